@@ -1,0 +1,179 @@
+"""What the interpreter says about a file: moves, events and the modal state between them.
+
+All columns of one dataclass have the same length and are plain numpy arrays; a block holds some
+thousand rows. Byte offsets count from the start of the file, line numbers from 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["EventKind", "Events", "Limits", "ModalState", "Moves", "Phases", "ProgramBlock"]
+
+
+class EventKind(IntEnum):
+    """What a line that is no move does to the motion."""
+
+    HARMLESS = 0
+    """Does not stop the motion and changes nothing that we track: comments, fan, M73, ..."""
+    MODE = 1
+    """Changes how later lines are read, without a stop: G90 G91 M82 M83 G92 M220 M221, a bare F."""
+    LIMITS = 2
+    """Changes the planner's limits without a stop: M204, SET_VELOCITY_LIMIT."""
+    STOP = 3
+    """Stops the motion; the position stays known: G4, M400, waits."""
+    UNKNOWN = 4
+    """Leaves position or state unknown: homing, probing, macros, tool change, pause."""
+    OBJECT = 5
+    """Object-exclusion mark: the firmware may jump over what follows."""
+    SHAPER = 6
+    """Sets the firmware's own input shaper (stops the motion)."""
+    STAMP = 7
+    """Our own header or footer line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Planner limits that G-code can change (Klipper: SET_VELOCITY_LIMIT, M204)."""
+
+    velocity_mm_s: float
+    accel_mm_s2: float
+    square_corner_velocity_mm_s: float
+    minimum_cruise_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModalState:
+    """How the firmware reads the next line."""
+
+    absolute_xyz: bool
+    absolute_e: bool
+    speed_factor: float
+    """1.0 = 100 % (M220)."""
+    extrude_factor: float
+    """1.0 = 100 % (M221)."""
+    feedrate_mm_min: float
+    """The modal F as written, before `speed_factor`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moves:
+    """Straight moves (arcs already cut), in file order.
+
+    Attributes
+    ----------
+    start_mm, end_mm : ndarray, shape (n, 4)
+        x y z in machine axes and e as the firmware's cumulative extruder position.
+    speed_mm_s : ndarray, shape (n,)
+        Requested speed: F times the speed factor, before any limit.
+    limits_id, modal_id : ndarray of int32, shape (n,)
+        Rows of `ProgramBlock.limits` and `ProgramBlock.modal` in force for the move.
+    known : ndarray of uint8, shape (n,)
+        Bit 0..2 set: the machine's x, y, z are known at both ends of the move.
+    line, byte_start, byte_end : ndarray of int64, shape (n,)
+        Source line; `byte_end` is one past its newline. An arc's pieces share one line.
+    layer, feature, object_id : ndarray of int32, shape (n,)
+        -1 where unknown.
+    """
+
+    start_mm: NDArray[np.float64]
+    end_mm: NDArray[np.float64]
+    speed_mm_s: NDArray[np.float64]
+    limits_id: NDArray[np.int32]
+    modal_id: NDArray[np.int32]
+    known: NDArray[np.uint8]
+    line: NDArray[np.int64]
+    byte_start: NDArray[np.int64]
+    byte_end: NDArray[np.int64]
+    layer: NDArray[np.int32]
+    feature: NDArray[np.int32]
+    object_id: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+@dataclass(frozen=True, slots=True)
+class Events:
+    """Lines that are no moves, in file order.
+
+    Attributes
+    ----------
+    kind : ndarray of int8, shape (n,)
+        An `EventKind`.
+    move_index : ndarray of int64, shape (n,)
+        How many moves of the whole file stand before the line.
+    modal_id, limits_id : ndarray of int32, shape (n,)
+        The state AFTER the line.
+    dwell_s : ndarray, shape (n,)
+        Planned standing time of a STOP (G4), otherwise 0.
+    line, byte_start, byte_end : ndarray of int64, shape (n,)
+    """
+
+    kind: NDArray[np.int8]
+    move_index: NDArray[np.int64]
+    modal_id: NDArray[np.int32]
+    limits_id: NDArray[np.int32]
+    dwell_s: NDArray[np.float64]
+    line: NDArray[np.int64]
+    byte_start: NDArray[np.int64]
+    byte_end: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramBlock:
+    """One block of an interpreted file.
+
+    `limits` and `modal` are the interpreter's append-only tables: ids stay valid for the whole
+    file. `text` holds the bytes from `text_offset` on, and covers every line of the block.
+    """
+
+    first_move: int
+    moves: Moves
+    events: Events
+    limits: list[Limits]
+    modal: list[ModalState]
+    text_offset: int
+    text: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Phases:
+    """Planned moves: each an acceleration, a cruise and a deceleration along a straight line.
+
+    Attributes
+    ----------
+    t_s : ndarray, shape (n,)
+        Start of the move, counted from the first move of the file.
+    accel_s, cruise_s, decel_s : ndarray, shape (n,)
+        Durations of the three phases.
+    start_mm, direction : ndarray, shape (n, 4)
+        Start position and travel per mm of path (x y z e). An extruder-only move has the
+        direction (0, 0, 0, +-1) and its path is filament.
+    start_mm_s, cruise_mm_s, end_mm_s : ndarray, shape (n,)
+    accel_mm_s2 : ndarray, shape (n,)
+    move_index : ndarray of int64, shape (n,)
+        Index of the move in the whole file.
+    """
+
+    t_s: NDArray[np.float64]
+    accel_s: NDArray[np.float64]
+    cruise_s: NDArray[np.float64]
+    decel_s: NDArray[np.float64]
+    start_mm: NDArray[np.float64]
+    direction: NDArray[np.float64]
+    start_mm_s: NDArray[np.float64]
+    cruise_mm_s: NDArray[np.float64]
+    end_mm_s: NDArray[np.float64]
+    accel_mm_s2: NDArray[np.float64]
+    move_index: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t_s)

@@ -1,0 +1,24 @@
+"""What the user chooses for one job."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["Options"]
+
+
+class Options(BaseModel):
+    """Settings of one compensation job; the same settings give the same bytes.
+
+    `method` is `fbf`, `zpetc`, `none` or `shaper:NAME` with a firmware shaper's name.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Annotated[
+        str, Field(pattern=r"^(fbf|zpetc|none|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$")
+    ] = "fbf"
+    basis: Literal["ce-opt", "bspline"] = "ce-opt"
+    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = 5.0
