@@ -1,0 +1,92 @@
+"""Machines by name: the built-in library and JSON files of the user."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from models.errors import ModelError
+from models.machine import Machine
+
+__all__ = ["builtin_machines", "load_machine", "read_machine"]
+
+_LIBRARY = Path(__file__).parent / "library"
+_LARGEST_BYTES = 4_000_000
+
+
+def builtin_machines() -> list[str]:
+    """Return the names of the built-in machines, sorted."""
+    return sorted(path.stem for path in _LIBRARY.glob("*.json"))
+
+
+def load_machine(name_or_path: str | Path) -> Machine:
+    """Load a built-in machine by name, or a machine from a JSON file.
+
+    Whatever ends in `.json` or holds a slash is a path, all else a name.
+
+    Raises
+    ------
+    ModelError
+        If there is no such machine or file, or the document is not a valid machine.
+    """
+    text = str(name_or_path)
+    if isinstance(name_or_path, Path) or text.endswith(".json") or "/" in text or "\\" in text:
+        return _from_file(Path(name_or_path))
+    names = builtin_machines()
+    if text not in names:
+        near = difflib.get_close_matches(text.lower().replace("_", "-"), names, n=3, cutoff=0.5)
+        hint = f"did you mean {', '.join(near)}? " if near else ""
+        raise ModelError(
+            f"no machine is called {text!r}; {hint}Built in are {', '.join(names)}; "
+            "a file of your own is given by its path, ending in .json"
+        )
+    return _from_file(_LIBRARY / f"{text}.json")
+
+
+def read_machine(document: str | bytes, source: str = "machine") -> Machine:
+    """Read a machine from its JSON text; `source` names it in messages.
+
+    Raises
+    ------
+    ModelError
+        Naming the first field that is wrong, its value and what it must be.
+    """
+    try:
+        parsed = json.loads(document)
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ModelError(f"{source}: not JSON ({error})") from None
+    try:
+        return Machine.model_validate(parsed)
+    except ValidationError as error:
+        raise ModelError(f"{source}: {_explain(error)}") from None
+
+
+def _from_file(path: Path) -> Machine:
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ModelError(f"{path}: over {_LARGEST_BYTES} bytes, not a machine")
+        document = path.read_bytes()
+    except OSError as error:
+        raise ModelError(
+            f"cannot read the machine file {path}: {error.strerror}; built in are "
+            f"{', '.join(builtin_machines())}"
+        ) from None
+    return read_machine(document, str(path))
+
+
+def _explain(error: ValidationError) -> str:
+    """The first complaint in one line, with the number of further ones."""
+    complaints = error.errors(include_url=False)
+    # An unfitting branch of a union complains too; the deepest complaint is the one meant.
+    first = max(complaints, key=lambda c: len(c["loc"]))
+    where = ".".join(str(part) for part in first["loc"]) or "document"
+    message = first["msg"].removeprefix("Value error, ")
+    given = first["input"]
+    shown = "" if isinstance(given, (dict, list, tuple)) else f" (given: {given!r:.80})"
+    if first["type"] == "missing":
+        shown = ""
+    more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
+    return f"{where}: {message}{shown}{more}"
