@@ -1,0 +1,150 @@
+"""From planned moves to the sampled path of a piece, with its rests laid on the sampling grid.
+
+A *piece* is a row of planned moves that starts and ends at rest. Inside it, moves of X and Y form
+*stretches*; between them lie *rests*, moves of the extruder or of Z alone, which leave the file as
+they came while X and Y stand still. How long a rest takes is decided by the limits under which the
+written file will run, not by the original ones, so the rests' durations are an input here and the
+stretches move in time. A rest starts on the sampling grid; a stretch starts where its rest ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.sampler import sample_phases
+from gcode.types import Phases
+
+__all__ = ["Group", "Timeline", "build_timeline", "group_rows"]
+
+_GRID_EPS = 1e-6
+"""Samples are compared with times to this part of a sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Consecutive rows of a piece, all moving X or Y (a stretch) or none of them (a rest)."""
+
+    first: int
+    last: int
+    """One past the last row."""
+    rest: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """The sampled path of a piece.
+
+    Attributes
+    ----------
+    dt_s : float
+    position_mm : ndarray, shape (4, n)
+        x y z e at the times ``k * dt_s``.
+    row : ndarray of int64, shape (n,)
+        Row of the piece's phases that each sample belongs to.
+    moving : ndarray of bool, shape (n,)
+        X or Y moves at the sample.
+    rests : ndarray of int64, shape (k, 2)
+        Ranges [a, b) of samples in which u(i) = u(i - 1) must hold.
+    groups : list of Group
+    start_s, end_s : ndarray, shape (len(groups),)
+        When each group starts and ends; a stretch is padded to the grid at its end.
+    group_start_mm : ndarray, shape (len(groups), 4)
+        x y z e where each group starts.
+    row_start_s : ndarray, shape (rows,)
+        Start of each row on this timeline.
+    """
+
+    dt_s: float
+    position_mm: NDArray[np.float64]
+    row: NDArray[np.int64]
+    moving: NDArray[np.bool_]
+    rests: NDArray[np.int64]
+    groups: list[Group]
+    start_s: NDArray[np.float64]
+    end_s: NDArray[np.float64]
+    group_start_mm: NDArray[np.float64]
+    row_start_s: NDArray[np.float64]
+
+
+def group_rows(phases: Phases) -> list[Group]:
+    """Split the rows of a piece into stretches and rests, in order."""
+    moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+    edges = np.flatnonzero(np.diff(moves_xy)) + 1
+    bounds = [0, *edges.tolist(), len(moves_xy)]
+    return [
+        Group(first, last, rest=not bool(moves_xy[first]))
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True)
+        if last > first
+    ]
+
+
+def build_timeline(
+    phases: Phases,
+    groups: list[Group],
+    rest_s: NDArray[np.float64],
+    dt_s: float,
+    *,
+    lead_s: float = 0.0,
+    tail_s: float = 0.0,
+    end_s: float = 0.0,
+) -> Timeline:
+    """Lay a piece on the sampling grid.
+
+    Parameters
+    ----------
+    phases : Phases
+        The original plan of the piece.
+    groups : list of Group
+        As `group_rows` gives them.
+    rest_s : ndarray, shape (len(groups),)
+        Duration of each rest under the limits of the written file (ignored for stretches).
+    dt_s : float
+        Sampling time.
+    lead_s, tail_s : float
+        Standing time before and after every stretch, for compensators that need it.
+    end_s : float
+        Standing time after the last group, at most which the command may take to settle.
+    """
+    duration = phases.accel_s + phases.cruise_s + phases.decel_s
+    row_start = np.empty(len(phases))
+    start, end = np.empty(len(groups)), np.empty(len(groups))
+    rests: list[tuple[int, int]] = []
+    now = 0.0
+    for i, group in enumerate(groups):
+        rows = slice(group.first, group.last)
+        offset = np.concatenate([[0.0], np.cumsum(duration[rows])])
+        if group.rest:
+            scale = rest_s[i] / offset[-1] if offset[-1] > 0 else 1.0
+            start[i], end[i] = now, now + rest_s[i]
+            row_start[rows] = now + scale * offset[:-1]
+            first = int(np.ceil(now / dt_s - _GRID_EPS)) + 1
+            last = int(np.floor(end[i] / dt_s + _GRID_EPS)) + 1
+            if last > first:
+                rests.append((first, last))
+            now = end[i]
+        else:
+            start[i] = now + lead_s
+            row_start[rows] = start[i] + offset[:-1]
+            now = dt_s * np.ceil((start[i] + offset[-1] + tail_s) / dt_s - _GRID_EPS)
+            end[i] = now
+    samples = int(np.ceil(now / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
+    moved = replace(phases, t_s=row_start)
+    position, row = sample_phases(moved, (0.0, dt_s, samples))
+    t = dt_s * np.arange(samples)
+    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+    moving = xy[row] & (t <= row_start[row] + duration[row] + _GRID_EPS * dt_s)
+    return Timeline(
+        dt_s=dt_s,
+        position_mm=position,
+        row=row,
+        moving=moving,
+        rests=np.array(rests, dtype=np.int64).reshape(-1, 2),
+        groups=groups,
+        start_s=start,
+        end_s=end,
+        group_start_mm=phases.start_mm[[group.first for group in groups]],
+        row_start_s=row_start,
+    )
