@@ -320,7 +320,7 @@ class PlantSetSpec(_Document):
 
 def _pair(f_hz: float, zeta: float) -> NDArray[np.complex128]:
     root = np.sqrt(complex(zeta * zeta - 1.0))
-    return 2 * np.pi * f_hz * np.array([-zeta + root, -zeta - root])
+    return 2 * np.pi * f_hz * np.array([-zeta + root, -zeta - root], dtype=np.complex128)
 
 
 def _complex(*parts: NDArray[np.generic]) -> NDArray[np.complex128]:

@@ -173,8 +173,7 @@ class DiscretePlant(_StateSpace):
 
     def rest_state(self, u: float = 1.0) -> Matrix:
         """Return the state in which the plant stands still at the constant command `u`."""
-        state: Matrix = np.linalg.solve(np.eye(self.order) - self.a, self.b) * u
-        return state
+        return np.asarray(np.linalg.solve(np.eye(self.order) - self.a, self.b) * u, np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,13 +316,13 @@ def _undo_hold(plant: DiscretePlant, spec: PlantSpec) -> ContinuousPlant:
             "continuous model"
         )
     n, dt_s = plant.order, plant.dt_s
-    rate = np.real(logm(plant.a)) / dt_s
+    rate = np.asarray(np.real(logm(plant.a)) / dt_s, np.float64)
     block = np.zeros((3 * n, 3 * n))
     block[:n, :n] = rate * dt_s
     block[:n, n : 2 * n] = np.eye(n) * dt_s
     block[n : 2 * n, 2 * n :] = np.eye(n)
     grown = expm(block)
     step, ramp = grown[:n, n : 2 * n], grown[:n, 2 * n :]
-    b = np.linalg.solve(step - ramp + plant.a @ ramp, plant.b)
+    b = np.asarray(np.linalg.solve(step - ramp + plant.a @ ramp, plant.b), np.float64)
     d = plant.d - float(plant.c @ ramp @ b)
     return ContinuousPlant(*balanced(rate, b, plant.c, d, discrete=False), plant.notes)

@@ -72,8 +72,7 @@ def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.
 
 
 def _solve_continuous(a: Matrix, q: Matrix) -> Matrix:
-    solution: Matrix = solve_continuous_lyapunov(a, -q)
-    return solution
+    return np.asarray(solve_continuous_lyapunov(a, -q), dtype=np.float64)
 
 
 def _groups(roots: NDArray[np.complex128]) -> list[_Group]:

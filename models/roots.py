@@ -123,7 +123,8 @@ def to_s(
     if dt_s is None:
         return roots, np.ones(len(roots), bool)
     has = (roots != 0) & ~((roots.imag == 0) & (roots.real <= 0))
-    return np.log(np.where(has, roots, 1.0)) / dt_s, has
+    images = np.asarray(np.log(np.where(has, roots, 1.0)) / dt_s, dtype=np.complex128)
+    return images, has
 
 
 def scaled_roots(roots: Roots, frequency: float, damping: float) -> Roots:
@@ -177,4 +178,5 @@ def _scaled(
         moved[~pair] = s[~pair] * frequency
     if dt_s is None:
         return moved
-    return np.where(has, np.exp(moved * dt_s), roots)
+    back: NDArray[np.complex128] = np.where(has, np.exp(moved * dt_s), roots)
+    return back

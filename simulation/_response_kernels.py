@@ -1,0 +1,71 @@
+"""Loops of the plant response; `simulation.response` gives them names and checks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.jit import kernel
+
+__all__ = ["dense_response", "modal_response"]
+
+Array = NDArray[np.float64]
+_CHUNK = 1024
+_TINY = 1e-150
+
+
+@kernel
+def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array, y: Array) -> None:
+    """Add up first-order complex recurrences, two at a time to hide their latency.
+
+    `modes` has rows (re, im of the eigenvalue, re, im of the output weight) and an even number
+    of them; `state` has rows (re, im) and is carried on. y = origin + response of u - origin.
+    """
+    n = len(u)
+    for k in range(n):
+        y[k] = origin + d * (u[k] - origin)
+    for m in range(0, len(modes), 2):
+        a_re, a_im, a_wr, a_wi = modes[m, 0], modes[m, 1], modes[m, 2], modes[m, 3]
+        b_re, b_im, b_wr, b_wi = modes[m + 1, 0], modes[m + 1, 1], modes[m + 1, 2], modes[m + 1, 3]
+        p, q = state[m, 0], state[m, 1]
+        r, s = state[m + 1, 0], state[m + 1, 1]
+        for first in range(0, n, _CHUNK):
+            for k in range(first, min(first + _CHUNK, n)):
+                y[k] += (a_wr * p - a_wi * q) + (b_wr * r - b_wi * s)
+                drive = u[k] - origin
+                p_next = (a_re * p - a_im * q) + drive
+                q = a_im * p + a_re * q
+                p = p_next
+                r_next = (b_re * r - b_im * s) + drive
+                s = b_im * r + b_re * s
+                r = r_next
+            # In a long rest the states decay into denormal numbers, which cost a hundredfold.
+            if abs(p) + abs(q) < _TINY:
+                p = q = 0.0
+            if abs(r) + abs(s) < _TINY:
+                r = s = 0.0
+        state[m, 0], state[m, 1] = p, q
+        state[m + 1, 0], state[m + 1, 1] = r, s
+
+
+@kernel
+def dense_response(
+    a: Array, b: Array, c: Array, d: float, origin: float, state: Array, u: Array, y: Array
+) -> None:
+    """Advance x(k+1) = a x + b u, y = c x + d u for plants without a usable modal form."""
+    n = len(b)
+    x = state.copy()
+    x_next = np.empty(n)
+    for k in range(len(u)):
+        drive = u[k] - origin
+        value = origin + d * drive
+        for i in range(n):
+            value += c[i] * x[i]
+        y[k] = value
+        for i in range(n):
+            total = b[i] * drive
+            for j in range(n):
+                total += a[i, j] * x[j]
+            x_next[i] = total if abs(total) > _TINY else 0.0
+        x[:] = x_next
+    state[:] = x
