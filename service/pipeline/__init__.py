@@ -1,0 +1,1 @@
+"""The road: a file in, runs, a file and its figures out; without web framework or database."""

@@ -1,0 +1,130 @@
+"""Every error leaves as application/problem+json (RFC 9457)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from http import HTTPStatus
+from typing import Any
+
+import structlog
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+
+from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
+
+__all__ = ["Problem", "install", "problem_response", "responses"]
+
+
+class Problem(Exception):  # named as in RFC 9457
+    """Raise it anywhere in a request; it becomes the answer.
+
+    Parameters
+    ----------
+    status : int
+    title, detail : str
+    headers : dict, optional
+    **extra
+        Further members of the document.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        title: str,
+        detail: str,
+        *,
+        headers: Mapping[str, str] | None = None,
+        **extra: Any,
+    ) -> None:
+        super().__init__(detail)
+        self.document = problem(status, title, detail, **extra)
+        self.headers = dict(headers or {})
+
+
+def problem_response(
+    document: Mapping[str, Any], headers: Mapping[str, str] | None = None
+) -> Response:
+    """Return the answer for a problem document."""
+    return JSONResponse(
+        dict(document),
+        status_code=int(document["status"]),
+        headers=dict(headers or {}),
+        media_type=PROBLEM_MEDIA_TYPE,
+    )
+
+
+def install(app: FastAPI) -> None:
+    """Make an application answer every error with a problem document."""
+
+    @app.exception_handler(Problem)
+    async def _problem(_: Request, error: Problem) -> Response:
+        return problem_response(error.document, error.headers)
+
+    @app.exception_handler(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> Response:
+        title = HTTPStatus(error.status_code).phrase
+        detail = str(error.detail)
+        if detail == title:
+            called = f"{request.method} {request.url.path}"
+            detail = f"{called}: {title.lower()}; /openapi.json lists what there is."
+        return problem_response(problem(error.status_code, title, detail), error.headers)
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(_: Request, error: RequestValidationError) -> Response:
+        found = [_field(entry) for entry in error.errors()]
+        detail = "; ".join(f"{entry['name']}: {entry['message']}" for entry in found)
+        return problem_response(problem(422, "Bad parameter", detail, errors=found))
+
+    @app.exception_handler(Exception)
+    async def _crash(request: Request, error: Exception) -> Response:
+        structlog.get_logger("api").error(
+            "request broke", method=request.method, path=request.url.path, exc_info=error
+        )
+        return problem_response(
+            problem(500, "Internal error", "The service broke; its log holds the details.")
+        )
+
+
+def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI entries for the problems a route may answer with."""
+    return {
+        status: {
+            "description": HTTPStatus(status).phrase,
+            "content": {PROBLEM_MEDIA_TYPE: {"schema": _SCHEMA, "example": _EXAMPLES.get(status)}},
+        }
+        for status in statuses
+    }
+
+
+def _field(entry: Mapping[str, Any]) -> dict[str, str]:
+    place = entry.get("loc", ())
+    return {
+        "name": ".".join(str(part) for part in place[1:]) or str(place[0] if place else "request"),
+        "message": f"{entry.get('msg', 'bad value')} (given: {entry.get('input')!r})",
+    }
+
+
+_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": ["type", "title", "status", "detail"],
+    "properties": {
+        "type": {"type": "string"},
+        "title": {"type": "string", "description": "The kind of problem."},
+        "status": {"type": "integer"},
+        "detail": {"type": "string", "description": "What, where, the limit and the remedy."},
+        "line": {"type": "integer", "description": "Line of the G-code, from 1."},
+        "text": {"type": "string", "description": "That line."},
+    },
+}
+_EXAMPLES: dict[int, dict[str, Any]] = {
+    404: problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
+    409: problem(409, "Not done yet", "The job is running. Ask again when its state is done."),
+    413: problem(413, "File too large", "The upload is larger than 1073741824 bytes."),
+    422: problem(
+        422,
+        "Bad parameter",
+        "method: String should match pattern '^(fbf|zpetc|none|shaper:...)$' (given: 'magic')",
+    ),
+}

@@ -1,0 +1,208 @@
+"""An upload goes from the socket to the disk; memory holds one chunk."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from anyio import to_thread
+from fastapi import Request
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from service.api.problems import Problem
+
+if TYPE_CHECKING:
+    from python_multipart.multipart import MultipartCallbacks
+
+__all__ = ["Upload", "receive_upload", "safe_name"]
+
+_WRITE_BYTES = 1 << 20
+_DEFAULT_NAME = "upload.gcode"
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """What arrived: the file's name as its sender called it, made safe, and its size."""
+
+    name: str
+    size: int
+
+
+async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> Upload:
+    """Write the body of a request, raw or multipart/form-data, to `target`.
+
+    Parameters
+    ----------
+    request : Request
+        For multipart, the first part with a file name counts; others are ignored.
+    target : Path
+        Is left incomplete when an error is raised; the caller deletes it.
+    max_bytes : int
+        Largest body.
+
+    Raises
+    ------
+    Problem
+        413 if the body is too large, 422 if it is empty or broken.
+    """
+    declared = request.headers.get("content-length", "")
+    if declared.isdecimal() and int(declared) > max_bytes:
+        raise _too_large(max_bytes)
+    kind, parameters = parse_options_header(request.headers.get("content-type"))
+    with target.open("wb") as file:
+        sink = _Sink(file)
+        if kind == b"multipart/form-data":
+            name = await _receive_form(request, sink, parameters.get(b"boundary"), max_bytes)
+        else:
+            name = request.query_params.get("name", "")
+            async for chunk in _limited(request, max_bytes):
+                await sink.write(chunk)
+        await sink.finish()
+    if sink.size == 0:
+        raise Problem(
+            422,
+            "The file is empty",
+            "The request brought no bytes. Send the G-code as the body "
+            "(curl --data-binary @part.gcode) or as a form's file.",
+        )
+    return Upload(safe_name(name), sink.size)
+
+
+def safe_name(name: str) -> str:
+    """Return a file name without folders, control characters or surprises."""
+    base = re.split(r"[/\\]", name)[-1]
+    base = re.sub(r"[^\w .()+-]", "_", base).strip(" .")[:100]
+    return base or _DEFAULT_NAME
+
+
+@dataclass(slots=True)
+class _Sink:
+    """Collects small chunks and writes large ones, in a thread: the disk may be slow."""
+
+    file: BinaryIO
+    size: int = 0
+    _chunks: list[bytes] = field(default_factory=list)
+    _waiting: int = 0
+
+    def take(self, chunk: bytes) -> None:
+        self._chunks.append(chunk)
+        self._waiting += len(chunk)
+        self.size += len(chunk)
+
+    async def write(self, chunk: bytes) -> None:
+        self.take(chunk)
+        await self.drain()
+
+    async def drain(self) -> None:
+        if self._waiting >= _WRITE_BYTES:
+            await to_thread.run_sync(self._flush)
+
+    async def finish(self) -> None:
+        await to_thread.run_sync(self._flush_and_sync)
+
+    def _flush(self) -> None:
+        self.file.write(b"".join(self._chunks))
+        self._chunks.clear()
+        self._waiting = 0
+
+    def _flush_and_sync(self) -> None:
+        self._flush()
+        self.file.flush()
+        os.fsync(self.file.fileno())
+
+
+async def _limited(request: Request, max_bytes: int) -> AsyncIterator[bytes]:
+    size = 0
+    async for chunk in request.stream():
+        size += len(chunk)
+        if size > max_bytes:
+            raise _too_large(max_bytes)
+        yield chunk
+
+
+async def _receive_form(
+    request: Request, sink: _Sink, boundary: bytes | None, max_bytes: int
+) -> str:
+    if not boundary:
+        raise _broken_form("the Content-Type names no boundary")
+    form = _Form(sink.take)
+    try:
+        parser = MultipartParser(boundary, form.callbacks())
+        async for chunk in _limited(request, max_bytes):
+            parser.write(chunk)
+            await sink.drain()
+        parser.finalize()
+    except FormParserError as error:
+        raise _broken_form(str(error)) from error
+    if form.name is None:
+        raise _broken_form("no part has a file name")
+    return form.name
+
+
+class _Form:
+    """Callbacks of the multipart parser: finds the first file and passes its data on."""
+
+    def __init__(self, take: Callable[[bytes], None]) -> None:
+        self.name: str | None = None
+        self._take = take
+        self._in_file = False
+        self._headers: dict[bytes, bytes] = {}
+        self._field = b""
+        self._value = b""
+
+    def callbacks(self) -> MultipartCallbacks:
+        return {
+            "on_part_begin": self._part_begin,
+            "on_header_field": self._header_field,
+            "on_header_value": self._header_value,
+            "on_header_end": self._header_end,
+            "on_headers_finished": self._headers_finished,
+            "on_part_data": self._part_data,
+            "on_part_end": self._part_end,
+        }
+
+    def _part_begin(self) -> None:
+        self._headers = {}
+
+    def _header_field(self, data: bytes, start: int, end: int) -> None:
+        self._field += data[start:end]
+
+    def _header_value(self, data: bytes, start: int, end: int) -> None:
+        self._value += data[start:end]
+
+    def _header_end(self) -> None:
+        self._headers[self._field.lower()] = self._value
+        self._field = self._value = b""
+
+    def _headers_finished(self) -> None:
+        _, parameters = parse_options_header(self._headers.get(b"content-disposition"))
+        name = parameters.get(b"filename")
+        self._in_file = name is not None and self.name is None
+        if self._in_file and name is not None:
+            self.name = name.decode("utf-8", "replace")
+
+    def _part_data(self, data: bytes, start: int, end: int) -> None:
+        if self._in_file:
+            self._take(data[start:end])
+
+    def _part_end(self) -> None:
+        self._in_file = False
+
+
+def _too_large(max_bytes: int) -> Problem:
+    return Problem(
+        413,
+        "File too large",
+        f"The upload is larger than {max_bytes} bytes, the limit of this service "
+        "(STILLPATH_MAX_UPLOAD_BYTES).",
+        headers={"Connection": "close"},
+    )
+
+
+def _broken_form(why: str) -> Problem:
+    return Problem(422, "Broken form", f"The multipart/form-data body cannot be read: {why}.")

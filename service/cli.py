@@ -1,0 +1,304 @@
+"""The command line. Heavy imports wait until a command needs them, so that --help is quick.
+
+Exit codes: 0 done, 1 the computer failed us (disk, memory, permission), 2 the request cannot be
+met (bad file, machine, model or option), 130 interrupted. Whatever is not 0 leaves no output
+file, and the input as it was.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from service.environment import prepare_environment
+
+__all__ = ["app", "main", "run"]
+
+app = typer.Typer(
+    name="stillpath",
+    help="Keeps a printer's nozzle on its path: compensates G-code for the machine's vibration.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+_METHODS = "fbf, zpetc, none, shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei"
+
+Input = Annotated[Path, typer.Argument(metavar="IN", help="The sliced file.")]
+MachineOption = Annotated[
+    str,
+    typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
+]
+ReportOption = Annotated[
+    Path | None, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
+]
+
+
+def main() -> NoReturn:
+    """Run the command line and exit; the entry point of the `stillpath` command."""
+    prepare_environment()
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command and return its exit code; every failure is one line on stderr."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = typer.main.get_command(app).main(
+            args=arguments, prog_name="stillpath", standalone_mode=False
+        )
+        return code if isinstance(code, int) else 0
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; nothing was written", 130)
+    except typer.TyperException as error:
+        return _fail(f"{error.format_message()} (stillpath COMMAND --help lists the options)", 2)
+    except _Refused as error:
+        return _fail(str(error), 2)
+    except MemoryError:
+        return _fail("out of memory; close other programs or use a larger machine", 1)
+    except OSError as error:
+        return _fail(_of_system(error), 1)
+    except ValueError as error:
+        if not _is_ours(error):
+            raise
+        return _fail(str(error), 2)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        from service.version import __version__
+
+        typer.echo(f"stillpath {__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command()
+def compensate(
+    source: Input,
+    machine: MachineOption,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT", help="The file to write.")
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Write over IN, as slicers ask of their scripts.")
+    ] = False,
+    method: Annotated[str, typer.Option(help=_METHODS)] = "fbf",
+    basis: Annotated[str, typer.Option(help="Basis of fbf: ce-opt or bspline.")] = "ce-opt",
+    tolerance_um: Annotated[
+        float, typer.Option(help="How far the written path may be from the computed one.")
+    ] = 5.0,
+    report: ReportOption = None,
+) -> None:
+    """Write a compensated file, and print what was measured on it."""
+    if in_place == (output is not None):
+        raise _Refused("give either -o OUT or --in-place")
+    options = _options(method=method, basis=basis, tolerance_um=tolerance_um)
+    _check_input(source)
+    target = _check_output(output or source)
+    _check_folder(report)
+    found = _machine(machine)
+
+    from service.console import print_result, progress_shown
+    from service.pipeline.road import compensate_file
+
+    with progress_shown("stillpath") as progress:
+        result = compensate_file(source, target, found, options, progress=progress)
+    _write_report(result, report)
+    print_result(result)
+
+
+@app.command()
+def plan(
+    source: Input,
+    machine: MachineOption,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="motion.npz")],
+    rate: Annotated[float, typer.Option(min=1.0, max=100_000.0, help="Samples per second.")] = 1e3,
+) -> None:
+    """Write the motion the machine will make: t, x, y, z, e, sampled."""
+    _check_input(source)
+    target = _check_output(output)
+    if target == source.resolve():
+        raise _Refused("OUT must not be IN: the motion is no G-code")
+    found = _machine(machine)
+
+    from service.console import progress_shown
+    from service.pipeline.road import plan_file
+
+    with progress_shown("stillpath") as progress:
+        plan_file(source, target, found, rate_hz=rate, progress=progress)
+
+
+@app.command()
+def simulate(
+    source: Input,
+    machine: MachineOption,
+    report: Annotated[
+        Path, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
+    ],
+) -> None:
+    """Report how far the nozzle will be from its path; no G-code is written."""
+    _check_input(source)
+    _check_folder(report)
+    found = _machine(machine)
+
+    from service.console import print_result, progress_shown
+    from service.pipeline.road import simulate_file
+
+    with progress_shown("stillpath") as progress:
+        result = simulate_file(source, found, progress=progress)
+    _write_report(result, report)
+    print_result(result)
+
+
+@app.command()
+def machines(
+    name: Annotated[str | None, typer.Argument(help="Show this one, as JSON.")] = None,
+) -> None:
+    """List the built-in machines, or print one as a JSON document to start from."""
+    from models.store import builtin_machines
+
+    if name is not None:
+        typer.echo(_machine(name).model_dump_json(indent=1))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("name", "machine", "kinematics", "revision", box=None, pad_edge=False)
+    for entry in map(_machine, builtin_machines()):
+        table.add_row(entry.name, entry.title, entry.kinematics, entry.revision)
+    Console(highlight=False).print(table)
+
+
+@app.command()
+def serve(
+    host: Annotated[str, typer.Option(help="Address to bind.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 8000,
+    data_dir: Annotated[
+        Path | None, typer.Option(help="Database, uploads, results [STILLPATH_DATA_DIR].")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Worker processes [STILLPATH_WORKERS].")
+    ] = None,
+    allow_remote: Annotated[
+        bool,
+        typer.Option(
+            "--allow-remote",
+            help="Bind an address other computers can reach; there are no keys "
+            "[STILLPATH_ALLOW_REMOTE].",
+        ),
+    ] = False,
+) -> None:
+    """Serve HTTP: a page at /, the API under /v1."""
+    from pydantic import ValidationError
+
+    from service.server import serve_forever
+    from service.settings import Settings, is_loopback
+
+    given: dict[str, Any] = {
+        "data_dir": data_dir,
+        "workers": workers,
+        "allow_remote": allow_remote or None,
+    }
+    try:
+        settings = Settings(**{key: value for key, value in given.items() if value is not None})
+    except ValidationError as error:
+        raise _Refused(_first_field(error)) from None
+    if not is_loopback(host) and not settings.allow_remote:
+        raise _Refused(
+            f"{host} can be reached from other computers, and this service has no keys. Bind "
+            "127.0.0.1, or say --allow-remote if something before it checks who is calling"
+        )
+    serve_forever(settings, host, port)
+
+
+def _options(**values: Any) -> Any:
+    from pydantic import ValidationError
+
+    from service.pipeline.options import Options
+
+    try:
+        return Options(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if first["loc"] == ("method",):
+            raise _Refused(f"unknown method {values['method']!r}; there is {_METHODS}") from None
+        raise _Refused(_first_field(error)) from None
+
+
+def _first_field(error: Any) -> str:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return f"{place}: {first['msg']} (given: {first['input']!r})"
+
+
+def _machine(name: str) -> Any:
+    from models.store import load_machine
+
+    return load_machine(name)
+
+
+def _check_input(source: Path) -> None:
+    if source.is_dir():
+        raise _Refused(f"{source} is a folder, not a G-code file")
+    if not source.exists():
+        raise _Refused(f"there is no file {source}")
+
+
+def _check_output(target: Path) -> Path:
+    if target.is_dir():
+        raise _Refused(f"{target} is a folder; name the file to write")
+    # A link is followed, so that what it points to is replaced and not the link.
+    target = target.resolve()
+    if not target.parent.is_dir():
+        raise _Refused(f"the folder {target.parent} does not exist; make it first")
+    return target
+
+
+def _check_folder(folder: Path | None) -> None:
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise _Refused(f"--report {folder} is a file; name a folder")
+
+
+def _write_report(result: Any, folder: Path | None) -> None:
+    if folder is not None:
+        from service.reports import write_report
+
+        write_report(result, folder)
+
+
+def _is_ours(error: ValueError) -> bool:
+    from compensation.base import DesignError
+    from gcode.errors import GcodeError
+    from models.errors import ModelError
+
+    return isinstance(error, GcodeError | ModelError | DesignError)
+
+
+def _of_system(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    return f"{place}{error.strerror or error}"
+
+
+def _fail(message: str, code: int) -> int:
+    sys.stderr.write(f"stillpath: error: {' '.join(message.split())}\n")
+    return code
+
+
+class _Refused(Exception):
+    """The request cannot be met as it was put."""
+
+
+def _terminate(number: int, _: FrameType | None) -> NoReturn:
+    # As an exception, so that temporary files are removed on the way out.
+    raise SystemExit(128 + number)

@@ -1,0 +1,99 @@
+"""What the command line shows: progress on stderr, figures on stdout."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from service.pipeline.progress import Progress
+    from service.pipeline.result import Result
+
+__all__ = ["print_result", "progress_shown"]
+
+_PLAIN_EVERY_S = 5.0
+
+
+@contextmanager
+def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
+    """Yield a progress callback: a bar on a terminal, now and then a plain line elsewhere."""
+    if sys.stderr.isatty():
+        with _bar(title) as callback:
+            yield callback
+    else:
+        yield _plain_lines(title)
+
+
+def print_result(result: Result, console: Console | None = None) -> None:
+    """Print what was measured: one column per channel, then time, size and warnings."""
+    console = console or Console(highlight=False)
+    table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
+    table.add_column("error, µm")
+    for channel in result.channels:
+        table.add_column(channel.label, justify="right")
+    for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
+        for kind in ("contour", "tracking"):
+            for measure in ("rms", "max"):
+                cells = [
+                    f"{getattr(getattr(channel, scope), f'{kind}_{measure}_um'):.2f}"
+                    for channel in result.channels
+                ]
+                table.add_row(f"{kind} {measure}, {part}", *cells)
+    table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
+    console.print(table)
+    if any(channel.name == "after" for channel in result.channels):
+        change = 100 * (result.time_s / result.original_time_s - 1) if result.original_time_s else 0
+        console.print(
+            f"print time {result.original_time_s:.1f} -> {result.time_s:.1f} s ({change:+.2f} %), "
+            f"size {result.original_bytes / 1e6:.2f} -> {result.written_bytes / 1e6:.2f} MB, "
+            f"{result.segments_per_s:.0f} segments/s (peak {result.peak_segments_per_s:.0f})"
+        )
+        console.print(
+            f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
+            f"{100 * result.put_back_extruding_share:.2f} % of the extruding time"
+        )
+    for warning in result.warnings:
+        console.print(f"warning: {warning}", markup=False)
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Callable[[Progress], None]]:
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[eta]}"),
+    )
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(title, total=1.0, eta="")
+
+        def tell(progress: Progress) -> None:
+            eta = "" if progress.eta_s is None else f"{progress.eta_s:.0f} s left"
+            bars.update(task, completed=progress.fraction, description=progress.stage, eta=eta)
+
+        yield tell
+
+
+def _plain_lines(title: str) -> Callable[[Progress], None]:
+    last = time.monotonic()
+
+    def tell(progress: Progress) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last < _PLAIN_EVERY_S:
+            return
+        last = now
+        eta = "" if progress.eta_s is None else f", {progress.eta_s:.0f} s left"
+        sys.stderr.write(f"{title}: {progress.stage} {100 * progress.fraction:.0f} %{eta}\n")
+
+    return tell

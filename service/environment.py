@@ -1,0 +1,38 @@
+"""What must be set before numpy and numba are imported, in every process of ours."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+__all__ = ["prepare_environment"]
+
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def prepare_environment() -> None:
+    """Set defaults for the numerical libraries; what the user has set stays.
+
+    BLAS gets one thread: the matrices are small, and more threads only burn CPU. Numba gets a
+    writable folder for compiled kernels where the installed package cannot hold them. Child
+    processes inherit both.
+    """
+    for name in _ONE_THREAD:
+        os.environ.setdefault(name, "1")
+    if "NUMBA_CACHE_DIR" not in os.environ and not _package_is_writable():
+        os.environ["NUMBA_CACHE_DIR"] = str(_kernel_cache())
+
+
+def _package_is_writable() -> bool:
+    return os.access(Path(__file__).resolve().parent.parent / "models", os.W_OK)
+
+
+def _kernel_cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    folder = (Path(base) if base else Path.home() / ".cache") / "stillpath" / "numba"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="stillpath-numba-"))
+    return folder

@@ -1,0 +1,56 @@
+"""Errors as problem documents (RFC 9457), for the job row and for the wire."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["PROBLEM_MEDIA_TYPE", "problem", "problem_of"]
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+
+
+def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any]:
+    """Return a problem document.
+
+    Parameters
+    ----------
+    status : int
+        HTTP status.
+    title : str
+        The kind of problem, the same for every occurrence.
+    detail : str
+        What happened here, the limit and the remedy.
+    **extra
+        Further members, for instance `line`.
+    """
+    return {"type": "about:blank", "title": title, "status": status, "detail": detail, **extra}
+
+
+def problem_of(error: BaseException) -> dict[str, Any]:
+    """Return the problem document for an error of the road.
+
+    The three error roots of the house are the input's fault (422) and are told in full; anything
+    else is ours (500), and the details stay in the log.
+    """
+    from compensation.base import DesignError
+    from gcode.errors import GcodeError
+    from models.errors import ModelError
+
+    match error:
+        case GcodeError():
+            place = {} if error.line is None else {"line": error.line, "text": error.text}
+            return problem(422, "The G-code cannot be processed", str(error), **place)
+        case ModelError():
+            return problem(422, "The machine model cannot be used", str(error))
+        case DesignError():
+            return problem(422, "No compensator can be designed", str(error))
+        case MemoryError():
+            return problem(500, "Out of memory", "The worker ran out of memory; give it more.")
+        case OSError() if error.errno == 28:
+            return problem(507, "No space left", "The data directory's disk is full; free space.")
+        case _:
+            return problem(
+                500,
+                "Internal error",
+                f"The job broke with {type(error).__name__}; the service's log holds the details.",
+            )
