@@ -44,12 +44,17 @@ def _segment_squared(path: Array, j: int, px: float, py: float) -> float:
 
 @kernel
 def contour_distances(
-    path: Array, s: Array, points: Array, first: int, stride: int, window: int, out: Array
+    path: Array,
+    s: Array,
+    points: Array,
+    centres: NDArray[np.int64],
+    window: int,
+    out: Array,
 ) -> int:
     """Distance of points to the stretch of the path that is near them in time.
 
-    Point i belongs to the vertex `first + i * stride` of the path; its distance is taken to the
-    segments between the vertices up to `window` before and after.
+    Point i belongs to the vertex `centres[i]` of the path; its distance is taken to the segments
+    between the vertices up to `window` before and after.
 
     From a vertex at distance D the path must be at least D - best long before it can come
     nearer than `best`, so the search leaps to the segment in which that length runs out.
@@ -62,16 +67,14 @@ def contour_distances(
     """
     n = path.shape[1]
     looked = 0
-    near = 0
+    lag = 0
     for i in range(len(out)):
         px, py = points[0, i], points[1, i]
-        centre = first + i * stride
+        centre = centres[i]
         low = max(0, centre - window)
         high = min(n - 1, centre + window)
-        # The nearest segment of the point before, moved on, is nearly always the right one.
-        start = min(max(near, low), max(high - 1, low))
-        if i == 0:
-            start = min(centre, max(high - 1, low))
+        # The lag of the point before is nearly always right.
+        start = min(max(centre + lag, low), max(high - 1, low))
         if high == low:
             out[i] = math.hypot(px - path[0, low], py - path[1, low])
             continue
@@ -123,7 +126,7 @@ def contour_distances(
                 best2, best, best_at = found2, math.sqrt(found2), j - 1
             j -= 1
         out[i] = best
-        near = best_at + stride
+        lag = best_at - centre
     return looked
 
 

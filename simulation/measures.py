@@ -27,6 +27,7 @@ __all__ = [
     "ResidualMeter",
     "Tally",
     "contour_error",
+    "distance_to_path",
     "tracking_error",
 ]
 
@@ -177,8 +178,7 @@ class ContourMeter:
                 self._path,
                 length,
                 np.ascontiguousarray(self._points[:, offset : end : self._stride]),
-                offset,
-                self._stride,
+                offset + self._stride * np.arange(count, dtype=np.int64),
                 self._window,
                 errors,
             )
@@ -196,9 +196,7 @@ class ResidualMeter:
     `shortest_s`; rests shorter than `window_s` count as long as they last.
     """
 
-    def __init__(
-        self, dt_s: float = 1e-3, window_s: float = 0.1, shortest_s: float = 0.02
-    ) -> None:
+    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.1, shortest_s: float = 0.02) -> None:
         self._window = max(1, round(window_s / dt_s))
         self._shortest = min(round(shortest_s / dt_s), self._window - 1)
         self._state = np.array([np.nan, np.nan, -1.0, 0, 0, 0, 0, 0, 0, 0])
@@ -304,3 +302,30 @@ def contour_error(
     meter = ContourMeter(dt_s, window_s, stride)
     first = meter.push(y_d_mm, y_mm)
     return np.concatenate([first.error_mm, meter.flush().error_mm])
+
+
+def distance_to_path(
+    path_mm: Array,
+    points_mm: Array,
+    index: NDArray[np.int64],
+    dt_s: float = 1e-3,
+    window_s: float = 0.08,
+) -> Array:
+    """Return the contour error of chosen samples only.
+
+    Parameters
+    ----------
+    path_mm : ndarray, shape (2, n)
+        The whole planned motion.
+    points_mm : ndarray, shape (2, m)
+        Executed positions at the samples `index`.
+    index : ndarray of int64, shape (m,)
+        Rising; each within the path.
+    """
+    path = np.ascontiguousarray(path_mm)
+    length = np.empty(path.shape[1])
+    arc_length(path, length)
+    out = np.empty(len(index))
+    points = np.ascontiguousarray(points_mm)
+    contour_distances(path, length, points, index, round(window_s / dt_s), out)
+    return out

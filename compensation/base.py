@@ -1,0 +1,84 @@
+"""What every compensator offers, and the list of them by name."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+
+__all__ = ["COMPENSATORS", "Compensator", "DesignError", "compensator"]
+
+COMPENSATORS = ("fbf", "zpetc", "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
+                "shaper:3hump_ei")  # fmt: skip
+
+
+class DesignError(ValueError):
+    """A compensator that cannot be designed; the message says why and what to do."""
+
+
+class Compensator(Protocol):
+    """From planned positions to commands, X and Y together, one run at a time.
+
+    Attributes
+    ----------
+    name : str
+    lead_s : float
+        How long before the first motion of a run the command may begin to move.
+    hold_s : float
+        How long the command may differ from the plan after a rest begins.
+    """
+
+    name: str
+    lead_s: float
+    hold_s: float
+
+    def compensate(
+        self,
+        y_d_mm: NDArray[np.float64],
+        extruding: NDArray[np.bool_],
+        rests: NDArray[np.int64],
+    ) -> NDArray[np.float64]:
+        """Return the command u, shape (2, n), for a plan that starts and ends at rest.
+
+        Parameters
+        ----------
+        y_d_mm : ndarray, shape (2, n)
+        extruding : ndarray of bool, shape (n,)
+        rests : ndarray of int64, shape (k, 2)
+            Sample ranges [a, b) in which the command must stand still; may be empty.
+
+        Raises
+        ------
+        DesignError
+            If the command cannot keep the machine's limits.
+        """
+        ...
+
+
+def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
+    """Make the compensator `name` for a machine, at the sampling time `dt_s`.
+
+    Raises
+    ------
+    DesignError
+        If there is no such compensator or it cannot be designed for this machine.
+    """
+    made: Compensator
+    if name == "fbf":
+        from compensation.fbf import PreviewFbf
+
+        made = PreviewFbf(machine, dt_s, **settings)
+    elif name == "zpetc":
+        from compensation.zpetc import Zpetc
+
+        made = Zpetc(machine, dt_s, **settings)
+    elif name.startswith("shaper:"):
+        from compensation.shapers import ShaperCompensator
+
+        made = ShaperCompensator(machine, dt_s, shaper=name.removeprefix("shaper:"), **settings)
+    else:
+        raise DesignError(f"no compensator is called {name!r}; there are {', '.join(COMPENSATORS)}")
+    return made

@@ -1,0 +1,76 @@
+"""Making a filtered command stand still where the machine must not move.
+
+A filter spreads every motion over its length; a rest (retraction, Z hop) cuts that off. Before
+the rest the command is led onto the resting position, after it from there back to the filter's
+output, by the cubic that matches position and speed at both of its ends.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["stand_still"]
+
+Array = NDArray[np.float64]
+
+
+def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int) -> Array:
+    """Return `u_mm` standing at the plan's position in the rests and at both ends.
+
+    Parameters
+    ----------
+    u_mm, y_d_mm : ndarray, shape (2, n)
+        Filter output and plan; the plan stands still in the rests.
+    rests : ndarray of int64, shape (k, 2)
+        Sample ranges [a, b); the sample before `a` belongs to the rest too, so that the last
+        motion ends there.
+    blend : int
+        Samples of a transition; at most half the distance to the next rest.
+    """
+    n = u_mm.shape[1]
+    out = u_mm.copy()
+    if n == 0:
+        return out
+    still = [(max(int(a) - 1, 0), min(int(b), n)) for a, b in rests if b > a]
+    spans = _joined([(0, 1), *still, (n - 1, n)])
+    # Every correction is worked out from the filter's output, so none sees another.
+    for (_, begin), (end, _) in pairwise(spans):
+        gap = end - begin
+        length = min(blend, max(gap // 2, 1))
+        _lead(out[:, begin - 1 : begin + length], u_mm, y_d_mm, begin - 1, 1)
+        _lead(out[:, end - length + 1 : end + 1][:, ::-1], u_mm, y_d_mm, end, -1)
+    for a, b in spans:
+        out[:, a:b] = y_d_mm[:, b - 1 : b]
+    return out
+
+
+def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Merge spans that touch."""
+    joined: list[tuple[int, int]] = []
+    for a, b in sorted(spans):
+        if joined and a <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
+        else:
+            joined.append((a, b))
+    return joined
+
+
+def _lead(part: Array, u: Array, y_d: Array, rest: int, step: int) -> None:
+    """Subtract from `part` (view of the command, away from the rest) the fading deviation.
+
+    `rest` is the sample at the edge of the rest, `step` the direction away from it.
+    """
+    length = part.shape[1] - 1
+    if length < 1:
+        return
+    n = u.shape[1]
+    deviation = u[:, rest] - y_d[:, rest]
+    beside = rest + step
+    slope = u[:, beside] - u[:, rest] if 0 <= beside < n else np.zeros(2)
+    x = np.arange(part.shape[1]) / length
+    value = (1 + 2 * x) * (1 - x) ** 2
+    rise = x * (1 - x) ** 2 * length
+    part -= deviation[:, None] * value + slope[:, None] * rise
