@@ -1,0 +1,1 @@
+"""Text to motion and back: lexing, interpreting, planning, sampling, encoding."""

@@ -3,7 +3,8 @@
 One call of `run` walks over whole lines of a buffer and writes rows of moves and events. It stops
 early with a status when a line needs Python (`HANDBACK`), when the output is full (`FULL`), when
 a table must grow (`GROW`) or when the line is an error. All state lives in two small arrays,
-addressed by the ``F_`` (float64) and ``I_`` (int64) slots below, so that Python and kernel share it.
+addressed by the ``F_`` (float64) and ``I_`` (int64) slots below, so that Python and
+kernel share it.
 
 Rules: klippy/gcode.py, klippy/extras/gcode_move.py, klippy/extras/gcode_arcs.py, 2026-08.
 """
@@ -63,15 +64,17 @@ M_LIMITS, M_MODAL, M_KNOWN, M_LINE, M_START, M_STOP, M_LAYER, M_FEATURE, M_OBJEC
 E_KIND, E_MOVE, E_LIMITS, E_MODAL, E_LINE, E_START, E_STOP = range(7)
 
 OK, DONE, HANDBACK, FULL, GROW = 0, 1, 2, 3, 4
-ERROR_INCHES, ERROR_FEED, ERROR_TRAVEL, ERROR_RANGE, ERROR_ARC_RADIUS = 10, 11, 12, 13, 14
-ERROR_ARC_RELATIVE, ERROR_ARC_CENTER, ERROR_ARC_LONG, ERROR_POSITIVE, ERROR_SLOW = 15, 16, 17, 18, 19
+ERROR_INCHES, ERROR_FEED, ERROR_TRAVEL, ERROR_RANGE = 10, 11, 12, 13
+ERROR_ARC_RADIUS, ERROR_ARC_RELATIVE, ERROR_ARC_CENTER, ERROR_ARC_LONG = 14, 15, 16, 17
+ERROR_POSITIVE, ERROR_SLOW = 18, 19
 
 MARK_NONE, MARK_LAYER, MARK_FEATURE, MARK_OBJECT = 0, 1, 2, 3
 MARK_STRIDE = 1 << 32
 
 MAX_VALUE = 1e9  # no coordinate or feedrate of a printer is larger
 MIN_SPEED_MM_S = 1e-4
-MAX_ARC_PIECES = 1_000_000
+MIN_VALUE = 1e-9
+MAX_ARC_PIECES = 200_000
 SMALLEST_MOVE_MM = 1e-9
 
 _HARMLESS, _MODE, _LIMITS, _STOP, _UNKNOWN = 0, 1, 2, 3, 4
@@ -83,17 +86,17 @@ _FNV_PRIME = 1099511628211
 
 @kernel
 def mark_hash(text: Any, start: int, stop: int) -> int:
-    """FNV-1a over the bytes, as a non-negative int64."""
+    """Hash the bytes (FNV-1a) to a positive int64."""
     h = np.int64(_FNV_OFFSET)
     for p in range(start, stop):
         h = (h ^ np.int64(text[p])) * np.int64(_FNV_PRIME)
     h = h & np.int64(0x7FFFFFFFFFFFFFFF)
-    return h if h != 0 else np.int64(1)
+    return int(h) if h != 0 else 1
 
 
 @kernel
 def mark_slot(keys: Any, h: int) -> int:
-    """Slot of a remembered mark, or the free slot where it belongs."""
+    """Find the slot of a remembered mark, or the free slot where it belongs."""
     mask = len(keys) - 1
     slot = h & mask
     while keys[slot] != 0 and keys[slot] != h:
@@ -103,7 +106,7 @@ def mark_slot(keys: Any, h: int) -> int:
 
 @kernel
 def intern_row(rows: Any, index: Any, count: int, row: Any) -> int:
-    """Number of `row` in the append-only table `rows`; equal to `count` if it is new."""
+    """Look `row` up in the append-only table `rows`; the number is `count` if it is new."""
     mask = len(index) - 1
     h = np.int64(0)
     for k in range(rows.shape[1]):
@@ -111,7 +114,7 @@ def intern_row(rows: Any, index: Any, count: int, row: Any) -> int:
     h ^= h >> np.int64(29)
     slot = h & mask
     while True:
-        number = index[slot]
+        number = int(index[slot])
         if number < 0:
             index[slot] = count
             for k in range(rows.shape[1]):
@@ -163,7 +166,7 @@ def put_event(i: Any, ei: Any, ef: Any, kind: int, dwell_s: float) -> None:
     i[I_EVENTS] = n + 1
 
 
-@kernel
+@kernel(inline=True)
 def travel(f: Any, i: Any, mf: Any, mi: Any, named: int, trusted: bool) -> int:
     """Send the tool to F_LAST; write a move unless nothing moves.
 
@@ -242,9 +245,18 @@ def _set_feed(f: Any, i: Any, feed: float, mod_rows: Any, mod_index: Any) -> int
     return OK
 
 
-@kernel
+@kernel(inline=True)
 def _move(
-    w: Any, mask: int, f: Any, i: Any, mf: Any, mi: Any, ei: Any, ef: Any, mod_rows: Any, mod_index: Any
+    w: Any,
+    mask: int,
+    f: Any,
+    i: Any,
+    mf: Any,
+    mi: Any,
+    ei: Any,
+    ef: Any,
+    mod_rows: Any,
+    mod_index: Any,
 ) -> int:
     named = 0
     for k in range(3):
@@ -375,7 +387,7 @@ def _arc(
 @kernel
 def _positive(f: Any, value: float) -> bool:
     f[F_ERROR] = value
-    return 0.0 < value <= MAX_VALUE
+    return MIN_VALUE <= value <= MAX_VALUE
 
 
 @kernel
@@ -481,14 +493,14 @@ def _line_end(buf: Any, p: int, stop: int) -> int:
 
 @kernel
 def _maybe_mark(buf: Any, p: int, end: int) -> bool:
-    """Could the comment (p: behind its semicolon) be a mark that Python knows?"""
+    """Tell whether the comment (p: behind its semicolon) may be a mark that Python knows."""
     while p < end and (buf[p] == 32 or buf[p] == 59):
         p += 1
     if p + 3 >= end:
         return False
     # First two letters, lower case: LA TY CH FE Z: Z_ pr st ME PR BE 'P OB fe -- and our stamp.
-    a = buf[p] | 32
-    b = buf[p + 1] | 32
+    a: int = buf[p] | 32
+    b: int = buf[p + 1] | 32
     if a == 108:
         return b == 97
     if a == 116:
@@ -498,7 +510,7 @@ def _maybe_mark(buf: Any, p: int, end: int) -> bool:
     if a == 102:
         return b == 101
     if a == 122:
-        return b == 58 or buf[p + 1] == 95
+        return b == 58 or b == 127  # colon, underscore
     if a == 112:
         return b == 114
     if a == 115:
@@ -509,7 +521,7 @@ def _maybe_mark(buf: Any, p: int, end: int) -> bool:
         return b == 101
     if a == 111:
         return b == 98
-    return buf[p] == 39 or (buf[p] == 45 and buf[p + 1] == 45)
+    return a == 39 or (a == 45 and b == 45)  # both have bit 5 set
 
 
 @kernel
@@ -646,6 +658,10 @@ def run(
             i[I_END] = min(p + 1, stop)
             if action < 20:
                 put_event(i, ei, ef, action, 0.0)
+            elif action == 20:  # here again: passing so many arrays on costs as much as the rest
+                status = _move(w, mask, f, i, mf, mi, ei, ef, mod_rows, mod_index)
+                if status != OK:
+                    return status
             else:
                 status = execute(
                     action, w, mask, f, i, mf, mi, ei, ef, lim_rows, lim_index, mod_rows, mod_index

@@ -30,7 +30,7 @@ _ROWS = 32_768
 _BOM = b"\xef\xbb\xbf"
 _DEFAULT_SPEED_MM_S = 25.0
 _MARK_SLOTS = 4096
-_LONG_LINE = 4096
+_LONGEST_COMMAND = 65_536
 
 # Words whose numbers a command needs; Klipper does not look at the others.
 _NEEDED = {
@@ -84,7 +84,6 @@ class Interpreter:
         self._offset = 0
         self._first_move = 0
         self._layer_style: str | None = None
-        self._parameters: dict[bytes, tuple[str, dict[str, str]]] = {}
 
         self._f = f = np.zeros(lex.F_SIZE)
         self._i = i = np.zeros(lex.I_SIZE, np.int64)
@@ -265,7 +264,11 @@ class Interpreter:
         if i[lex.I_LINE] == 1 and raw.startswith(_BOM):
             raw = raw[len(_BOM) :]
         text = raw.decode("utf-8", "replace")
-        name = split_line(text if len(text) < _LONG_LINE else text.split(";", 1)[0]).name
+        if len(text) > _LONGEST_COMMAND and len(text.split(";", 1)[0]) > _LONGEST_COMMAND:
+            raise self._problem(
+                f"the command has more than {_LONGEST_COMMAND} characters; is this G-code?", text
+            )
+        name = split_line(text).name
         if not name:
             return self._comment(raw, text)
         if name in KERNEL_WORDS and (self.firmware.arcs or name not in ("G2", "G3")):
@@ -377,7 +380,7 @@ class Interpreter:
         self._note_limits()
         return self._event(EventKind.LIMITS)
 
-    def _retract(self, name: str, text: str) -> int:
+    def _retract(self, name: str, _text: str) -> int:
         """G10 and G11: an E move of its own speed that the absolute E does not see."""
         facts = self._retraction
         assert facts is not None
@@ -463,7 +466,7 @@ class Interpreter:
         f[lex.F_LAST : lex.F_LAST + 3] = saved[lex.F_LAST : lex.F_LAST + 3]
         return self._travel_at(given, 0, text)
 
-    def _home_command(self, name: str, text: str) -> int:
+    def _home_command(self, _name: str, text: str) -> int:
         words = split_line(text).words
         axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in words) or 0b111
         if self.firmware.home_mm is None:
@@ -523,7 +526,7 @@ class Interpreter:
         f[lex.F_SPEED] = speed_before
         return self._event(EventKind.MODE) if status == lex.DONE else status
 
-    def _extended(self, name: str, text: str) -> dict[str, str]:
+    def _extended(self, name: str, text: str) -> Mapping[str, str]:
         return extended_parameters(text, name, line=int(self._i[lex.I_LINE]))
 
     def _flag(self, given: Mapping[str, str], text: str) -> bool:
@@ -636,9 +639,7 @@ def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np
     return np.zeros((rows, columns)), np.full(4 * rows, -1, np.int32)
 
 
-def _grown(
-    rows: NDArray[np.float64], count: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     larger, index = _new_table(rows.shape[1], 2 * len(rows))
     for number in range(count):
         lex.intern_row(larger, index, number, rows[number])
@@ -646,7 +647,7 @@ def _grown(
 
 
 def _number_of(name: str, names: list[str]) -> int:
-    """Number of a name, entered if it is new; -1 for the empty name."""
+    """Return the number of a name, entered if it is new; -1 for the empty name."""
     if not name:
         return -1
     if name not in names:

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
 
 from gcode.errors import GcodeError
 
@@ -26,12 +29,12 @@ class Command:
     ----------
     name : str
         ``G1``, ``M117``, ``SET_VELOCITY_LIMIT``; empty for a blank line or a comment.
-    words : dict of str to str
+    words : mapping of str to str
         Text behind each letter; the last of repeated words.
     """
 
     name: str
-    words: dict[str, str]
+    words: Mapping[str, str]
 
 
 def split_line(text: str) -> Command:
@@ -42,16 +45,21 @@ def split_line(text: str) -> Command:
     text : str
         The line, with or without its newline.
     """
-    parts = _LETTERS.split(text.strip().split(";", 1)[0].upper())
+    return _split(text.strip().split(";", 1)[0])
+
+
+@lru_cache(maxsize=512)  # slicers repeat themselves
+def _split(text: str) -> Command:
+    parts = _LETTERS.split(text.upper())
     head = parts[3:5] if "".join(parts[:2]) == "N" else parts[:3]
     name = "".join(head).strip()
     words = {parts[k]: parts[k + 1].strip() for k in range(1, len(parts), 2)}
     if " " in name and name.split()[0] in _RAW_COMMANDS:
         name = name.split()[0]
-    return Command(name, words)
+    return Command(name, MappingProxyType(words))
 
 
-def extended_parameters(text: str, name: str, *, line: int | None = None) -> dict[str, str]:
+def extended_parameters(text: str, name: str, *, line: int | None = None) -> Mapping[str, str]:
     """Read ``KEY=VALUE`` pairs with the quoting rules of a POSIX shell.
 
     Parameters
@@ -66,9 +74,20 @@ def extended_parameters(text: str, name: str, *, line: int | None = None) -> dic
     GcodeError
         If a quote is not closed or a word has no ``=``.
     """
-    stripped = text.strip()
-    rest = stripped[stripped.upper().find(name) + len(name) :]
-    if not stripped.upper().startswith(name):
+    try:
+        return _pairs(text.strip(), name)
+    except ValueError:
+        raise GcodeError(
+            f"cannot read the parameters of {name}: write KEY=VALUE and close every quote",
+            line=line,
+            text=text,
+        ) from None
+
+
+@lru_cache(maxsize=512)
+def _pairs(text: str, name: str) -> Mapping[str, str]:
+    rest = text[text.upper().find(name) + len(name) :]
+    if not text.upper().startswith(name):
         # Behind a line number there may be a checksum.
         star = rest.rfind("*")
         if star >= 0 and rest[star + 1 :].isdigit():
@@ -76,12 +95,5 @@ def extended_parameters(text: str, name: str, *, line: int | None = None) -> dic
     reader = shlex.shlex(rest, posix=True)
     reader.whitespace_split = True
     reader.commenters = "#;"
-    try:
-        pairs = [word.split("=", 1) for word in reader]
-        return {key.upper(): value for key, value in pairs}
-    except ValueError:
-        raise GcodeError(
-            f"cannot read the parameters of {name}: write KEY=VALUE and close every quote",
-            line=line,
-            text=text,
-        ) from None
+    pairs = [word.split("=", 1) for word in reader]
+    return MappingProxyType({key.upper(): value for key, value in pairs})

@@ -1,0 +1,1 @@
+"""Klipper: its dialect and its planner."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.klipper import _planner_kernels as kernels
@@ -154,7 +154,13 @@ class Planner:
         kernels.drop(self._queue, settled, self._count)
         self._count -= settled
         self._retry = 2 * self._count
-        return Phases(*times, phases.start_mm, phases.direction, *speeds, phases.move_index)
+        return replace(
+            phases,
+            **dict(zip(("t_s", "accel_s", "cruise_s", "decel_s"), times, strict=True)),
+            **dict(
+                zip(("start_mm_s", "cruise_mm_s", "end_mm_s", "accel_mm_s2"), speeds, strict=True)
+            ),
+        )
 
     def _note_limits(self, limits: Sequence[Limits]) -> None:
         if len(limits) != len(self._limits):
@@ -212,11 +218,16 @@ def join_phases(parts: Sequence[Phases]) -> Phases:
 
 
 def _empty(n: int = 0) -> Phases:
-    columns: list[NDArray[np.float64]] = [np.empty(n) for _ in range(8)]
     return Phases(
-        *columns[:4],
-        np.empty((n, 4)),
-        np.empty((n, 4)),
-        *columns[4:],
-        np.empty(n, np.int64),
+        t_s=np.empty(n),
+        accel_s=np.empty(n),
+        cruise_s=np.empty(n),
+        decel_s=np.empty(n),
+        start_mm=np.empty((n, 4)),
+        direction=np.empty((n, 4)),
+        start_mm_s=np.empty(n),
+        cruise_mm_s=np.empty(n),
+        end_mm_s=np.empty(n),
+        accel_mm_s2=np.empty(n),
+        move_index=np.empty(n, np.int64),
     )

@@ -1,0 +1,166 @@
+"""Positions along planned moves, at given times or on a uniform grid.
+
+`sample_phases` samples phases that are all at hand; `Sampler` takes them as they come and gives
+one unbroken uniform grid, standing still through dwells and stops.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode import _sample_kernels as kernels
+from gcode.types import Phases
+
+__all__ = ["Sampler", "Samples", "sample_phases"]
+
+_NO_TIMES: NDArray[np.float64] = np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """A piece of a uniformly sampled motion.
+
+    Attributes
+    ----------
+    t_s : ndarray, shape (n,)
+        Integer multiples of the sampler's step.
+    xyz_mm : ndarray, shape (3, n)
+    e_mm : ndarray, shape (n,)
+    move_index : ndarray of int64, shape (n,)
+        The move in force, or the last one before a stand.
+    """
+
+    t_s: NDArray[np.float64]
+    xyz_mm: NDArray[np.float64]
+    e_mm: NDArray[np.float64]
+    move_index: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+def sample_phases(
+    phases: Phases, t_s: NDArray[np.float64] | tuple[float, float, int]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sample planned moves.
+
+    Parameters
+    ----------
+    phases : Phases
+        At least one, in order of time.
+    t_s : ndarray, shape (n,), or tuple (t0, dt, n)
+        Ascending times, or the grid ``t0 + k dt``.
+
+    Returns
+    -------
+    position_mm : ndarray, shape (4, n)
+        x y z e. Before the first phase its start, behind a phase its end.
+    row : ndarray of int64, shape (n,)
+        Row of `phases` in force.
+
+    Raises
+    ------
+    ValueError
+        If there are no phases, or the times descend or are not finite.
+    """
+    if len(phases) == 0:
+        raise ValueError("nothing to sample: there are no phases")
+    if isinstance(t_s, tuple):
+        t0_s, dt_s, n = t_s
+        if not (math.isfinite(t0_s) and dt_s > 0 and math.isfinite(dt_s) and n >= 0):
+            raise ValueError(f"the grid (t0 {t0_s}, dt {dt_s}, n {n}) needs dt > 0 and n >= 0")
+        return _sweep(phases, _NO_TIMES, t0_s, dt_s, 0, n)
+    times = np.ascontiguousarray(t_s, np.float64)
+    if times.ndim != 1 or not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
+        raise ValueError("the sampling times must be finite and ascending")
+    return _sweep(phases, times, 0.0, 1.0, 0, len(times))
+
+
+class Sampler:
+    """Sample a stream of phases on the grid ``t = k dt``, k = 0, 1, ...
+
+    Parameters
+    ----------
+    dt_s : float
+        Step.
+    """
+
+    def __init__(self, dt_s: float) -> None:
+        if not (dt_s > 0 and math.isfinite(dt_s)):
+            raise ValueError(f"the sampling step {dt_s} s must be above 0")
+        self.dt_s = dt_s
+        self._next = 0
+        self._last: Phases | None = None
+
+    def push(self, phases: Phases) -> Samples:
+        """Take the next phases; return the samples up to the end of the last of them."""
+        if len(phases) == 0:
+            return _no_samples()
+        known = phases if self._last is None else _join(self._last, phases)
+        self._last = _tail(phases)
+        # A sample that falls on the end belongs to what comes next.
+        return self._sample(known, math.ceil(_end_s(phases) / self.dt_s))
+
+    def flush(self) -> Samples:
+        """Return the rest: the last sample stands at the end of the last phase."""
+        if self._last is None:
+            return _no_samples()
+        return self._sample(self._last, math.ceil(_end_s(self._last) / self.dt_s) + 1)
+
+    def _sample(self, phases: Phases, stop: int) -> Samples:
+        n = max(stop - self._next, 0)
+        position, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, n)
+        t_s = (self._next + np.arange(n)) * self.dt_s
+        self._next += n
+        return Samples(t_s, position[:3], position[3], phases.move_index[row])
+
+
+def _sweep(
+    phases: Phases, times: NDArray[np.float64], t0_s: float, dt_s: float, first: int, n: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    position = np.empty((4, n))
+    row = np.empty(n, np.int64)
+    kernels.sweep(
+        times,
+        t0_s,
+        dt_s,
+        first,
+        phases.t_s,
+        phases.accel_s,
+        phases.cruise_s,
+        phases.decel_s,
+        phases.start_mm,
+        phases.direction,
+        phases.start_mm_s,
+        phases.cruise_mm_s,
+        phases.accel_mm_s2,
+        position,
+        row,
+    )
+    return position, row
+
+
+def _end_s(phases: Phases) -> float:
+    return float(phases.t_s[-1] + phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1])
+
+
+def _tail(phases: Phases) -> Phases:
+    """Copy the last phase."""
+    return Phases(*(getattr(phases, name)[-1:].copy() for name in Phases.__dataclass_fields__))
+
+
+def _join(first: Phases, second: Phases) -> Phases:
+    return Phases(
+        *(
+            np.concatenate((getattr(first, name), getattr(second, name)))
+            for name in Phases.__dataclass_fields__
+        )
+    )
+
+
+def _no_samples() -> Samples:
+    return Samples(np.empty(0), np.empty((3, 0)), np.empty(0), np.empty(0, np.int64))
