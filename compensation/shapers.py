@@ -159,7 +159,10 @@ class ShaperCompensator:
         self._blend = max(2, round(0.03 / dt_s))
 
     def compensate(
-        self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]  # noqa: ARG002
+        self,
+        y_d_mm: Array,
+        extruding: NDArray[np.bool_],  # noqa: ARG002
+        rests: NDArray[np.int64],
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
         shaped = np.stack(

@@ -161,7 +161,10 @@ class Zpetc:
         """What the last run used for X and Y."""
 
     def compensate(
-        self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]  # noqa: ARG002
+        self,
+        y_d_mm: Array,
+        extruding: NDArray[np.bool_],  # noqa: ARG002
+        rests: NDArray[np.int64],
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
         rows, used = [], []

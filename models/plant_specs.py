@@ -328,7 +328,7 @@ def _complex(*parts: NDArray[np.generic]) -> NDArray[np.complex128]:
 
 
 def _conjugate(listed: tuple[Complex, ...], what: str) -> NDArray[np.complex128]:
-    """Listed roots as an array, exactly closed under conjugation."""
+    """Return the listed roots, exactly closed under conjugation."""
     roots = np.array([complex(*r) for r in listed], dtype=complex)
     upper = roots[roots.imag > 0]
     lower = list(roots[roots.imag < 0])

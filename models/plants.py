@@ -290,7 +290,7 @@ def _discretised(spec: PlantSpec, dt_s: float) -> DiscretePlant:
 
 
 def _as_sampled(spec: PlantSpec) -> DiscretePlant:
-    """A discrete document at its own sampling time."""
+    """Realise a discrete document at its own sampling time."""
     dt_s = spec.sampling_s
     assert dt_s is not None
     if isinstance(spec, FirSpec):

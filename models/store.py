@@ -78,7 +78,7 @@ def _from_file(path: Path) -> Machine:
 
 
 def _explain(error: ValidationError) -> str:
-    """The first complaint in one line, with the number of further ones."""
+    """Tell the first complaint in one line, with the number of further ones."""
     complaints = error.errors(include_url=False)
     # An unfitting branch of a union complains too; the deepest complaint is the one meant.
     first = max(complaints, key=lambda c: len(c["loc"]))

@@ -1,0 +1,1 @@
+"""What a machine does with a command: plant response and error measures."""
