@@ -114,7 +114,7 @@ class Sampler:
     def _sample(self, phases: Phases, stop: int) -> Samples:
         n = max(stop - self._next, 0)
         position, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, n)
-        t_s = (self._next + np.arange(n)) * self.dt_s
+        t_s = np.arange(self._next, self._next + n, dtype=np.float64) * self.dt_s
         self._next += n
         return Samples(t_s, position[:3], position[3], phases.move_index[row])
 

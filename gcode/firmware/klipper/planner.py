@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -154,12 +153,18 @@ class Planner:
         kernels.drop(self._queue, settled, self._count)
         self._count -= settled
         self._retry = 2 * self._count
-        return replace(
-            phases,
-            **dict(zip(("t_s", "accel_s", "cruise_s", "decel_s"), times, strict=True)),
-            **dict(
-                zip(("start_mm_s", "cruise_mm_s", "end_mm_s", "accel_mm_s2"), speeds, strict=True)
-            ),
+        return Phases(
+            times[0],
+            times[1],
+            times[2],
+            times[3],
+            phases.start_mm,
+            phases.direction,
+            speeds[0],
+            speeds[1],
+            speeds[2],
+            speeds[3],
+            phases.move_index,
         )
 
     def _note_limits(self, limits: Sequence[Limits]) -> None:
