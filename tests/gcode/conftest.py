@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from models.machine import Machine
+from models.store import load_machine
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    beside = Path(__file__).parents[3] / "shared"
+    folder = Path(os.environ.get("STILLPATH_SHARED", beside))
+    if not folder.is_dir():
+        pytest.skip(f"NO SHARED TEST DATA at {folder}: set STILLPATH_SHARED")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def golden_machine() -> Machine:
+    """Klipper with the limits of the golden plans; X Y Z travel -1000 to 1000 mm."""
+    return load_machine("klipper-golden")
+
+
+@pytest.fixture(scope="session")
+def wary_machine(golden_machine: Machine) -> Machine:
+    """The same, but unknown commands may be macros and homing leaves the place unknown."""
+    firmware = golden_machine.firmware.model_copy(
+        update={"unknown_commands": "unknown", "home_mm": None}
+    )
+    return golden_machine.model_copy(update={"firmware": firmware})

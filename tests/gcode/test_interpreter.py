@@ -1,0 +1,304 @@
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcode.errors import GcodeError
+from gcode.interpreter import Interpreter, interpret_bytes
+from gcode.types import EventKind, ProgramBlock
+from models.machine import Machine
+
+
+def run(text: str, machine: Machine) -> ProgramBlock:
+    """The one block of a small program."""
+    (block,) = interpret_bytes(text.encode(), machine)
+    return block
+
+
+def ends(block: ProgramBlock) -> list[list[float]]:
+    return block.moves.end_mm.round(9).tolist()
+
+
+def kinds(block: ProgramBlock) -> list[EventKind]:
+    return [EventKind(kind) for kind in block.events.kind]
+
+
+def test_words(golden_machine: Machine) -> None:
+    block = run(
+        "G28\nM83\ng1x10y5f3000\nG1X20.Y.5E.02\nG1 X+21 Y-0.0\n  \tG1\tX27\tY8\tE.1   \r\n"
+        "G1 X92 X93 ; X5\nN4G1X83Y80\nN1 G1 X81 Y80 E.1*83\nG1 X1.5E1\n"
+        "G1 X94.123456789012345678\nG0 X1e-2\n",
+        golden_machine,
+    )
+    assert ends(block) == [
+        [10, 5, 0, 0],
+        [20, 0.5, 0, 0.02],
+        [21, 0, 0, 0.02],
+        [27, 8, 0, 0.12],
+        [93, 8, 0, 0.12],
+        [83, 80, 0, 0.12],
+        [81, 80, 0, 0.22],
+        [1.5, 80, 0, 1.22],
+        [94.123456789, 80, 0, 1.22],
+        [1, 80, 0, -0.78],
+    ]
+    assert block.moves.line.tolist() == list(range(3, 13))
+    assert block.moves.speed_mm_s.tolist() == [50.0] * 10
+
+
+def test_modes_and_origins(golden_machine: Machine) -> None:
+    block = run(
+        "G28\nG1 X10 E5\nG92 X0 E0\nG1 X10 E1\nG91\nG1 X1 E1\nG90\nG1 X0 E3\nM83\nG1 E1\nM82\n"
+        "G92\nG1 X1 E1\n",
+        golden_machine,
+    )
+    x_and_e = [[row[0], row[3]] for row in ends(block)]
+    assert x_and_e == [[10, 5], [20, 6], [21, 7], [10, 8], [10, 9], [11, 10]]
+    modal = [block.modal[k] for k in block.moves.modal_id]
+    assert [m.absolute_xyz for m in modal] == [True, True, False, True, True, True]
+    assert [m.absolute_e for m in modal] == [True, True, True, True, False, True]
+
+
+def test_factors(golden_machine: Machine) -> None:
+    block = run(
+        "G28\nG1 X10 E10 F6000\nM221 S50\nG1 X20 E12\nM220 S50\nG1 X30\nG1 X40 F3000\nM220\n"
+        "G1 X50\nM221\nG1 X60 E13\n",
+        golden_machine,
+    )
+    assert block.moves.end_mm[:, 3].tolist() == [10, 11, 11, 11, 11, 12]
+    assert block.moves.speed_mm_s == pytest.approx([100, 100, 50, 25, 50, 50])
+    assert block.modal[block.moves.modal_id[3]].speed_factor == pytest.approx(0.5)
+    assert block.modal[block.moves.modal_id[3]].feedrate_mm_min == 3000
+
+
+def test_limits(golden_machine: Machine) -> None:
+    block = run(
+        "M204 S1000\nM204 P800 T1500 R9\nM204 P700\n"
+        "set_velocity_limit velocity=250 ACCEL=4000 ACCEL_TO_DECEL=2000 ; x\n"
+        'SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY="8" MINIMUM_CRUISE_RATIO=0\n',
+        golden_machine,
+    )
+    assert kinds(block) == [EventKind.LIMITS] * 5
+    after = [block.limits[k] for k in block.events.limits_id]
+    assert [limit.accel_mm_s2 for limit in after] == [1000, 800, 800, 4000, 4000]
+    assert after[-1].velocity_mm_s == 250
+    assert after[-1].square_corner_velocity_mm_s == 8
+    assert after[-1].minimum_cruise_ratio == 0
+
+
+def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
+    block = run("G28\nG1 X10\nM83\nG3 X0 Y10 Z1 I-10 J0 E2\n", golden_machine)
+    arc = block.moves.end_mm[1:]
+    n = int(np.hypot(5 * np.pi, 1.0) / 0.1)
+    assert len(arc) == n
+    assert np.hypot(arc[:, 0], arc[:, 1]) == pytest.approx(np.full(n, 10.0))
+    assert arc[-1].tolist()[:3] == [0, 10, 1]
+    assert arc[-1, 3] == pytest.approx(2)
+    assert np.diff(arc[:, 2]) == pytest.approx(np.full(n - 1, 1 / n))
+    assert set(block.moves.line[1:].tolist()) == {4}
+    circle = run("G28\nG1 X10\nG2 I-10 J0\n", golden_machine).moves.end_mm[1:]
+    assert len(circle) == 628
+    assert circle[0, 1] < 0  # clockwise
+    assert circle[-1].tolist() == [10, 0, 0, 0]
+    upright = run("G28\nG18\nG2 X20 I10 K0\n", golden_machine).moves.end_mm
+    assert np.all(upright[:, 1] == 0)
+    assert np.abs(upright[:, 2]).max() == pytest.approx(10, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("G20", "inches"),
+        ("G1 X1..2", "not a number"),
+        ("G1 X", "not a number"),
+        ("G1 X5 F0", "feedrate"),
+        ("G1 X5 F-5", "feedrate"),
+        ("G1 X1001", "X 1001.000 mm lies outside.*1000.000"),
+        ("G1 X" + "9" * 400, "out of range"),
+        ("G2 X5 Y5 R5", "R"),
+        ("G2 X5 Y5", "centre"),
+        ("G91\nG2 X5 I5", "G90"),
+        ("G2 X5 I1e9", None),
+        ("G2 X5 I100000000", "pieces"),
+        ("M220 S0", "above 0"),
+        ("M204 S-5", "above 0"),
+        ("G4 P-1", "P of G4"),
+        ("RESTORE_GCODE_STATE NAME=none", "SAVE_GCODE_STATE"),
+        ("SET_VELOCITY_LIMIT ACCEL=0", "above 0"),
+        ("SET_VELOCITY_LIMIT ACCEL=nan", "out of range"),
+        ('SET_VELOCITY_LIMIT ACCEL="5', "quote"),
+        ("SET_VELOCITY_LIMIT ACCEL", "KEY=VALUE"),
+    ],
+)
+def test_refused(line: str, words: str | None, golden_machine: Machine) -> None:
+    if words is None:  # I1e9 is I1 and E9
+        run(f"G28\n{line}\n", golden_machine)
+        return
+    with pytest.raises(GcodeError, match=words) as caught:
+        run(f"G28\n{line}\n", golden_machine)
+    assert caught.value.line == 2 + line.count("\n")
+    assert caught.value.text
+
+
+def test_bounds_only_where_known(wary_machine: Machine) -> None:
+    run("G91\nG1 X5000\n", wary_machine)
+    with pytest.raises(GcodeError, match="X 5000"):
+        run("G1 X5000\n", wary_machine)
+    (block,) = interpret_bytes(b"G1 X5000\n", wary_machine, strict_bounds=False)
+    assert len(block.moves) == 1
+
+
+def test_known_axes(wary_machine: Machine) -> None:
+    block = run(
+        "G28\nG1 X5\nG1 X6 Y5\nG1 X7 Y6\nSTART_PRINT A=1\nG91\nG1 X1\nG90\nG1 X1\nG1 X2\n"
+        "G28 X\nG1 X0 Y0\n",
+        wary_machine,
+    )
+    assert block.moves.known.tolist() == [0, 1, 3, 0, 0, 1, 0]
+    assert kinds(block)[:2] == [EventKind.UNKNOWN, EventKind.UNKNOWN]
+    # A named axis whose place we do not know may move, though we guess it stands there.
+    assert kinds(run("G28\nG1 X0\nG1 X0\n", wary_machine))[1:] == [
+        EventKind.UNKNOWN,
+        EventKind.MODE,
+    ]
+
+
+def test_classes(wary_machine: Machine) -> None:
+    expected = {
+        "; comment": EventKind.HARMLESS,
+        "": EventKind.HARMLESS,
+        "M106 S255": EventKind.HARMLESS,
+        "M104 S200": EventKind.HARMLESS,
+        "SET_PRESSURE_ADVANCE ADVANCE=0.05": EventKind.HARMLESS,
+        "M117 G1 X500 Y500 ; not a move": EventKind.HARMLESS,
+        "M117 100% done (really)": EventKind.HARMLESS,
+        'RESPOND MSG="G1 X1; quoted"': EventKind.HARMLESS,
+        "M862.3 P \"MK3S\"": EventKind.HARMLESS,
+        "(full line comment G1 X5)": EventKind.HARMLESS,
+        "/G1 X1 Y1": EventKind.HARMLESS,
+        "G1(inline comment X99)X26": EventKind.HARMLESS,
+        "M205 X8": EventKind.HARMLESS,
+        "G1 F1800": EventKind.MODE,
+        "G21": EventKind.HARMLESS,
+        "M400": EventKind.STOP,
+        "M109 S200": EventKind.STOP,
+        "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=5": EventKind.STOP,
+        "G4 P200": EventKind.STOP,
+        "T0": EventKind.UNKNOWN,
+        "M600": EventKind.UNKNOWN,
+        "G29": EventKind.UNKNOWN,
+        "PAUSE": EventKind.UNKNOWN,
+        "MY_MACRO X=5": EventKind.UNKNOWN,
+        "M84": EventKind.UNKNOWN,
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=0": EventKind.SHAPER,
+        "EXCLUDE_OBJECT_START NAME=a": EventKind.OBJECT,
+        "EXCLUDE_OBJECT_DEFINE NAME=a": EventKind.HARMLESS,
+        "M486 S-1": EventKind.OBJECT,
+        "; Processed by stillpath 1.0": EventKind.STAMP,
+        "; stillpath: report": EventKind.STAMP,
+    }
+    block = run("\n".join(expected) + "\n", wary_machine)
+    assert dict(zip(expected, kinds(block), strict=True)) == expected
+    assert block.events.dwell_s.sum() == pytest.approx(0.2)
+
+
+def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
+    firmware = wary_machine.firmware.model_copy(
+        update={"harmless_macros": ("_on_layer",), "stopping_macros": ("CLEAN", "M600")}
+    )
+    machine = wary_machine.model_copy(update={"firmware": firmware})
+    block = run("_ON_LAYER LAYER=1\nCLEAN\nm600\nOTHER\n", machine)
+    assert kinds(block) == [
+        EventKind.HARMLESS,
+        EventKind.STOP,
+        EventKind.STOP,
+        EventKind.UNKNOWN,
+    ]
+
+
+def test_firmware_retraction(golden_machine: Machine) -> None:
+    block = run("G28\nG1 X5 E1 F6000\nG10\nG10\nG1 X6\nG11\nG1 X7 E2\n", golden_machine)
+    assert block.moves.end_mm[:, 3] == pytest.approx([1, 0.2, 0.2, 1, 2])
+    assert block.moves.speed_mm_s == pytest.approx([100, 35, 100, 35, 100])
+    assert block.moves.known.tolist() == [7, 0, 7, 0, 7]
+
+
+def test_states_and_offsets(golden_machine: Machine) -> None:
+    block = run(
+        "G28\nG1 X5 Y5 E1 F6000\nSAVE_GCODE_STATE NAME=a\nG91\nG1 X5 E2 F60\n"
+        "RESTORE_GCODE_STATE NAME=a MOVE=1 MOVE_SPEED=7\nG1 X6 E2\n"
+        "SET_GCODE_OFFSET Z_ADJUST=0.05 MOVE=1\nSET_GCODE_OFFSET X=1\nG1 X6\n",
+        golden_machine,
+    )
+    assert ends(block)[1:] == [
+        [10, 5, 0, 3],
+        [5, 5, 0, 3],
+        [6, 5, 0, 4],
+        [6, 5, 0.05, 4],
+        [7, 5, 0.05, 4],
+    ]
+    assert block.moves.speed_mm_s.tolist() == pytest.approx([100, 1, 7, 100, 100, 100])
+
+
+def test_marks(golden_machine: Machine) -> None:
+    text = (
+        "G28\n;LAYER_CHANGE\n;Z:.3\n;TYPE:Perimeter\n; printing object A id:0 copy 0\nG1 X1\n"
+        "; stop printing object A id:0 copy 0\n;TYPE:Infill\nG1 X2\n;LAYER_CHANGE\n;Z:.5\n"
+        ";TYPE:Perimeter\nG1 X3\n;LAYER_CHANGE\nG1 X4\nEXCLUDE_OBJECT_START NAME='b c'\nG1 X5\n"
+    )
+    interpreter = Interpreter(golden_machine)
+    (block,) = interpreter.push(text.encode())
+    assert block.moves.layer.tolist() == [0, 0, 1, 2, 2]
+    assert [interpreter.feature_names[k] for k in block.moves.feature] == [
+        "Perimeter",
+        "Infill",
+        *["Perimeter"] * 3,
+    ]
+    assert block.moves.object_id.tolist() == [0, -1, -1, -1, 1]
+    assert interpreter.object_names == ["A id:0 copy 0", "B C"]
+    assert interpreter.layer_z_mm[:2] == [0.3, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("layer", "feature"),
+    [
+        (";LAYER:0", ";TYPE:WALL-OUTER"),
+        ("; CHANGE_LAYER", "; FEATURE: Outer wall"),
+        ("N7 ; CHANGE_LAYER", "N8 ; FEATURE: Outer wall"),
+        ("; BEGIN_LAYER_OBJECT z=0.3", "; 'Perimeter Path', 1.2 [feed mm/s]"),
+        (";; --- layer 0 (0.3) ---", "; feature wall"),
+    ],
+)
+def test_marks_of_slicers(layer: str, feature: str, golden_machine: Machine) -> None:
+    block = run(f"G28\n{layer}\n{feature}\nG1 X1\n", golden_machine)
+    assert (block.moves.layer.tolist(), block.moves.feature.tolist()) == ([0], [0])
+
+
+def test_bom_and_line_ends(golden_machine: Machine) -> None:
+    data = b"\xef\xbb\xbfG91\r\nG1 X1\nG1 X1\r\nG1 X1"
+    (first,), (last,) = (lambda i: (i.push(data), i.flush()))(Interpreter(golden_machine))
+    assert first.text + last.text == data
+    assert last.moves.end_mm[0, 0] == 3
+    assert (last.moves.byte_start[0], last.moves.byte_end[0]) == (len(data) - 5, len(data))
+
+
+@pytest.mark.shared
+def test_corpus_bytes_are_covered(golden_machine: Machine, shared_dir: Path) -> None:
+    refused = set()
+    for path in sorted((shared_dir / "corpus").glob("*/*.gz")):
+        data = gzip.decompress(path.read_bytes())
+        try:
+            blocks = interpret_bytes(data, golden_machine)
+        except GcodeError as error:
+            assert error.line
+            refused.add(path.name.split(".")[0])
+            continue
+        assert b"".join(block.text for block in blocks) == data
+    assert refused == {
+        "hm_arcs_planes_marlin",  # R arcs
+        "hm_cnc_inches_g20_numbered",
+        "hm_laser_grbl",  # R arcs
+    }
