@@ -1,8 +1,8 @@
 """Making a filtered command stand still where the machine must not move.
 
 A filter spreads every motion over its length; a rest (retraction, Z hop) cuts that off. Before
-the rest the command is led onto the resting position, after it from there back to the filter's
-output, by the cubic that matches position and speed at both of its ends.
+the rest the command is led onto the plan, after it from there back to the filter's output, by the
+cubic in their difference that matches position and speed at both of its ends.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def _lead(part: Array, u: Array, y_d: Array, rest: int, step: int) -> None:
         return
     n = u.shape[1]
     deviation = u[:, rest] - y_d[:, rest]
-    beside = rest + step
-    slope = u[:, beside] - u[:, rest] if 0 <= beside < n else np.zeros(2)
+    beside = min(max(rest + step, 0), n - 1)
+    slope = u[:, beside] - y_d[:, beside] - deviation
     x = np.arange(part.shape[1]) / length
     value = (1 + 2 * x) * (1 - x) ** 2
     rise = x * (1 - x) ** 2 * length

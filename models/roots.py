@@ -70,7 +70,7 @@ def check_stable(roots: Roots) -> None:
     if len(roots.poles) == 0:
         return
     if roots.dt_s is None:
-        near = np.abs(roots.poles) < 1e-9 * np.abs(roots.poles).max()
+        near = np.abs(roots.poles) <= 1e-9 * np.abs(roots.poles).max()
         bad = roots.poles.real >= 0
         rule = "Re s must be below 0"
     else:

@@ -42,6 +42,8 @@ _VERSION = 1
 _COARSE = 4
 _COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
 _STARTS, _FINALISTS = 4, 6
+_REST_S = 0.12
+"""Longer than the longest shaper, 3hump_ei at 20 Hz: 0.1 s."""
 
 FREQUENCIES_HZ: Array = np.array([20.0 * 1.02**k for k in range(117)])
 """The 2 % grid, 117 frequencies."""
@@ -109,10 +111,11 @@ def evaluate_shaper(
     fy_hz: float,
 ) -> BestShaper:
     """Measure one shaper with all points, the way every other motion is measured."""
+    use = extruding if extruding.any() else np.ones(len(extruding), bool)
+    y_d_mm, use = _with_rests(y_d_mm, use, dt_s)
     pulses = [shaper_pulses(kind, f_hz, _ZETA) for f_hz in (fx_hz, fy_hz)]
     u = np.stack([shape(row, dt_s, p) for row, p in zip(y_d_mm, pulses, strict=True)])
     y = response(_plants(machine, dt_s), u)
-    use = extruding if extruding.any() else np.ones(len(extruding), bool)
     contour, tracking = Tally(), Tally()
     contour.add(contour_error(y_d_mm, y, dt_s, stride=2), use[::2])
     tracking.add(tracking_error(y_d_mm, y), use)
@@ -157,10 +160,11 @@ class _Trial:
     def __init__(
         self, machine: Machine, y_d_mm: Array, dt_s: float, extruding: NDArray[np.bool_]
     ) -> None:
-        self._y_d = np.ascontiguousarray(y_d_mm)
+        use = extruding if extruding.any() else np.ones(len(extruding), bool)
+        self._y_d, use = _with_rests(y_d_mm, use, dt_s)
         self._dt_s = dt_s
         self._answer = response(_plants(machine, dt_s), self._y_d)
-        chosen = np.flatnonzero(extruding) if extruding.any() else np.arange(y_d_mm.shape[1])
+        chosen = np.flatnonzero(use)
         self._chosen = chosen.astype(np.int64)
         self._points: dict[int, _Points] = {}
         self._shaped: dict[tuple[int, str, int, int], Array] = {}
@@ -232,6 +236,14 @@ def _descend(
         if value >= best:
             return best, i, j
         best, i, j = value, a, b
+
+
+def _with_rests(
+    y_d_mm: Array, use: NDArray[np.bool_], dt_s: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Add standstill before and after: a centred shaper begins early and ends late."""
+    pad = 2 * round(_REST_S / dt_s / 2)
+    return np.pad(y_d_mm, ((0, 0), (pad, pad)), mode="edge"), np.pad(use, pad)
 
 
 def _plants(machine: Machine, dt_s: float) -> list[DiscretePlant]:

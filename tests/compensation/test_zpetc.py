@@ -1,0 +1,124 @@
+"""ZPETC: zero phase by frequency response, and that it tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.base import DesignError, compensator
+from compensation.holds import stand_still
+from compensation.zpetc import Zpetc, ZpetcFilter, zero_phase_fir
+from models.machine import Machine
+from models.plants import ZpkSpec, discretise, plant_set
+from models.store import load_machine
+
+F_HZ = np.linspace(0.5, 450, 200)
+NO_RESTS = np.zeros((0, 2), np.int64)
+
+
+def strokes() -> np.ndarray:
+    """Back and forth on both axes: 20 mm, 100 mm/s, 3000 mm/s2, at rest at both ends."""
+    accel = np.concatenate([np.full(33, 3000.0), np.zeros(167), np.full(33, -3000.0)])
+    profile = np.concatenate([np.zeros(200), accel, np.zeros(120), -accel, np.zeros(500)])
+    x = np.cumsum(np.cumsum(profile)) * 1e-6
+    return np.stack([x, np.roll(x, 40)])
+
+
+def answer(machine: Machine, u: np.ndarray) -> np.ndarray:
+    rows = []
+    for axis, row in zip(("x", "y"), u, strict=True):
+        plant = plant_set(machine.axes[axis], 1e-3).nominal
+        pulse = plant.impulse_response(u.shape[1])
+        rows.append(row[0] + np.convolve(pulse, row - row[0])[: u.shape[1]])
+    return np.array(rows)
+
+
+def test_fir_of_paper_002() -> None:
+    np.testing.assert_allclose(
+        zero_phase_fir(500, 1e-4, 5)[5:],
+        [0.2116, 0.1514, 0.1062, 0.0716, 0.0441, 0.0210],
+        atol=5e-5,
+    )
+    once, twice = zero_phase_fir(100, 1e-3, 8), zero_phase_fir(100, 1e-3, 8, passes=2)
+    np.testing.assert_allclose(twice, np.convolve(once, once))
+    with pytest.raises(DesignError, match="cutoff"):
+        zero_phase_fir(600, 1e-3)
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v0", "annex-k3", "taz6-x", "generic-corexy"])
+def test_phase_is_zero_and_gain_is_that_of_the_reflected_zeros(name: str) -> None:
+    plant = plant_set(load_machine(name).axes["x"], 1e-3).nominal
+    design = ZpetcFilter(plant)
+    through = design.response(F_HZ, 1e-3) * plant.frequency_response(F_HZ)
+    at = np.exp(2j * np.pi * F_HZ * 1e-3)[:, None]
+    kept = design.uncancelled
+    expected = np.prod(np.abs(at - kept) ** 2, axis=1) / np.prod(np.abs(1 - kept) ** 2)
+    np.testing.assert_allclose(through, expected, rtol=1e-7, atol=1e-9)
+
+
+def test_filter_is_its_frequency_response() -> None:
+    plant = plant_set(load_machine("voron-v0").axes["y"], 1e-3).nominal
+    design = ZpetcFilter(plant)
+    impulse = np.zeros(4096)
+    impulse[2048] = 1.0
+    out = design.apply(impulse)
+    spectrum = np.fft.fft(np.roll(out, -2048))[1:2000]
+    f_hz = np.arange(1, 2000) / 4.096
+    np.testing.assert_allclose(spectrum, design.response(f_hz, 1e-3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "limit_um"),
+    [("ender3", 8.0), ("voron-v0", 2.0), ("generic-corexy", 2.0), ("taz6-x", 100.0)],
+)
+def test_it_tracks(name: str, limit_um: float) -> None:
+    machine, y_d = load_machine(name), strokes()
+    made = compensator("zpetc", machine, 1e-3)
+    assert isinstance(made, Zpetc)
+    u = made.compensate(y_d, np.ones(y_d.shape[1], bool), NO_RESTS)
+    after = np.abs(answer(machine, u) - y_d).max() * 1e3
+    before = np.abs(answer(machine, y_d) - y_d).max() * 1e3
+    assert after < min(limit_um, before / 5)
+    assert np.abs(np.diff(u, 2)).max() <= 20_000e-6
+    np.testing.assert_array_equal(u[:, [0, -1]], y_d[:, [0, -1]])
+
+
+def test_rests_are_kept() -> None:
+    machine, y_d = load_machine("ender3"), strokes()
+    rests = np.array([[480, 540]])
+    u = compensator("zpetc", machine, 1e-3).compensate(y_d, np.ones(y_d.shape[1], bool), rests)
+    assert np.all(np.diff(u[:, 479:540]) == 0)
+
+
+def test_refusals() -> None:
+    # A zero on the circle at 100 Hz.
+    angle = 0.2 * np.pi
+    zero = (float(np.cos(angle)), float(np.sin(angle)))
+    spec = ZpkSpec(
+        zeros=(zero, (zero[0], -zero[1])), poles=((0.5, 0.2), (0.5, -0.2), (0.3, 0)), dt_s=1e-3
+    )
+    with pytest.raises(DesignError, match=r"unit circle \(100 Hz\)"):
+        ZpetcFilter(discretise(spec, 1e-3))
+    machine = load_machine("ender3")
+    slow = machine.model_copy(
+        update={"command": machine.command.model_copy(update={"accel_mm_s2": 100.0})}
+    )
+    y_d = strokes()
+    with pytest.raises(DesignError, match="zpetc, axis x: even with a low-pass"):
+        compensator("zpetc", slow, 1e-3).compensate(y_d, np.ones(y_d.shape[1], bool), NO_RESTS)
+
+
+def test_stand_still_joins_smoothly() -> None:
+    t = np.arange(600)
+    y_d = np.stack([np.clip(t - 100, 0, 200) * 0.1 + np.clip(t - 400, 0, 100) * 0.1] * 2)
+    u = y_d + 0.05 * np.sin(t / 9.0)
+    out = stand_still(u, y_d, np.array([[301, 400]]), 30)
+    assert np.all(out[:, 300:400] == y_d[:, [350]])
+    untouched = slice(31, 269)
+    np.testing.assert_array_equal(out[:, untouched], u[:, untouched])
+    jump = np.abs(np.diff(out - y_d)).max()
+    assert jump < 0.01
+    # Adjacent rests and rests at the ends.
+    edge = stand_still(u, y_d, np.array([[0, 50], [50, 101], [590, 600]]), 30)
+    assert np.all(edge[:, :101] == y_d[:, [100]])
+    assert np.all(edge[:, 589:] == y_d[:, [599]])

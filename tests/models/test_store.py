@@ -1,0 +1,116 @@
+"""The library and what users give instead of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models.errors import ModelError
+from models.plants import PairsSpec, TfSpec, plant_set
+from models.repair import repair_rounded
+from models.store import builtin_machines, load_machine, read_machine
+
+FITTED = {"ender3": "ender3", "voron-v0": "voron_v0", "voron-v24-250": "voron_v24_250",
+          "annex-k3": "annex_k3"}  # fmt: skip
+
+
+@pytest.fixture
+def document() -> dict[str, Any]:
+    return load_machine("ender3").model_dump(mode="json")
+
+
+def test_the_library_loads() -> None:
+    assert {*FITTED, "generic-bedslinger", "generic-corexy", "taz6-x", "klipper-golden"} == set(
+        builtin_machines()
+    )
+    for name in builtin_machines():
+        machine = load_machine(name)
+        assert machine.name == name
+        for axis in ("x", "y"):
+            plants = plant_set(machine.axes[axis], 1e-3)
+            assert all(np.abs(p.poles()).max() < 1 for p in plants.members)
+            assert all(abs(p.frequency_response(0.0)[0] - 1) < 1e-9 for p in plants.members)
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", sorted(FITTED))
+def test_fitted_printers_are_those_of_the_golden_file(name: str, shared_dir: Path) -> None:
+    golden = json.loads((shared_dir / "golden" / "printers.json").read_text())[FITTED[name]]
+    machine = load_machine(name)
+    for axis in ("x", "y"):
+        expected = {k: golden[axis][k] for k in ("poles", "zeros", "real_zero_tau_s")}
+        spec = machine.axes[axis]
+        assert spec.nominal == PairsSpec.model_validate(expected)
+        assert len(spec.weighted_members()) == 10
+    assert machine.travel["x"].min_mm == -10
+    assert machine.command.accel_mm_s2 == 20_000
+    assert machine.firmware.planner.max_velocity_mm_s == 500
+
+
+def test_taz_is_the_repaired_print() -> None:
+    num, den, _ = repair_rounded(
+        (0.0874, -0.3415, 0.5118, -0.3481, 0.09063),
+        (1.0, -4.54, 8.283, -7.583, 3.479, -0.639),
+        (4, 4, 4, 4, 5),
+        (3,) * 6,
+    )
+    nominal = load_machine("taz6-x").axes["x"].nominal
+    assert isinstance(nominal, TfSpec)
+    np.testing.assert_allclose(nominal.num, num, rtol=1e-14)
+    np.testing.assert_allclose(nominal.den, den, rtol=1e-14)
+
+
+def test_golden_klipper_facts() -> None:
+    firmware = load_machine("klipper-golden").firmware
+    assert firmware.unknown_commands == "skip"
+    assert firmware.arc_resolution_mm == 0.1
+    assert firmware.home_mm == (0, 0, 0)
+    assert not firmware.homed_at_start
+
+
+def test_a_file_of_ones_own(tmp_path: Path, document: dict[str, Any]) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(document))
+    assert load_machine(path) == load_machine("ender3")
+    assert load_machine(str(path)).revision == load_machine("ender3").revision
+
+
+def test_unknown_names_and_files(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="did you mean voron-v0"):
+        load_machine("voron_v0")
+    with pytest.raises(ModelError, match="Built in are annex-k3"):
+        load_machine("zzz")
+    with pytest.raises(ModelError, match="cannot read the machine file"):
+        load_machine(tmp_path / "none.json")
+    (tmp_path / "bad.json").write_bytes(b"\xff{")
+    with pytest.raises(ModelError, match="not JSON"):
+        load_machine(tmp_path / "bad.json")
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("travel", "x", "min_mm"), 900.0, "travel.x: min_mm 900.0 must be below"),
+        (("axes", "x", "nominal", "kind"), "foo", "axes.x.nominal: .*'foo'"),
+        (("axes", "y", "nominal", "poles", 0, "zeta"), -1, r"poles\.0\.zeta: .*given: -1"),
+        (("axes", "x", "members", "frequency_scale"), [1, -2], r"frequency_scale\.1"),
+        (("firmware", "planner", "max_accel_mm_s2"), float("nan"), "max_accel_mm_s2: .*finite"),
+        (("command", "accel_mm_s2"), 0, "accel_mm_s2: .*greater than 0"),
+        (("surprise",), 1, "surprise: Extra inputs"),
+    ],
+)
+def test_a_wrong_field_is_named(
+    document: dict[str, Any], path: tuple[str | int, ...], value: object, message: str
+) -> None:
+    part: Any = document
+    for key in path[:-1]:
+        part = part[key]
+    part[path[-1]] = value
+    with pytest.raises(ModelError, match=message) as raised:
+        read_machine(json.dumps(document), "mine.json")
+    assert str(raised.value).startswith("mine.json: ")
+    assert "\n" not in str(raised.value)

@@ -1,0 +1,149 @@
+"""Error measures against their definitions in plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from simulation.measures import (
+    ContourMeter,
+    GroupTally,
+    MotionMeter,
+    ResidualMeter,
+    Tally,
+    contour_error,
+    distance_to_path,
+    tracking_error,
+)
+
+
+def brute_force(y_d: np.ndarray, y: np.ndarray, i: int, window: int) -> float:
+    """Distance to every segment of the window."""
+    part = y_d[:, max(0, i - window) : i + window + 1]
+    if part.shape[1] == 1:
+        return float(np.hypot(*(y[:, i] - part[:, 0])))
+    step, offset = np.diff(part, axis=1), y[:, i : i + 1] - part[:, :-1]
+    size = np.sum(step**2, axis=0)
+    along = np.clip(np.sum(offset * step, axis=0) / np.where(size > 0, size, 1), 0, 1)
+    return float(np.sqrt(np.sum((offset - along * step) ** 2, axis=0).min()))
+
+
+def wander(seed: int, n: int, deviation: float) -> tuple[np.ndarray, np.ndarray]:
+    """A path with rests, reversals and loops, and points beside it."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rng.normal(scale=0.3, size=n)) + np.pi * np.cumsum(rng.random(n) < 0.03)
+    speed = np.repeat(rng.choice([0.0, 0.02, 0.1], size=n // 7 + 1), 7)[:n]
+    path = np.cumsum(speed * np.vstack([np.cos(heading), np.sin(heading)]), axis=1)
+    return path, path + rng.normal(scale=deviation, size=(2, n))
+
+
+@given(
+    st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([1e-4, 0.02, 1.0]),
+    st.integers(1, 5), st.integers(1, 80), st.lists(st.integers(0, 300), max_size=4),
+)  # fmt: skip
+@settings(max_examples=80, deadline=None)
+def test_contour_meter_is_brute_force(
+    seed: int, n: int, deviation: float, stride: int, window: int, cuts: list[int]
+) -> None:
+    y_d, y = wander(seed, n, deviation)
+    meter = ContourMeter(1e-3, window * 1e-3, stride)
+    edges = [0, *sorted(min(c, n) for c in cuts), n]
+    parts = [meter.push(y_d[:, a:b], y[:, a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    parts.append(meter.flush())
+    index = np.concatenate([part.index for part in parts])
+    np.testing.assert_array_equal(index, np.arange(0, n, stride))
+    expected = [brute_force(y_d, y, i, window) for i in index]
+    errors = np.concatenate([part.error_mm for part in parts])
+    np.testing.assert_allclose(errors, expected, atol=1e-12)
+    np.testing.assert_allclose(
+        distance_to_path(y_d, y[:, index], index, 1e-3, window * 1e-3), expected, atol=1e-12
+    )
+
+
+def test_contour_error_of_a_late_point_is_zero_on_a_straight_line() -> None:
+    y_d = np.vstack([np.arange(500) * 0.1, np.zeros(500)])
+    late = np.roll(y_d, 20, axis=1)
+    late[:, :20] = 0
+    assert contour_error(y_d, late).max() < 1e-12
+    assert tracking_error(y_d, late)[250] == pytest.approx(2.0)
+    assert contour_error(y_d, late + 0.5)[250] == pytest.approx(0.5)
+
+
+def test_few_segments_are_looked_at() -> None:
+    y_d = np.vstack([np.arange(20_000) * 0.1, np.zeros(20_000)])
+    meter = ContourMeter()
+    meter.push(y_d, y_d + 0.01)
+    # 160 segments in each window.
+    assert meter.evaluations < 20 * 10_000
+
+
+@given(st.integers(0, 1000), st.lists(st.integers(0, 400), max_size=3))
+@settings(max_examples=25, deadline=None)
+def test_motion_meter_adds_up(seed: int, cuts: list[int]) -> None:
+    n = 400
+    y_d, y = wander(seed, n, 0.02)
+    rng = np.random.default_rng(seed)
+    extruding = rng.random(n) < 0.6
+    layer = np.sort(rng.integers(-1, 4, n)).astype(np.int32)
+    feature = rng.integers(-1, 3, n).astype(np.int32)
+    meter = MotionMeter(stride=1)
+    edges = [0, *sorted(cuts), n]
+    for a, b in zip(edges, edges[1:], strict=False):
+        meter.push(y_d[:, a:b], y[:, a:b], extruding[a:b], layer[a:b], feature[a:b])
+    meter.flush()
+    contour = np.array([brute_force(y_d, y, i, 80) for i in range(n)])
+    tracking = np.hypot(*(y - y_d))
+    for tally, values in (
+        (meter.contour_all, contour),
+        (meter.contour_extruding, contour[extruding]),
+        (meter.tracking_all, tracking),
+        (meter.tracking_extruding, tracking[extruding]),
+    ):
+        assert tally.count == len(values)
+        assert tally.rms == pytest.approx(np.sqrt(np.mean(values**2)))
+        assert tally.max == pytest.approx(values.max())
+    for groups, ids in ((meter.layers, layer), (meter.features, feature)):
+        found = groups.tallies()
+        assert sorted(found) == sorted(set(ids[extruding].tolist()))
+        for i, tally in found.items():
+            values = contour[extruding & (ids == i)]
+            assert tally.rms == pytest.approx(np.sqrt(np.mean(values**2)))
+            assert tally.max == pytest.approx(values.max())
+
+
+def test_groups_grow_both_ways() -> None:
+    groups = GroupTally()
+    use = np.array([True, True])
+    groups.add(np.array([1.0, 2.0]), np.array([5, 5], np.int32), use)
+    groups.add(np.array([3.0, 4.0]), np.array([-1, 9], np.int32), use)
+    groups.add(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, bool))
+    assert {k: t.max for k, t in groups.tallies().items()} == {-1: 3.0, 5: 2.0, 9: 4.0}
+    assert Tally().rms == 0.0
+
+
+@pytest.mark.parametrize("block", [7, 1000])
+def test_residual_vibration(block: int) -> None:
+    """Rests of 300 and 60 samples count, one of 10 does not; the first standstill neither."""
+    move = np.arange(1, 51) * 0.1
+    x = np.concatenate(
+        [np.zeros(50), move, np.full(300, 5.0), 5 + move, np.full(10, 10.0), 10 + move,
+         np.full(60, 15.0)]
+    )  # fmt: skip
+    y_d = np.vstack([x, np.zeros_like(x)])
+    y = y_d + np.vstack([np.sin(np.arange(len(x))), np.zeros_like(x)])
+    meter = ResidualMeter()
+    for a in range(0, len(x), block):
+        meter.push(y_d[:, a : a + block], y[:, a : a + block])
+    error = np.abs(y - y_d)[0]
+    used = np.concatenate([error[99:199], error[509:570]])
+    assert meter.rests == 2
+    assert meter.tally.count == len(used)
+    assert meter.tally.rms == pytest.approx(np.sqrt(np.mean(used**2)))
+    assert meter.tally.max == pytest.approx(used.max())
+
+
+def test_bad_shapes() -> None:
+    with pytest.raises(ValueError, match="must be"):
+        ContourMeter().push(np.zeros((2, 3)), np.zeros((2, 4)))

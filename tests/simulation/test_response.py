@@ -1,0 +1,115 @@
+"""Plant streams against plain numpy, scipy and python-control."""
+
+from __future__ import annotations
+
+import control
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.plants import (
+    DiscretePlant,
+    FirSpec,
+    Mode,
+    ModesSpec,
+    PairsSpec,
+    PlantSpec,
+    PolePair,
+    TfSpec,
+    ZeroPair,
+    discretise,
+)
+from models.store import builtin_machines, load_machine
+from simulation.response import PlantStream, modal_form, response
+from simulation.truth import TruthStream, refined, truth_response
+
+PAIRS = PairsSpec(
+    poles=(PolePair(f_hz=34, zeta=0.28), PolePair(f_hz=44.7, zeta=0.046)),
+    zeros=(ZeroPair(f_hz=41.2, zeta=-0.2),),
+    real_zero_tau_s=0.0012,
+)
+DOUBLE = ModesSpec(modes=(Mode(f_hz=40, zeta=0.1, gain=0.5), Mode(f_hz=40, zeta=0.1, gain=0.5)))
+SPECS: dict[str, PlantSpec] = {
+    "pairs": PAIRS,
+    "one mode": ModesSpec(modes=(Mode(f_hz=45, zeta=0.05),)),
+    "two equal modes": DOUBLE,
+    "real pole": TfSpec(num=(0.1,), den=(1, -0.9), dt_s=1e-3),
+    "delay": FirSpec(taps=(0.0, 0.0, 1.0), dt_s=1e-3),
+    "gain": FirSpec(taps=(1.0,), dt_s=1e-3),
+}
+
+
+def twin(plant: DiscretePlant, u: np.ndarray) -> np.ndarray:
+    """The definition, sample by sample."""
+    x, y = np.zeros(plant.order), np.empty(len(u))
+    for k, value in enumerate(u - u[0]):
+        y[k] = plant.c @ x + plant.d * value
+        x = plant.a @ x + plant.b * value
+    return y + u[0]
+
+
+@pytest.mark.parametrize("name", sorted(SPECS))
+@given(
+    st.lists(st.floats(-300, 300), min_size=2, max_size=50), st.integers(0, 50), st.integers(0, 50)
+)
+@settings(max_examples=25, deadline=None)
+def test_stream_is_the_recursion(name: str, values: list[float], cut: int, more: int) -> None:
+    plant = discretise(SPECS[name], 1e-3)
+    u = np.array(values)
+    stream = PlantStream([plant])
+    blocks = np.split(u, sorted((min(cut, len(u)), min(more, len(u)))))
+    y = np.concatenate([stream.push(block[None])[0] for block in blocks])
+    np.testing.assert_allclose(y, twin(plant, u), atol=1e-9)
+
+
+def test_dense_form_where_modes_crowd() -> None:
+    assert modal_form(discretise(PAIRS, 1e-3)) is not None
+    assert modal_form(discretise(SPECS["delay"], 1e-3)) is None
+
+
+@pytest.mark.parametrize("name", builtin_machines())
+def test_modal_form_of_the_library(name: str) -> None:
+    rng = np.random.default_rng(2)
+    u = 150 + np.cumsum(np.cumsum(rng.normal(size=4000))) * 1e-4
+    for axis in ("x", "y"):
+        plant = discretise(load_machine(name).axes[axis].nominal, 1e-3)
+        assert modal_form(plant) is not None
+        np.testing.assert_allclose(response([plant], u[None])[0], twin(plant, u), atol=1e-10)
+
+
+def test_long_rest_decays_to_the_command_exactly() -> None:
+    plant = discretise(PAIRS, 1e-3)
+    u = np.concatenate([np.zeros(10), np.full(60_000, 7.25)])
+    assert response([plant], u[None])[0, -1] == pytest.approx(7.25, abs=1e-13)
+
+
+def test_truth_is_the_continuous_plant() -> None:
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=(1, 40))
+    w = [2 * np.pi * 34, 2 * np.pi * 44.7, 2 * np.pi * 41.2]
+    den = np.polymul([w[0] ** -2, 0.56 / w[0], 1], [w[1] ** -2, 0.092 / w[1], 1])
+    num = np.polymul([0.0012, 1], [w[2] ** -2, -0.4 / w[2], 1])
+    fine = refined(u, 10)
+    assert fine.shape == (1, 391)
+    np.testing.assert_allclose(fine[:, ::10], u)
+    reference = control.forced_response(
+        control.tf(num, den), np.arange(391) * 1e-4, fine[0] - u[0, 0]
+    )
+    y = truth_response([PAIRS], u)
+    np.testing.assert_allclose(y[0], np.asarray(reference.outputs) + u[0, 0], atol=1e-8)
+    # A command linear between milliseconds is answered alike on both grids.
+    coarse = response([discretise(PAIRS, 1e-3)], u)
+    np.testing.assert_allclose(y[:, ::10], coarse, atol=1e-9)
+    stream = TruthStream([PAIRS])
+    parts = [stream.push(fine[:, :100]), stream.push(fine[:, 100:])]
+    np.testing.assert_allclose(np.hstack(parts), y, atol=1e-12)
+
+
+def test_bad_shapes() -> None:
+    plant = discretise(PAIRS, 1e-3)
+    with pytest.raises(ValueError, match="expected"):
+        PlantStream([plant]).push(np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="sampling time"):
+        PlantStream([plant, discretise(PAIRS, 1e-4)])
+    assert PlantStream([plant]).push(np.zeros((1, 0))).shape == (1, 0)
