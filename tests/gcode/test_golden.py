@@ -45,7 +45,9 @@ def test_same_plan_as_klipper(name: str, golden_machine: Machine, shared_dir: Pa
     source = shared_dir / "corpus" / "own" / f"{name.split('__')[0]}.gcode.gz"
     machine = machine_of(name, golden_machine)
     planner = Planner(machine.firmware)
-    parts = [planner.push(b) for b in interpret_bytes(gzip.decompress(source.read_bytes()), machine)]
+    parts = [
+        planner.push(b) for b in interpret_bytes(gzip.decompress(source.read_bytes()), machine)
+    ]
     plan = join_phases([*parts, planner.flush()])
 
     times = np.column_stack(

@@ -176,7 +176,7 @@ def test_classes(wary_machine: Machine) -> None:
         "M117 G1 X500 Y500 ; not a move": EventKind.HARMLESS,
         "M117 100% done (really)": EventKind.HARMLESS,
         'RESPOND MSG="G1 X1; quoted"': EventKind.HARMLESS,
-        "M862.3 P \"MK3S\"": EventKind.HARMLESS,
+        'M862.3 P "MK3S"': EventKind.HARMLESS,
         "(full line comment G1 X5)": EventKind.HARMLESS,
         "/G1 X1 Y1": EventKind.HARMLESS,
         "G1(inline comment X99)X26": EventKind.HARMLESS,

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcode.firmware.klipper.planner import Planner, join_phases
+from gcode.interpreter import interpret_bytes
+from gcode.sampler import Sampler, Samples, sample_phases
+from gcode.types import Phases
+from models.machine import Machine
+
+
+def plan_of(text: str, machine: Machine) -> Phases:
+    planner = Planner(machine.firmware)
+    parts = [planner.push(block) for block in interpret_bytes(text.encode(), machine)]
+    return join_phases([*parts, planner.flush()])
+
+
+def position_at(plan: Phases, t: float) -> np.ndarray:
+    """The plain meaning of the columns."""
+    m = max(int(np.searchsorted(plan.t_s, t, side="right")) - 1, 0)
+    left = max(t - plan.t_s[m], 0.0)
+    t1 = min(left, plan.accel_s[m])
+    t2 = min(left - t1, plan.cruise_s[m])
+    t3 = min(left - t1 - t2, plan.decel_s[m])
+    path = plan.start_mm_s[m] * t1 + 0.5 * plan.accel_mm_s2[m] * t1 * t1
+    path += plan.cruise_mm_s[m] * (t2 + t3) - 0.5 * plan.accel_mm_s2[m] * t3 * t3
+    return plan.start_mm[m] + plan.direction[m] * path
+
+
+@pytest.fixture(scope="module")
+def plan(golden_machine: Machine) -> Phases:
+    text = "G28\nM83\nG1 X30 F6000\nG1 Y20 E1\nG4 P35\nG1 E-1\nG1 X0 Y0 Z1\nG3 X0 Y10 J5 E1\n"
+    return plan_of(text, golden_machine)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(-1, 6), max_size=40).map(sorted))
+def test_twin(plan: Phases, times: list[float]) -> None:
+    position, row = sample_phases(plan, np.array(times))
+    expected = np.array([position_at(plan, t) for t in times]).reshape(-1, 4).T
+    np.testing.assert_allclose(position, expected, rtol=0, atol=1e-9)
+    assert np.all(np.diff(row) >= 0)
+
+
+def test_ends_and_stand(plan: Phases) -> None:
+    end = plan.t_s[-1] + plan.accel_s[-1] + plan.cruise_s[-1] + plan.decel_s[-1]
+    position, row = sample_phases(plan, (-1.0, end + 2.0, 2))
+    assert position[:, 0].tolist() == [0, 0, 0, 0]
+    assert position[:, 1] == pytest.approx([0, 10, 1, 1], abs=1e-9)
+    assert row.tolist() == [0, len(plan) - 1]
+    stand = plan.t_s[2] - np.array([0.03, 0.02, 0.01])
+    position, row = sample_phases(plan, stand)
+    assert position[:, 0] == pytest.approx([30, 20, 0, 1])
+    assert np.ptp(position, axis=1) == pytest.approx(np.zeros(4), abs=1e-12)
+    assert row.tolist() == [1, 1, 1]
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.integers(0, 200), max_size=8), st.sampled_from([0.0005, 0.004, 0.3]))
+def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> None:
+    sampler = Sampler(dt_s)
+    bounds = [0, *sorted(min(cut, len(plan)) for cut in cuts), len(plan)]
+    parts: list[Samples] = [
+        sampler.push(Phases(*(getattr(plan, name)[a:b] for name in Phases.__dataclass_fields__)))
+        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
+    parts.append(sampler.flush())
+    t_s = np.concatenate([part.t_s for part in parts])
+    np.testing.assert_array_equal(t_s, np.arange(len(t_s)) * dt_s)
+    position, row = sample_phases(plan, t_s)
+    np.testing.assert_array_equal(np.concatenate([p.xyz_mm for p in parts], axis=1), position[:3])
+    np.testing.assert_array_equal(np.concatenate([p.e_mm for p in parts]), position[3])
+    np.testing.assert_array_equal(
+        np.concatenate([p.move_index for p in parts]), plan.move_index[row]
+    )
+    assert position[:, -1] == pytest.approx([0, 10, 1, 1], abs=1e-9)
+
+
+def test_refused(plan: Phases) -> None:
+    none = Phases(*(getattr(plan, name)[:0] for name in Phases.__dataclass_fields__))
+    with pytest.raises(ValueError, match="no phases"):
+        sample_phases(none, (0.0, 1.0, 1))
+    with pytest.raises(ValueError, match="ascending"):
+        sample_phases(plan, np.array([1.0, 0.0]))
+    with pytest.raises(ValueError, match="dt > 0"):
+        sample_phases(plan, (0.0, 0.0, 1))
+    with pytest.raises(ValueError, match="above 0"):
+        Sampler(0.0)
+    assert len(Sampler(1.0).push(none)) == len(Sampler(1.0).flush()) == 0
