@@ -183,6 +183,7 @@ class ContourMeter:
                 errors,
             )
             drop = max(0, self._next - self._window - self._path_from)
+            drop = min(drop, self._path.shape[1])
             self._path = self._path[:, drop:].copy()
             self._points = self._points[:, drop:].copy()
             self._path_from += drop

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -50,7 +52,7 @@ def test_contour_meter_is_brute_force(
     y_d, y = wander(seed, n, deviation)
     meter = ContourMeter(1e-3, window * 1e-3, stride)
     edges = [0, *sorted(min(c, n) for c in cuts), n]
-    parts = [meter.push(y_d[:, a:b], y[:, a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    parts = [meter.push(y_d[:, a:b], y[:, a:b]) for a, b in pairwise(edges)]
     parts.append(meter.flush())
     index = np.concatenate([part.index for part in parts])
     np.testing.assert_array_equal(index, np.arange(0, n, stride))
@@ -90,7 +92,7 @@ def test_motion_meter_adds_up(seed: int, cuts: list[int]) -> None:
     feature = rng.integers(-1, 3, n).astype(np.int32)
     meter = MotionMeter(stride=1)
     edges = [0, *sorted(cuts), n]
-    for a, b in zip(edges, edges[1:], strict=False):
+    for a, b in pairwise(edges):
         meter.push(y_d[:, a:b], y[:, a:b], extruding[a:b], layer[a:b], feature[a:b])
     meter.flush()
     contour = np.array([brute_force(y_d, y, i, 80) for i in range(n)])
