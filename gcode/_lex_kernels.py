@@ -57,7 +57,8 @@ I_END = 17  # end of the line in hand
 I_ERROR_AXIS = 18
 I_OFFSET = 19  # file offset of the buffer
 I_NEED = 20  # move rows that the line in hand needs
-I_SIZE = 21
+I_ORIGIN_KNOWN = 21  # bit per axis: F_BASE holds in the machine's axes
+I_SIZE = 22
 
 # Columns of the integer rows.
 M_LIMITS, M_MODAL, M_KNOWN, M_LINE, M_START, M_STOP, M_LAYER, M_FEATURE, M_OBJECT = range(9)
@@ -67,6 +68,8 @@ OK, DONE, HANDBACK, FULL, GROW = 0, 1, 2, 3, 4
 ERROR_INCHES, ERROR_FEED, ERROR_TRAVEL, ERROR_RANGE = 10, 11, 12, 13
 ERROR_ARC_RADIUS, ERROR_ARC_RELATIVE, ERROR_ARC_CENTER, ERROR_ARC_LONG = 14, 15, 16, 17
 ERROR_POSITIVE, ERROR_SLOW = 18, 19
+
+MODAL_SIZE = 8
 
 MARK_NONE, MARK_LAYER, MARK_FEATURE, MARK_OBJECT = 0, 1, 2, 3
 MARK_STRIDE = 1 << 32
@@ -132,12 +135,14 @@ def intern_row(rows: Any, index: Any, count: int, row: Any) -> int:
 @kernel
 def note_modal(f: Any, i: Any, rows: Any, index: Any) -> None:
     """Enter the modal state in its table."""
-    row = np.empty(5)
+    row = np.empty(MODAL_SIZE)
     row[0] = i[I_ABS_XYZ]
     row[1] = i[I_ABS_E]
     row[2] = f[F_SPEED_FACTOR] * 60.0
     row[3] = f[F_EXTRUDE_FACTOR]
     row[4] = f[F_FEED]
+    for k in range(3):
+        row[5 + k] = f[F_BASE + k]
     number = intern_row(rows, index, i[I_N_MODAL], row)
     i[I_N_MODAL] = max(i[I_N_MODAL], number + 1)
     i[I_MODAL_ID] = number
@@ -278,7 +283,7 @@ def _move(
             return status
     # A coordinate that only seems to stand where we guess the axis to be may well move it.
     guessed = named & ~i[I_KNOWN]
-    status = travel(f, i, mf, mi, named, True)
+    status = travel(f, i, mf, mi, named & i[I_ORIGIN_KNOWN], True)
     if status == DONE:
         put_event(i, ei, ef, _UNKNOWN if guessed else _MODE, 0.0)
         return OK
@@ -375,7 +380,7 @@ def _arc(
                 f[F_LAST + 3] = e_here * f[F_EXTRUDE_FACTOR] + f[F_BASE + 3]
             else:
                 f[F_LAST + 3] += e_each * f[F_EXTRUDE_FACTOR]
-        status = travel(f, i, mf, mi, named if piece == n else 0, True)
+        status = travel(f, i, mf, mi, named & i[I_ORIGIN_KNOWN] if piece == n else 0, True)
         if status > DONE:
             return status
         moved = moved or status == OK
@@ -463,9 +468,13 @@ def execute(
                     f[F_ERROR + 1] = MAX_VALUE
                     return ERROR_RANGE
                 f[F_BASE + k] = f[F_LAST + k] - w[letter] * scale
+                # An origin set from a guessed position is a guess.
+                i[I_ORIGIN_KNOWN] &= ~(1 << k) | i[I_KNOWN]
+                i[I_ORIGIN_KNOWN] |= (1 << k) & i[I_KNOWN]
         if not any_axis:
             for k in range(4):
                 f[F_BASE + k] = f[F_LAST + k]
+            i[I_ORIGIN_KNOWN] = i[I_KNOWN]
     elif action == 34 or action == 35:
         percent = w[_S] if mask & (1 << _S) else 100.0
         if not _positive(f, percent):

@@ -72,12 +72,14 @@ class Interpreter:
     def __init__(self, machine: Machine, *, strict_bounds: bool = True) -> None:
         self.machine = machine
         self.firmware = firmware = machine.firmware
-        self.feature_names: list[str] = []
-        self.object_names: list[str] = []
+        self._features = _Names()
+        self._objects = _Names()
+        self.feature_names = self._features.names
+        self.object_names = self._objects.names
         self.layer_z_mm: list[float] = []
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []
-        self._saved: dict[str, tuple[NDArray[np.float64], int, int]] = {}
+        self._saved: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
         self._retraction = firmware.retraction
         self._retracted = False
         self._carry: list[bytes] = []
@@ -91,7 +93,7 @@ class Interpreter:
         self._buffer = np.zeros(0, np.uint8)
         self._text = b""
         self._allocate(_ROWS)
-        self._mod_rows, self._mod_index = _new_table(5, 256)
+        self._mod_rows, self._mod_index = _new_table(lex.MODAL_SIZE, 256)
         self._lim_rows, self._lim_index = _new_table(4, 256)
         self._mark_keys = np.zeros(_MARK_SLOTS, np.int64)
         self._mark_values = np.zeros(_MARK_SLOTS, np.int64)
@@ -117,9 +119,10 @@ class Interpreter:
         i[lex.I_LINE] = 1
         i[lex.I_ABS_XYZ] = i[lex.I_ABS_E] = 1
         i[lex.I_STRICT] = int(strict_bounds)
+        i[lex.I_ORIGIN_KNOWN] = 0b111
         i[lex.I_LAYER] = i[lex.I_FEATURE] = i[lex.I_OBJECT] = -1
         if firmware.homed_at_start:
-            self._home(0b111)
+            self._home(0b111, firmware.home_mm or (0.0, 0.0, 0.0))
         self._note_modal()
         self._note_limits()
 
@@ -318,23 +321,23 @@ class Interpreter:
         if mark is not None and mark.kind == MarkKind.STAMP:
             return self._event(EventKind.STAMP)
         if mark is not None and mark.kind == MarkKind.LAYER:
-            style = text[at : at + 4]
+            style = text[at : at + 7]
             self._layer_style = self._layer_style or style
-            if style == self._layer_style:
+            if style == self._layer_style and not self._same_height(mark.text):
                 i[lex.I_LAYER] += 1
                 self._note_height(mark.text)
                 value = lex.MARK_LAYER * lex.MARK_STRIDE
-                if mark.text:
-                    return self._event(EventKind.HARMLESS)
+            if mark.text:
+                return self._event(EventKind.HARMLESS)
         elif mark is not None and mark.kind == MarkKind.HEIGHT:
             self._note_height(mark.text)
             return self._event(EventKind.HARMLESS)
         elif mark is not None and mark.kind == MarkKind.FEATURE:
-            number = _number_of(mark.text, self.feature_names)
+            number = self._features.number(mark.text)
             i[lex.I_FEATURE] = number
             value = lex.MARK_FEATURE * lex.MARK_STRIDE + number + 1
         elif mark is not None and mark.kind == MarkKind.OBJECT:
-            number = _number_of(mark.text, self.object_names)
+            number = self._objects.number(mark.text)
             i[lex.I_OBJECT] = number
             value = lex.MARK_OBJECT * lex.MARK_STRIDE + number + 1
         pos, end = int(i[lex.I_POS]), int(i[lex.I_END])
@@ -349,6 +352,13 @@ class Interpreter:
                 self._mark_values[slot] = value
                 self._marks += 1
         return self._event(EventKind.HARMLESS)
+
+    def _same_height(self, text: str) -> bool:
+        """Tell whether a layer mark that names its height is the next object's of that layer."""
+        try:
+            return bool(text and self.layer_z_mm and self.layer_z_mm[-1] == float(text))
+        except ValueError:
+            return False
 
     def _note_height(self, text: str) -> None:
         while len(self.layer_z_mm) <= self._i[lex.I_LAYER]:
@@ -434,6 +444,7 @@ class Interpreter:
             delta[k] = offset - f[lex.F_HOMING + k]
             f[lex.F_BASE + k] += delta[k]
             f[lex.F_HOMING + k] = offset
+        self._note_modal()
         if not self._flag(given, text):
             return self._event(EventKind.MODE)
         f[lex.F_LAST : lex.F_LAST + 4] += delta
@@ -441,8 +452,7 @@ class Interpreter:
 
     def _save_state(self, name: str, text: str) -> int:
         key = self._extended(name, text).get("NAME", "default")
-        i = self._i
-        self._saved[key] = (self._f.copy(), int(i[lex.I_ABS_XYZ]), int(i[lex.I_ABS_E]))
+        self._saved[key] = (self._f.copy(), self._i.copy())
         return self._event(EventKind.MODE)
 
     def _restore_state(self, name: str, text: str) -> int:
@@ -450,9 +460,10 @@ class Interpreter:
         key = given.get("NAME", "default")
         if key not in self._saved:
             raise self._problem(f"no state {key!r} was saved; SAVE_GCODE_STATE it first", text)
-        saved, absolute_xyz, absolute_e = self._saved[key]
+        saved, saved_flags = self._saved[key]
         f, i = self._f, self._i
-        i[lex.I_ABS_XYZ], i[lex.I_ABS_E] = absolute_xyz, absolute_e
+        for slot in (lex.I_ABS_XYZ, lex.I_ABS_E, lex.I_ORIGIN_KNOWN):
+            i[slot] = saved_flags[slot]
         for first, count in (
             (lex.F_BASE, 4),
             (lex.F_HOMING, 4),
@@ -469,31 +480,28 @@ class Interpreter:
     def _home_command(self, _name: str, text: str) -> int:
         words = split_line(text).words
         axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in words) or 0b111
-        if self.firmware.home_mm is None:
-            # Homing one axis loses that one; it may also move the others (safe_z_home).
-            self._i[lex.I_KNOWN] = 0
-            for k in range(3):
-                if axes >> k & 1:
-                    self._f[lex.F_BASE + k] = self._f[lex.F_HOMING + k]
-        else:
-            self._home(axes)
+        self._home(axes, self.firmware.home_mm)
         return self._event(EventKind.UNKNOWN)
 
-    def _home(self, axes: int) -> None:
-        f = self._f
+    def _home(self, axes: int, home: tuple[float, float, float] | None) -> None:
+        """Give the axes their G-code origin back and, if the machine says it, their place."""
+        f, i = self._f, self._i
         f[lex.F_LAST : lex.F_LAST + 4] = f[lex.F_TOOL : lex.F_TOOL + 4]
-        home = self.firmware.home_mm or (0.0, 0.0, 0.0)
         for k in range(3):
             if axes >> k & 1:
-                f[lex.F_LAST + k] = f[lex.F_TOOL + k] = home[k]
                 f[lex.F_BASE + k] = f[lex.F_HOMING + k]
-        self._i[lex.I_KNOWN] |= axes
+                if home is not None:
+                    f[lex.F_LAST + k] = f[lex.F_TOOL + k] = home[k]
+        i[lex.I_ORIGIN_KNOWN] |= axes
+        # Homing an axis may move the others too (safe_z_home).
+        i[lex.I_KNOWN] = 0 if home is None else i[lex.I_KNOWN] | axes
+        self._note_modal()
 
     def _object(self, name: str, text: str) -> int:
         i = self._i
         if name == "EXCLUDE_OBJECT_START":
             given = self._extended(name, text)
-            i[lex.I_OBJECT] = _number_of(given.get("NAME", "").upper(), self.object_names)
+            i[lex.I_OBJECT] = self._objects.number(given.get("NAME", "").upper())
         elif name == "EXCLUDE_OBJECT_END":
             i[lex.I_OBJECT] = -1
         else:  # M486: S opens an object, S-1 closes it, A names it
@@ -501,7 +509,7 @@ class Interpreter:
             if "S" in words:
                 number = words["S"]
                 closing = number.startswith("-") or not number
-                i[lex.I_OBJECT] = -1 if closing else _number_of(number, self.object_names)
+                i[lex.I_OBJECT] = -1 if closing else self._objects.number(number)
         return self._event(EventKind.OBJECT)
 
     # Helpers of the handlers
@@ -579,7 +587,10 @@ class Interpreter:
     def _note_tables(self) -> None:
         """Bring the public tables up to the kernel's."""
         for row in self._mod_rows[len(self._modal) : int(self._i[lex.I_N_MODAL])].tolist():
-            self._modal.append(ModalState(bool(row[0]), bool(row[1]), *row[2:]))
+            absolute_xyz, absolute_e, speed, extrude, feed, x, y, z = row
+            self._modal.append(
+                ModalState(bool(absolute_xyz), bool(absolute_e), speed, extrude, feed, (x, y, z))
+            )
         for row in self._lim_rows[len(self._limits) : int(self._i[lex.I_N_LIMITS])].tolist():
             self._limits.append(Limits(*row))
 
@@ -646,10 +657,16 @@ def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], 
     return larger, index
 
 
-def _number_of(name: str, names: list[str]) -> int:
-    """Return the number of a name, entered if it is new; -1 for the empty name."""
-    if not name:
-        return -1
-    if name not in names:
-        names.append(name)
-    return names.index(name)
+class _Names:
+    """Names numbered as they come."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._numbers: dict[str, int] = {"": -1}
+
+    def number(self, name: str) -> int:
+        """Return the number of a name, entered if it is new; -1 for the empty name."""
+        number = self._numbers.setdefault(name, len(self.names))
+        if number == len(self.names):
+            self.names.append(name)
+        return number

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -239,10 +240,7 @@ def test_streaming_is_one_shot(moves: Moves, cuts: list[int]) -> None:
     whole = plan_moves(moves, LIMITS, TOLERANT)
     planner = Planner(TOLERANT)
     bounds = [0, *sorted(min(cut, len(moves)) for cut in cuts), len(moves)]
-    parts = [
-        planner.push_moves(part_of(moves, a, b), LIMITS)
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
+    parts = [planner.push_moves(part_of(moves, a, b), LIMITS) for a, b in pairwise(bounds)]
     plan = join_phases([*parts, planner.flush()])
     for name in Phases.__dataclass_fields__:
         np.testing.assert_array_equal(getattr(plan, name), getattr(whole, name))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -65,7 +67,7 @@ def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> Non
     bounds = [0, *sorted(min(cut, len(plan)) for cut in cuts), len(plan)]
     parts: list[Samples] = [
         sampler.push(Phases(*(getattr(plan, name)[a:b] for name in Phases.__dataclass_fields__)))
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        for a, b in pairwise(bounds)
     ]
     parts.append(sampler.flush())
     t_s = np.concatenate([part.t_s for part in parts])
