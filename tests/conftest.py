@@ -1,24 +1,61 @@
-"""Fixtures of all tests."""
+"""What all tests share: quiet numerical libraries, and the folder of shared test data."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
 
+# Before numpy and numba are imported anywhere.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+_ROOT = Path(__file__).resolve().parent.parent
+if "NUMBA_CACHE_DIR" not in os.environ and not os.access(_ROOT / "models", os.W_OK):
+    os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / "stillpath-tests-numba")
+
+
+def _shared() -> Path | None:
+    named = os.environ.get("STILLPATH_SHARED")
+    folder = Path(named) if named else _ROOT.parent / "shared"
+    return folder if folder.is_dir() else None
+
+
+def _in_ci() -> bool:
+    return os.environ.get("CI", "").lower() in ("1", "true", "yes")
+
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """Folder of shared test data: STILLPATH_SHARED, or `shared` beside the checkout.
+    """Folder of shared test data; tests that use it carry the marker `shared`."""
+    folder = _shared()
+    if folder is not None:
+        return folder
+    reason = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
+    if _in_ci():
+        pytest.fail(reason)
+    pytest.skip(reason)
 
-    A missing folder skips the test (pytest -ra lists it), and fails it in CI.
-    """
-    root = Path(__file__).resolve().parent.parent
-    folder = Path(os.environ.get("STILLPATH_SHARED", root.parent / "shared"))
-    if not folder.is_dir():
-        message = f"no shared test data at {folder}; set STILLPATH_SHARED"
-        if os.environ.get("CI", "").lower() == "true":
-            pytest.fail(message)
-        pytest.skip(message)
-    return folder
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the marker to whatever uses the fixture, so that `-m shared` finds all of them."""
+    for item in items:
+        if "shared_dir" in getattr(item, "fixturenames", ()):
+            item.add_marker("shared")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say it loudly when a part of the evidence was left out."""
+    skipped = [
+        report
+        for report in terminalreporter.getreports("skipped")
+        if "no shared test data" in str(report.longrepr)
+    ]
+    if skipped:
+        terminalreporter.write_line(
+            f"NOT CHECKED: {len(skipped)} tests need the shared test data (STILLPATH_SHARED)",
+            yellow=True,
+            bold=True,
+        )

@@ -1,0 +1,276 @@
+"""The API with a pretended road: uploads, states, problems, deletion, restarts."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from models.store import builtin_machines
+from service.api import create_app
+from service.api.uploads import safe_name
+from service.jobs.state import Job, JobState
+from service.jobs.store import JobStore
+from service.settings import Settings, is_loopback
+from tests.service.runners import pretend
+
+JOBS = "/v1/jobs?machine=ender3"
+
+
+def open_client(folder: Path, **settings: Any) -> TestClient:
+    app = create_app(
+        Settings(data_dir=folder, max_upload_bytes=100_000, cancel_grace_s=1.0, **settings),
+        runner=pretend,
+    )
+    return TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def client(data_dir: Path) -> Iterator[TestClient]:
+    with open_client(data_dir) as opened:
+        yield opened
+
+
+def until(client: TestClient, where: str, wanted: Callable[[dict[str, Any]], bool]) -> dict:
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        job = client.get(where).json()
+        if wanted(job):
+            return job
+        time.sleep(0.02)
+    raise AssertionError(f"waited in vain: {job}")
+
+
+def over(job: dict[str, Any]) -> bool:
+    return job["state"] in ("done", "failed")
+
+
+def assert_problem(answer: Any, status: int, *words: str) -> dict[str, Any]:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    document = answer.json()
+    assert document["status"] == status
+    assert {"type", "title", "detail"} <= document.keys()
+    for word in words:
+        assert word in document["detail"]
+    return document
+
+
+def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
+    answer = client.post(f"{JOBS}&name=gear.gcode", content=b"G1 X1\n")
+    assert answer.status_code == 202
+    where = answer.headers["location"]
+    assert answer.json()["links"]["self"] == where
+    job = until(client, where, over)
+    assert job["state"] == "done"
+    assert job["progress"] == 1.0
+    assert job["options"] == {"method": "fbf", "basis": "ce-opt", "tolerance_um": 5.0}
+    result = client.get(job["links"]["result"])
+    assert result.content == b"; compensated\nG1 X1\n"
+    assert 'filename="gear.stillpath.gcode"' in result.headers["content-disposition"]
+    assert client.get(job["links"]["report_json"]).json()["machine"] == "ender3"
+    page = client.get(job["links"]["report"])
+    assert page.headers["content-type"].startswith("text/html")
+    assert client.delete(where).status_code == 204
+    assert_problem(client.get(where), 404, job["id"])
+    assert_problem(client.delete(where), 404)
+    assert not (data_dir / "jobs" / job["id"]).exists()
+
+
+def test_a_form_brings_the_same_bytes(client: TestClient):
+    sent = b"G1 X1\r\n" * 9000
+    answer = client.post(
+        f"{JOBS}&method=shaper:ei",
+        files={"other": (None, "ignored"), "file": ("..\\tri angle.gcode", sent)},
+    )
+    assert answer.status_code == 202
+    assert answer.json()["source_name"] == "tri angle.gcode"
+    assert answer.json()["source_bytes"] == len(sent)
+    job = until(client, answer.headers["location"], over)
+    assert client.get(job["links"]["result"]).content.replace(b"\r", b"") == (
+        b"; compensated\n" + sent.replace(b"\r", b"")
+    )
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("", ["machine"]),
+        ("machine=nope", ["nope", "ender3"]),
+        ("machine=../../etc/passwd", ["Known"]),
+        ("machine=/tmp/x.json", ["Known"]),
+        ("machine=ender3&method=magic", ["method", "magic"]),
+        ("machine=ender3&method=shaper:best", ["method"]),
+        ("machine=ender3&basis=fourier", ["basis"]),
+        ("machine=ender3&tolerance_um=0", ["tolerance_um"]),
+        ("machine=ender3&tolerance_um=nan", ["tolerance_um"]),
+        ("machine=ender3&tolerance_um=wide", ["tolerance_um"]),
+    ],
+)
+def test_bad_options_are_refused_at_once(client: TestClient, query: str, words: list[str]):
+    assert_problem(client.post(f"/v1/jobs?{query}", content=b"G1 X1\n"), 422, *words)
+
+
+def test_empty_large_and_broken_uploads_leave_nothing(client: TestClient, data_dir: Path):
+    before = sorted((data_dir / "jobs").iterdir())
+    assert_problem(client.post(JOBS, content=b""), 422, "no bytes")
+    assert_problem(client.post(JOBS, content=b"x" * 100_001), 413, "100000 bytes")
+    assert_problem(client.post(JOBS, content=iter([b"x" * 60_000] * 2)), 413, "100000 bytes")
+    assert_problem(client.post(JOBS, files={"file": ("a.gcode", b"")}), 422, "no bytes")
+    assert_problem(client.post(JOBS, files={"file": (None, b"text")}), 422, "file name")
+    form = {"content-type": "multipart/form-data; boundary=abc"}
+    assert_problem(client.post(JOBS, content=b"junk", headers=form), 422, "cannot be read")
+    form = {"content-type": "multipart/form-data"}
+    assert_problem(client.post(JOBS, content=b"junk", headers=form), 422, "boundary")
+    assert list((data_dir / "incoming").iterdir()) == []
+    assert sorted((data_dir / "jobs").iterdir()) == before
+
+
+def test_an_unprintable_file_fails_its_job_with_the_line(client: TestClient):
+    where = client.post(JOBS, content=b"bad").headers["location"]
+    job = until(client, where, over)
+    assert job["state"] == "failed"
+    assert (job["error"]["status"], job["error"]["line"]) == (422, 7)
+    assert "X1e400" in job["error"]["detail"]
+    for name in ("result", "report", "report.json"):
+        document = assert_problem(client.get(f"{where}/{name}"), 409, "X1e400")
+        assert document["error"]["line"] == 7
+
+
+def test_a_crash_of_ours_keeps_its_secrets(client: TestClient):
+    job = until(client, client.post(JOBS, content=b"crash").headers["location"], over)
+    assert job["error"]["status"] == 500
+    assert "secret" not in str(job)
+
+
+def test_a_dying_worker_is_replaced_and_its_job_tried_once_more(client: TestClient):
+    job = until(client, client.post(JOBS, content=b"die-once").headers["location"], over)
+    assert job["state"] == "done"
+    job = until(client, client.post(JOBS, content=b"die").headers["location"], over)
+    assert job["error"]["title"] == "The worker was lost"
+    assert "code 9" in job["error"]["detail"]
+    assert client.get("/readyz").status_code == 200
+    job = until(client, client.post(JOBS, content=b"G1 X1").headers["location"], over)
+    assert job["state"] == "done"
+
+
+@pytest.mark.parametrize("word", [b"slow", b"deaf"])
+def test_a_running_job_can_be_cancelled(client: TestClient, data_dir: Path, word: bytes):
+    where = client.post(JOBS, content=word).headers["location"]
+    waiting = client.post(JOBS, content=b"G1 X2").headers["location"]
+    running = until(client, where, lambda job: job["state"] == "running")
+    assert_problem(client.get(f"{where}/result"), 409, "running")
+    assert client.get(waiting).json()["queue_position"] == 0
+    assert client.delete(where).status_code == 204
+    assert until(client, waiting, over)["state"] == "done"
+    assert not (data_dir / "jobs" / running["id"]).exists()
+
+
+def test_a_restart_continues_what_was_queued_and_running(tmp_path: Path):
+    with open_client(tmp_path) as client:
+        slow = client.post(JOBS, content=b"slow").headers["location"]
+        waiting = client.post(JOBS, content=b"G1 X1").headers["location"]
+        until(client, slow, lambda job: job["state"] == "running")
+    source = next((tmp_path / "jobs" / slow.rsplit("/", 1)[1] / "source").iterdir())
+    source.write_text("G1 X3\n")
+    (tmp_path / "incoming" / "half").write_text("half an upload")
+    (tmp_path / "jobs" / "orphan").mkdir()
+    with open_client(tmp_path) as client:
+        assert until(client, slow, over)["state"] == "done"
+        assert until(client, waiting, over)["state"] == "done"
+    assert not (tmp_path / "incoming" / "half").exists()
+    assert not (tmp_path / "jobs" / "orphan").exists()
+
+
+def test_a_killed_service_leaves_no_job_behind(tmp_path: Path):
+    store = JobStore(tmp_path)
+    job = Job("a" * 32, "ender3", {}, "a.gcode", "b.gcode", 5, 1.0)
+    source = store.files(job.id).source(job.source_name)
+    source.parent.mkdir(parents=True)
+    source.write_text("G1 X1")
+    store.add(job)
+    claimed = store.claim(2.0)
+    assert claimed is not None
+    assert claimed.state is JobState.RUNNING
+    store.close()  # as it was when the power went
+    with open_client(tmp_path) as client:
+        assert until(client, f"/v1/jobs/{job.id}", over)["state"] == "done"
+
+
+def test_a_foreign_database_is_refused(tmp_path: Path):
+    JobStore(tmp_path).close()
+    connection = sqlite3.connect(tmp_path / "jobs.sqlite3")
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(sqlite3.DatabaseError, match="schema 99"):
+        JobStore(tmp_path)
+
+
+def test_unknown_paths_and_methods_are_problems(client: TestClient):
+    assert_problem(client.get("/nowhere"), 404)
+    assert_problem(client.put("/v1/jobs"), 405)
+    assert_problem(client.get("/v1/machines/nope"), 404, "ender3")
+    assert_problem(client.get("/v1/jobs/nope/result"), 404)
+
+
+def test_machines(client: TestClient):
+    listed = [machine["name"] for machine in client.get("/v1/machines").json()]
+    assert listed == builtin_machines()
+    assert client.get("/v1/machines/ender3").json()["kinematics"] == "cartesian"
+
+
+def test_health_and_openapi(client: TestClient):
+    assert client.get("/healthz").json()["status"] == "ok"
+    assert client.get("/readyz").json()["status"] == "ok"
+    schema = client.get("/openapi.json").json()
+    post = schema["paths"]["/v1/jobs"]["post"]
+    assert set(post["requestBody"]["content"]) >= {"multipart/form-data", "text/x.gcode"}
+    assert "application/problem+json" in post["responses"]["413"]["content"]
+
+
+def test_the_page_asks_nobody_else(client: TestClient):
+    answer = client.get("/")
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert re.findall(r"(?:src|href)\s*=\s*[\"']|https?://", answer.text) == []
+
+
+def test_foreign_pages_are_kept_out(client: TestClient):
+    rebound = {"host": "evil.example"}
+    assert_problem(client.get("/v1/machines", headers=rebound), 403, "evil.example")
+    elsewhere = {"origin": "http://evil.example"}
+    assert_problem(client.post(JOBS, content=b"G1", headers=elsewhere), 403, "another site")
+    own = {"origin": "http://localhost"}
+    assert client.post(JOBS, content=b"G1", headers=own).status_code == 202
+
+
+def test_is_loopback():
+    assert all(map(is_loopback, ("localhost", "127.0.0.1", "127.9.9.9", "::1", "[::1]")))
+    assert not any(map(is_loopback, ("", "0.0.0.0", "::", "192.168.1.2", "localhost.evil.example")))
+
+
+@pytest.mark.parametrize(
+    ("given", "safe"),
+    [
+        ("gear.gcode", "gear.gcode"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\prints\\part 1.gcode", "part 1.gcode"),
+        ("", "upload.gcode"),
+        ("..", "upload.gcode"),
+        ("a\x00b\n.gcode", "a_b_.gcode"),
+        ("größe.gcode", "größe.gcode"),
+        ("x" * 300, "x" * 100),
+    ],
+)
+def test_safe_name(given: str, safe: str):
+    assert safe_name(given) == safe
