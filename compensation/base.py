@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from models.machine import Machine
 
-__all__ = ["COMPENSATORS", "Compensator", "DesignError", "compensator"]
+__all__ = ["COMPENSATORS", "Compensator", "DesignError", "Memoryless", "compensator"]
 
 COMPENSATORS = ("fbf", "zpetc", "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
                 "shaper:3hump_ei")  # fmt: skip
@@ -20,20 +20,31 @@ class DesignError(ValueError):
 
 
 class Compensator(Protocol):
-    """From planned positions to commands, X and Y together, one run at a time.
+    """From planned positions to commands, X and Y together, one piece at a time.
 
     Attributes
     ----------
     name : str
-    lead_s : float
-        How long before the first motion of a run the command may begin to move.
-    hold_s : float
-        How long the command may differ from the plan after a rest begins.
+    lead_s, tail_s : float
+        Standing time that it needs before and after every stretch of motion; 0 where the command
+        stands on the plan in every rest.
     """
 
     name: str
     lead_s: float
-    hold_s: float
+    tail_s: float
+
+    def reset(self, position_mm: NDArray[np.float64]) -> None:
+        """Take the machine to stand still at `position_mm`, shape (2,)."""
+        ...
+
+    def observe(self, command_mm: NDArray[np.float64]) -> None:
+        """Let the machine follow a command, shape (2, n), that was not ours."""
+        ...
+
+    def commit(self) -> None:
+        """Take the last command as executed."""
+        ...
 
     def compensate(
         self,
@@ -41,7 +52,7 @@ class Compensator(Protocol):
         extruding: NDArray[np.bool_],
         rests: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        """Return the command u, shape (2, n), for a plan that starts and ends at rest.
+        """Return the command u, shape (2, n), of a piece that starts and ends at rest.
 
         Parameters
         ----------
@@ -56,6 +67,22 @@ class Compensator(Protocol):
             If the command cannot keep the machine's limits.
         """
         ...
+
+
+class Memoryless:
+    """Base of compensators that take every piece by itself: nothing vibrates when it begins."""
+
+    lead_s = 0.0
+    tail_s = 0.0
+
+    def reset(self, position_mm: NDArray[np.float64]) -> None:
+        """Do nothing."""
+
+    def observe(self, command_mm: NDArray[np.float64]) -> None:
+        """Do nothing."""
+
+    def commit(self) -> None:
+        """Do nothing."""
 
 
 def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:

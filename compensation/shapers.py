@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
+from compensation.base import DesignError, Memoryless
 from compensation.holds import stand_still
 from models.machine import Machine
 from models.plants import plant_set
@@ -120,7 +120,7 @@ def shape(command_mm: Array, dt_s: float, pulses: Pulses, *, centred: bool = Tru
     return out
 
 
-class ShaperCompensator:
+class ShaperCompensator(Memoryless):
     """A firmware shaper applied to the plan, so that any firmware can use it.
 
     Parameters
@@ -151,11 +151,6 @@ class ShaperCompensator:
         ]
         self.frequencies_hz = (chosen[0], chosen[1])
         self.pulses = [shaper_pulses(shaper, f_hz, zeta) for f_hz in chosen]
-        means = [float(weights @ times) for weights, times in self.pulses]
-        self.lead_s = max(means)
-        self.hold_s = max(
-            float(p[1][-1]) - mean for p, mean in zip(self.pulses, means, strict=True)
-        )
         self._blend = max(2, round(0.03 / dt_s))
 
     def compensate(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import sosfilt, zpk2sos
 
-from compensation.base import DesignError
+from compensation.base import DesignError, Memoryless
 from compensation.holds import stand_still
 from models.machine import Machine
 from models.plants import DiscretePlant, plant_set
@@ -127,7 +127,7 @@ class ZpetcFilter:
         return np.asarray(value * at**self.preview, np.complex128)
 
 
-class Zpetc:
+class Zpetc(Memoryless):
     """ZPETC for X and Y with a zero-phase low-pass.
 
     Parameters
@@ -153,9 +153,6 @@ class Zpetc:
             [zero_phase_fir(f, dt_s, passes=design.passes) for f in self._ladder]
             for design in self.filters
         ]
-        longest = max(len(firs[-1]) for firs in self._firs) // 2
-        self.lead_s = dt_s * (max(f.preview for f in self.filters) + longest)
-        self.hold_s = dt_s * (max(f.memory for f in self.filters) + longest)
         self._blend = max(2, round(_BLEND_S / dt_s))
         self.cutoffs_hz: tuple[float, float] = (self._ladder[0], self._ladder[0])
         """What the last run used for X and Y."""
