@@ -27,6 +27,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+_INTERRUPTED = 130
 _METHODS = "fbf, zpetc, none, shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei"
 
 Input = Annotated[Path, typer.Argument(metavar="IN", help="The sliced file.")]
@@ -52,9 +53,11 @@ def run(arguments: list[str]) -> int:
         code = typer.main.get_command(app).main(
             args=arguments, prog_name="stillpath", standalone_mode=False
         )
-        return code if isinstance(code, int) else 0
+        if code != _INTERRUPTED:
+            return code if isinstance(code, int) else 0
+        return _fail("interrupted; nothing was written", _INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted; nothing was written", 130)
+        return _fail("interrupted; nothing was written", _INTERRUPTED)
     except typer.TyperException as error:
         return _fail(f"{error.format_message()} (stillpath COMMAND --help lists the options)", 2)
     except _Refused as error:
