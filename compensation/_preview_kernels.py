@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["run_windows"]
+__all__ = ["advance_state", "run_windows"]
 
 
 @kernel
@@ -40,3 +40,24 @@ def run_windows(
                 total += state_gain[i, j] * z[j]
             following[i] = total
         z[:] = following
+
+
+@kernel
+def advance_state(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    state: NDArray[np.float64],
+    command: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """State of x <- a x + b u after the samples of `command`."""
+    order = len(b)
+    x = state.copy()
+    following = np.empty(order)
+    for k in range(len(command)):
+        for i in range(order):
+            total = b[i] * command[k]
+            for j in range(order):
+                total += a[i, j] * x[j]
+            following[i] = total
+        x[:] = following
+    return x

@@ -8,11 +8,12 @@ stays within the machine's limits (two-step design, paper 003, remark 3.2).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._preview_kernels import run_windows
+from compensation._preview_kernels import advance_state, run_windows
 from compensation.base import DesignError
 from compensation.preview import LiftedPlant, PreviewDesign, lifted_plant
 from compensation.rests import solve_window
@@ -21,8 +22,19 @@ from models.plants import DiscretePlant, plant_set
 
 __all__ = ["LADDER", "PreviewFbf"]
 
-LADDER = (120, 105, 90, 75, 66, 58, 51, 45, 40, 35, 30, 26, 22, 18)
-"""Numbers of functions for a window of 300 samples, tried from the largest down."""
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One step of the ladder: number of functions (per 300 samples) and price of acceleration."""
+
+    n: int
+    price: float
+
+
+LADDER = (
+    *(Rung(90, price) for price in (0.03, 0.1, 0.3, 1.0)),
+    *(Rung(n, 3.0) for n in (75, 60, 45, 34, 26, 18)),
+)
+"""Designs from the most accurate to the gentlest."""
 
 WEIGHT_TRAVEL = 0.3
 WEIGHT_REST = 0.05
@@ -36,19 +48,23 @@ class PreviewFbf:
     Parameters
     ----------
     machine : Machine
-        Plants of X and Y, travel and command limits.
+        Plants of X and Y and the limits of the command.
     dt_s : float
         Sampling time of the path.
     basis : str
         `ce-opt` or `bspline`.
     window_s, update_s : float
         Preview window and how much of it is committed before the next one starts.
+
+    Notes
+    -----
+    The machine's vibration is carried from one piece to the next: call `commit` when the last
+    command was used, `observe` for motion that leaves as it came, `reset` when the position jumps.
     """
 
     name = "fbf"
-    handles_rests = True
     lead_s = 0.0
-    tail_s = 0.15
+    tail_s = 0.0
 
     def __init__(
         self,
@@ -59,16 +75,28 @@ class PreviewFbf:
         window_s: float = 0.3,
         update_s: float = 0.15,
     ) -> None:
+        window, update = round(window_s / dt_s), round(update_s / dt_s)
         self._dt_s = dt_s
-        self._window = round(window_s / dt_s)
-        self._update = round(update_s / dt_s)
         self._limits = machine.command
-        self._axes: list[_Axis] = []
-        for axis in ("x", "y"):
-            plants = plant_set(machine.axes[axis], dt_s)
-            self._axes.append(
-                _Axis([(1.0, plants.nominal)], self._window, self._update, basis, axis)
-            )
+        self._axes = [
+            _Axis(axis, plant_set(machine.axes[axis], dt_s).nominal, window, update, basis)
+            for axis in ("x", "y")
+        ]
+
+    def reset(self, position_mm: NDArray[np.float64]) -> None:
+        """Take the machine to stand still at `position_mm` (2,)."""
+        for axis, position in zip(self._axes, position_mm, strict=True):
+            axis.reset(float(position))
+
+    def observe(self, command_mm: NDArray[np.float64]) -> None:
+        """Let the machine follow a command (2, n) that was not ours."""
+        for axis, command in zip(self._axes, command_mm, strict=True):
+            axis.observe(command)
+
+    def commit(self) -> None:
+        """Take the last command as executed."""
+        for axis in self._axes:
+            axis.commit()
 
     def compensate(
         self,
@@ -76,15 +104,16 @@ class PreviewFbf:
         extruding: NDArray[np.bool_],
         rests: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        """Command of a run that starts at rest and stands still at its end.
+        """Command of a piece that starts and ends standing still on the path.
 
         Parameters
         ----------
         y_d_mm : ndarray, shape (2, n)
-            Planned X and Y; the axis is at rest at the first sample and stays at the last.
+            Planned X and Y.
         extruding : ndarray of bool, shape (n,)
         rests : ndarray of int64, shape (k, 2)
-            Ranges [a, b) of samples in which u(i) = u(i - 1).
+            Ranges [a, b) of samples in which u(i) = u(i - 1); the path stands still there, and
+            the command stands exactly on it.
 
         Returns
         -------
@@ -95,115 +124,177 @@ class PreviewFbf:
         DesignError
             When no rung of the ladder keeps the machine's limits.
         """
+        n = y_d_mm.shape[1]
         weight = np.where(extruding, 1.0, WEIGHT_TRAVEL)
         for a, b in rests:
             weight[a:b] = WEIGHT_REST
+        ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
+        stops = np.concatenate([ends[:1], rests, ends[1:]])
+        ceiling = self._limits.accel_mm_s2
+        path_accel = _peak(np.diff(y_d_mm, 2)) / self._dt_s**2
+        accel_limit = min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
         return np.stack(
-            [self._axis_command(axis, y_d_mm[i], weight, rests) for i, axis in enumerate(self._axes)]
+            [
+                self._ladder(axis, y_d_mm[i], weight, stops, accel_limit)
+                for i, axis in enumerate(self._axes)
+            ]
         )
 
-    def _axis_command(
+    def _ladder(
         self,
         axis: _Axis,
         path: NDArray[np.float64],
         weight: NDArray[np.float64],
-        rests: NDArray[np.int64],
+        stops: NDArray[np.int64],
+        accel_limit: float,
     ) -> NDArray[np.float64]:
         dt = self._dt_s
-        path_accel = _peak(np.diff(path, 2)) / dt**2
-        accel_limit = min(
-            self._limits.accel_mm_s2, max(ACCEL_RATIO * path_accel, 0.1 * self._limits.accel_mm_s2)
-        )
         for rung in range(axis.rung, len(LADDER)):
-            command = axis.command(rung, path, weight, rests)
+            command = axis.command(rung, path, weight, stops)
             accel = _peak(np.diff(command, 2)) / dt**2
             if accel <= accel_limit and _peak(np.diff(command)) / dt <= self._limits.velocity_mm_s:
-                # The next run starts here, or one rung higher where there was room to spare.
-                axis.rung = max(0, rung - 1) if accel < 0.6 * accel_limit else rung
+                # The next piece starts here, or one rung higher where there was room to spare.
+                axis.next_rung = max(0, rung - 1) if accel < 0.6 * accel_limit else rung
                 return command
         raise DesignError(
-            f"axis {axis.name}: even {LADDER[-1]} functions break the machine's command limits "
+            f"axis {axis.name}: even the gentlest design breaks the machine's command limits "
             f"({accel_limit:.0f} mm/s2, {self._limits.velocity_mm_s:.0f} mm/s)"
         )
 
 
 class _Axis:
-    """Designs of one axis, made when first asked for."""
+    """One axis: its designs, made when first asked for, and the state of its plant."""
 
     def __init__(
-        self,
-        members: Sequence[tuple[float, DiscretePlant]],
-        window: int,
-        update: int,
-        basis: str,
-        name: str,
+        self, name: str, plant: DiscretePlant, window: int, update: int, basis: str
     ) -> None:
-        self.name = name
-        self.rung = 0
+        self.name, self.window, self.update = name, window, update
+        self.rung = self.next_rung = 0
         self._basis = basis
-        self._window, self._update = window, update
-        self._lifted: list[LiftedPlant] = [lifted_plant(p, w, window, update) for w, p in members]
+        self._lifted: Sequence[LiftedPlant] = [lifted_plant(plant, 1.0, window, update)]
         self._designs: dict[int, PreviewDesign] = {}
+        self._plants = [plant]
+        self.reset(0.0)
 
     def design(self, rung: int) -> PreviewDesign:
         if rung not in self._designs:
-            n = max(4, round(LADDER[rung] * self._window / 300))
-            self._designs[rung] = PreviewDesign(self._lifted, n, self._basis)
+            step = LADDER[rung]
+            n = max(4, round(step.n * self.window / 300))
+            self._designs[rung] = PreviewDesign(self._lifted, n, self._basis, step.price)
         return self._designs[rung]
+
+    def reset(self, position: float) -> None:
+        # States are kept relative to `origin`: the digits belong to the vibration.
+        self._origin = position
+        self._states = np.zeros(sum(p.order for p in self._plants))
+        self._after = (self._origin, self._states)
+
+    def observe(self, command: NDArray[np.float64]) -> None:
+        if len(command) == 0:
+            return
+        origin = float(command[-1])
+        self._move_origin(origin)
+        row = 0
+        for plant in self._plants:
+            states = slice(row, row + plant.order)
+            self._states[states] = advance_state(
+                plant.a, plant.b, self._states[states], command[:-1] - origin
+            )
+            row = states.stop
+
+    def commit(self) -> None:
+        self._origin, self._states = self._after
+        self.rung = self.next_rung
+
+    def _move_origin(self, origin: float) -> None:
+        shift = self._origin - origin
+        self._states = self._states + np.concatenate([p.rest_state(shift) for p in self._plants])
+        self._origin = origin
 
     def command(
         self,
         rung: int,
         path: NDArray[np.float64],
         weight: NDArray[np.float64],
-        rests: NDArray[np.int64],
+        stops: NDArray[np.int64],
     ) -> NDArray[np.float64]:
         design = self.design(rung)
-        n, window, update = len(path), self._window, self._update
+        n, window, update = len(path), self.window, self.update
         windows = -(-n // update)
-        # Coordinates relative to the start keep the digits for the vibration.
-        origin = path[0]
-        padded = np.concatenate(
-            [path - origin, np.full(windows * update + window - n, path[-1] - origin)]
-        )
-        weights = np.concatenate([weight, np.ones(len(padded) - n)])
+        self._move_origin(float(path[0]))
+        origin = self._origin
+        padding = windows * update + window - n
+        padded = np.concatenate([path - origin, np.full(padding, path[-1] - origin)])
+        weights = np.concatenate([weight, np.full(padding, WEIGHT_REST)])
         views = np.lib.stride_tricks.sliding_window_view(padded, window)[: windows * update : update]
         command_drive = views @ design.path_gain.T
         state_drive = views @ design.state_path_gain.T
 
         u = np.empty(windows * update)
-        z = design.rest_state(0.0)
+        z = np.append(self._states, [0.0, 0.0])
         starts = np.arange(windows) * update
         resting = np.zeros(windows, dtype=bool)
-        for a, b in rests:
-            resting |= (starts < b) & (starts + window > a)
+        for a, b in stops:
+            resting[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = True
         w = 0
         while w < windows:
-            if not resting[w]:
+            start = w * update
+            if resting[w]:
+                near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
+                committed = solve_window(
+                    design,
+                    z,
+                    padded[start : start + window],
+                    weights[start : start + window],
+                    stops[near] - start,
+                )[:update]
+                u[start : start + update] = committed
+                z = _advanced(design, z, committed)
+                w += 1
+            else:
                 following = w + int(np.argmax(np.append(resting[w:], True)))
                 run_windows(
-                    design.command_gain, design.state_gain, command_drive, state_drive, z, w, following, u
+                    design.command_gain,
+                    design.state_gain,
+                    command_drive,
+                    state_drive,
+                    z,
+                    w,
+                    following,
+                    u,
                 )
                 w = following
-                continue
-            k = w * update
-            local = rests[(rests[:, 0] < k + window) & (rests[:, 1] > k)] - k
-            committed = solve_window(design, z, padded[k : k + window], weights[k : k + window], local)
-            committed = committed[:update]
-            u[k : k + update] = committed
-            z = _advance(design, z, committed)
-            w += 1
+        end = path[-1] - origin
+        u[n - 1] = end
+        self._after = (float(path[-1]), self._end_states(z, u, n, end))
         return np.asarray(u[:n] + origin)
 
+    def _end_states(
+        self, z: NDArray[np.float64], u: NDArray[np.float64], n: int, end: float
+    ) -> NDArray[np.float64]:
+        """States at sample n - 1, relative to the end of the path.
 
-def _advance(
+        The windows run on past the end, where the command stands: step back is not possible, so
+        the last window is stepped again from the states it started with.
+        """
+        states = np.empty(len(z) - 2)
+        row = 0
+        for plant in self._plants:
+            part = slice(row, row + plant.order)
+            states[part] = advance_state(plant.a, plant.b, self._states[part], u[: n - 1])
+            states[part] -= plant.rest_state(end)
+            row = part.stop
+        return states
+
+
+def _advanced(
     design: PreviewDesign, z: NDArray[np.float64], committed: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """State after the committed samples."""
     following = np.empty_like(z)
     row = 0
     for member in design.members:
-        states = slice(row, row + len(member.plant.b))
+        states = slice(row, row + member.plant.order)
         following[states] = member.advance @ z[states] + member.drive @ committed
         row = states.stop
     following[-2], following[-1] = committed[-1], committed[-2]

@@ -2,8 +2,9 @@
 
 Over a rest [a, b) the increments are tied down: the one at a stops the command, the others are
 zero, and the remaining functions are solved for by weighted least squares with a small price on
-acceleration. The weight is low inside the rest (nothing is printed) and back to normal after it,
-otherwise the command would wander off (docs/method.md).
+acceleration, under the constraint that the command stands exactly on the path. The weight is low
+inside the rest (nothing is printed) and back to normal after it, otherwise the command would
+wander off (docs/method.md).
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from compensation.preview import PreviewDesign
 __all__ = ["EFFORT_PRICE", "solve_window"]
 
 EFFORT_PRICE = 0.5
-"""Price of squared acceleration (mm/sample^2)^2 against squared error mm^2."""
+"""Price of squared increments (mm/sample^2)^2 against squared error mm^2."""
+EDGE_PRICE = 30.0
+"""How much more the one increment costs with which the command stops or starts."""
 
 
 def solve_window(
@@ -38,7 +41,7 @@ def solve_window(
     path_mm, weight : ndarray, shape (window,)
         Planned positions and the weight of their errors.
     rests : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1).
+        Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1) = path(i - 1).
 
     Returns
     -------
@@ -47,9 +50,13 @@ def solve_window(
     last, previous = z[-2], z[-1]
     tied, offset, rows = _tie_down(design.basis, last - previous, rests, design.window)
     squared = weight * weight
+    price = max(EFFORT_PRICE, design.price)
     # The price of the untied functions keeps the matrix definite when a rest leaves few samples.
-    normal = EFFORT_PRICE * (tied.T @ tied + design.effort)
-    right = -EFFORT_PRICE * (tied.T @ offset)
+    normal = price * (tied.T @ tied + design.effort)
+    right = -price * (tied.T @ offset)
+    edges = np.clip(rests[rests > 0], 0, design.window - 1)
+    normal += EDGE_PRICE * price * (tied[edges].T @ tied[edges])
+    right -= EDGE_PRICE * price * (tied[edges].T @ offset[edges])
     change = tied[rows] - design.basis[rows]
     first = 0
     for member, filtered in zip(design.members, design.filtered, strict=True):
@@ -65,10 +72,19 @@ def solve_window(
         normal += weighted.T @ response
         right += weighted.T @ error
         first += states
-    coefficients = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), right)
-    increments = offset + tied @ coefficients
-    step = np.arange(1.0, design.window + 1.0)
-    command = last + step * (last - previous) + np.cumsum(np.cumsum(increments))
+    factor = cho_factor(normal, lower=True, overwrite_a=True)
+    coefficients = cho_solve(factor, right)
+    free = last + np.arange(1.0, design.window + 1.0) * (last - previous)
+    fixed = free + np.cumsum(np.cumsum(offset))
+    pins = rests[rests[:, 0] > 0, 0] - 1
+    if len(pins):
+        # Equality constraints by their multipliers: u(pin) = path(pin).
+        through = np.cumsum(np.cumsum(tied, axis=0), axis=0)[pins]
+        reach = cho_solve(factor, through.T)
+        miss = through @ coefficients - (path_mm[pins] - fixed[pins])
+        coefficients = coefficients - reach @ np.linalg.solve(through @ reach, miss)
+    command = fixed + np.cumsum(np.cumsum(tied @ coefficients))
+    command[pins] = path_mm[pins]
     for a, b in rests:
         # Rounding must not move a resting axis.
         command[max(a, 0) : b] = last if a <= 0 else command[a - 1]

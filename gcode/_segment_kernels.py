@@ -1,4 +1,4 @@
-"""Loop of the one-pass segment fit; `gcode.segments` wraps it."""
+"""Loops of the one-pass segment fit; `gcode.segments` wraps them."""
 
 from __future__ import annotations
 
@@ -7,71 +7,190 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["fit_stretch"]
+__all__ = ["fit_stretch", "path_directions", "rest_errors"]
+
+
+@kernel
+def path_directions(path: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """Unit direction of the path (2, n) at every sample; at a stand, the last one before it."""
+    n = path.shape[1]
+    x, y = 1.0, 0.0
+    for k in range(n):
+        before, after = max(k - 1, 0), min(k + 1, n - 1)
+        dx = path[0, after] - path[0, before]
+        dy = path[1, after] - path[1, before]
+        length = np.sqrt(dx * dx + dy * dy)
+        if length > 1e-7:
+            x, y = dx / length, dy / length
+        out[0, k] = x
+        out[1, k] = y
+
+
+@kernel
+def rest_errors(a: NDArray[np.float64], states: NDArray[np.float64], samples: int) -> None:
+    """Let the error states of both axes decay over `samples` without error, in place."""
+    axes, order = states.shape
+    following = np.empty(order)
+    for axis in range(axes):
+        for _ in range(samples):
+            for r in range(order):
+                total = 0.0
+                for c in range(order):
+                    total += a[axis, r, c] * states[axis, c]
+                following[r] = total
+            states[axis] = following
+
+
+@kernel
+def _follow(
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    state: NDArray[np.float64],
+    error: float,
+    following: NDArray[np.float64],
+) -> None:
+    order = len(b)
+    for r in range(order):
+        total = b[r] * error
+        for c in range(order):
+            total += a[r, c] * state[c]
+        following[r] = total
+    for r in range(order):
+        state[r] = following[r]
 
 
 @kernel
 def fit_stretch(
     position: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    along: float,
+    across: float,
+    loose: float,
+    tolerance_z: float,
+    tolerance_e: float,
+    grid: float,
     dt_s: float,
     start_s: float,
     first: int,
     last: int,
     begin: NDArray[np.float64],
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    c: NDArray[np.float64],
+    d: NDArray[np.float64],
+    ramp: NDArray[np.float64],
+    tail: NDArray[np.float64],
+    norm: NDArray[np.float64],
+    states: NDArray[np.float64],
     out_t: NDArray[np.float64],
     out_position: NDArray[np.float64],
 ) -> int:
-    """Cover samples first..last of `position` (axes, n) with straight segments.
+    """Cover samples first..last of `position` (x y z e, n) with straight segments.
 
-    The fit starts at `begin` at `start_s` and ends exactly at sample `last`. Every sample in
-    between is met within `tolerance` of its axis. Returns the number of segments written.
+    The fit starts at `begin` at `start_s` and ends exactly at sample `last`. A funnel of slopes in
+    the frame of the path's direction says how long a segment may be; where exactly it ends,
+    inside the (slightly looser) funnel, is chosen so that the machine's answer to the error stays
+    small: `a b c d` filter the error per axis, `ramp tail norm` are the answer to a triangular
+    error (`gcode.segments.ErrorFilter`), `states` carries the filter and is updated in place.
+    Vertices in X and Y lie on multiples of `grid`. Returns the number of segments.
     """
-    axes = position.shape[0]
-    low = np.empty(axes)
-    high = np.empty(axes)
-    new_low = np.empty(axes)
-    new_high = np.empty(axes)
+    order = b.shape[1]
+    longest = ramp.shape[1] - 1
+    low, high = np.empty(4), np.empty(4)
+    new_low, new_high = np.empty(4), np.empty(4)
+    wide_low, wide_high = np.empty(2), np.empty(2)
+    tolerance = np.array([along, across, tolerance_z, tolerance_e])
+    value = np.empty(4)
+    slope = np.empty(4)
+    wish = np.empty(2)
+    trial, following = np.empty(order), np.empty(order)
     origin = begin.copy()
     origin_s = start_s
     k = first
     count = 0
     while k <= last:
+        cx, cy = direction[0, k], direction[1, k]
         low[:] = -np.inf
         high[:] = np.inf
+        wide_low[:] = -np.inf
+        wide_high[:] = np.inf
         j = k
         while j <= last:
             span = j * dt_s - origin_s
+            dx, dy = position[0, j] - origin[0], position[1, j] - origin[1]
+            value[0] = cx * dx + cy * dy
+            value[1] = cx * dy - cy * dx
+            value[2] = position[2, j] - origin[2]
+            value[3] = position[3, j] - origin[3]
+            # Where the path has turned, slack along the frame is slack across the path.
+            turn = abs(cx * direction[1, j] - cy * direction[0, j])
+            tolerance[0] = along
+            if turn * along > 0.5 * across:
+                tolerance[0] = max(across, 0.5 * across / turn)
             fits = True
-            for a in range(axes):
-                slack = 0.0 if j == last else tolerance[a]
-                new_low[a] = max(low[a], (position[a, j] - slack - origin[a]) / span)
-                new_high[a] = min(high[a], (position[a, j] + slack - origin[a]) / span)
-                if new_low[a] > new_high[a]:
+            for i in range(4):
+                slack = 0.0 if j == last else tolerance[i]
+                new_low[i] = max(low[i], (value[i] - slack) / span)
+                new_high[i] = min(high[i], (value[i] + slack) / span)
+                if new_low[i] > new_high[i] + 1e-9:
                     fits = False
             if not fits:
                 break
             low[:] = new_low
             high[:] = new_high
+            for i in range(2):
+                wide_low[i] = max(wide_low[i], (value[i] - tolerance[i] - loose) / span)
+                wide_high[i] = min(wide_high[i], (value[i] + tolerance[i] + loose) / span)
             j += 1
-        end = j - 1
-        if end < k:
-            # Not even one sample (an origin off the path just before the exact end).
-            end = k
-            span = end * dt_s - origin_s
-            for a in range(axes):
-                origin[a] = position[a, end]
+        end = max(j - 1, k)
+        samples = end - k + 1
+        span = end * dt_s - origin_s
+        shaped = j > k and end < last
+        if shaped:
+            for axis in range(2):
+                wish[axis] = 0.0
+                if samples > longest:
+                    continue
+                trial[:] = states[axis]
+                straight = (position[axis, end] - origin[axis]) / span
+                inner = 0.0
+                for i in range(samples):
+                    at = k + i
+                    error = origin[axis] + straight * (at * dt_s - origin_s) - position[axis, at]
+                    out = d[axis] * error
+                    for r in range(order):
+                        out += c[axis, r] * trial[r]
+                    inner += out * ramp[axis, samples, i]
+                    _follow(a[axis], b[axis], trial, error, following)
+                for r in range(order):
+                    inner += trial[r] * tail[axis, samples, r]
+                wish[axis] = -inner / norm[axis, samples]
+            dx = position[0, end] + wish[0] - origin[0]
+            dy = position[1, end] + wish[1] - origin[1]
+            along_slope = min(max((cx * dx + cy * dy) / span, wide_low[0]), wide_high[0])
+            across_slope = min(max((cx * dy - cy * dx) / span, wide_low[1]), wide_high[1])
+            slope[0] = cx * along_slope - cy * across_slope
+            slope[1] = cy * along_slope + cx * across_slope
+            for axis in range(2):
+                target = grid * np.round((origin[axis] + slope[axis] * span) / grid)
+                slope[axis] = (target - origin[axis]) / span
+            slope[2] = 0.5 * (low[2] + high[2])
+            slope[3] = 0.5 * (low[3] + high[3])
         else:
-            span = end * dt_s - origin_s
-            for a in range(axes):
-                if end == last:
-                    origin[a] = position[a, last]
-                else:
-                    origin[a] += 0.5 * (low[a] + high[a]) * span
+            # The exact end of the stretch, or not even one sample fits: through the sample.
+            for i in range(4):
+                slope[i] = (position[i, end] - origin[i]) / span
+        for axis in range(2):
+            for i in range(samples):
+                at = k + i
+                error = origin[axis] + slope[axis] * (at * dt_s - origin_s) - position[axis, at]
+                _follow(a[axis], b[axis], states[axis], error, following)
+        for i in range(4):
+            origin[i] = position[i, last] if end == last else origin[i] + slope[i] * span
         origin_s = end * dt_s
         out_t[count] = origin_s
-        for a in range(axes):
-            out_position[a, count] = origin[a]
+        for i in range(4):
+            out_position[i, count] = origin[i]
         count += 1
         k = end + 1
     return count

@@ -1,25 +1,34 @@
 """The fewest straight constant-speed segments that follow a sampled command within a tolerance.
 
-One pass over X, Y, Z and E together: a funnel of admissible slopes per axis starts at the end of
-the last segment and narrows with every sample; when it closes, the segment ends. On a path of
-constant acceleration this finds the best piecewise linear fit in the maximum norm.
+One pass over X, Y, Z and E together: a funnel of admissible slopes starts at the end of the last
+segment and narrows with every sample; when it closes, the segment ends. The tolerance across the
+path, which one sees on the part, is tighter than along it. Within the funnel the end point is
+chosen by noise shaping: the error of a fit with some 200 corners a second falls right on a
+machine's resonances, and is steered to where the machine does not answer.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_lyapunov
 
-from gcode._segment_kernels import fit_stretch
+from gcode._segment_kernels import fit_stretch, path_directions, rest_errors
 from gcode.timeline import Timeline
+from models.plants import DiscretePlant
 
-__all__ = ["Segments", "fit_segments"]
+__all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
 
-XY_SHARE = 0.75
-"""Tolerance of X and of Y as a share of the distance allowed: .75 sqrt(2) = 1.06."""
+ALONG_SHARE = 0.8
+LOOSE_MM = 0.3e-3
+Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 1e-3
+END_SPEED_MM_S = 8.0
+"""A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
+_LONGEST = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +53,66 @@ class Segments:
         return len(self.end_s)
 
 
+class ErrorFilter:
+    """How the machine answers an error of the fit, for X and Y.
+
+    Parameters
+    ----------
+    plants : sequence of DiscretePlant
+        Plants of X and Y at the sampling time of the fit.
+
+    Notes
+    -----
+    For a triangular error that rises over m samples and falls over m - 1, `ramp[:, m]` is the
+    answer while it rises, `tail[:, m]` weighs a state at its peak with all that follows, and
+    `norm[:, m]` is the answer's energy. They give the peak that minimises the energy of the
+    answer to what is already there plus the triangle.
+    """
+
+    def __init__(self, plants: Sequence[DiscretePlant]) -> None:
+        order = max(1, *(p.order for p in plants))
+        axes = len(plants)
+        self.a, self.b = np.zeros((axes, order, order)), np.zeros((axes, order))
+        self.c, self.d = np.zeros((axes, order)), np.zeros(axes)
+        self.ramp = np.zeros((axes, _LONGEST + 1, _LONGEST))
+        self.tail = np.zeros((axes, _LONGEST + 1, order))
+        self.norm = np.ones((axes, _LONGEST + 1))
+        for i, plant in enumerate(plants):
+            n = plant.order
+            self.a[i, :n, :n], self.b[i, :n] = plant.a, plant.b
+            self.c[i, :n], self.d[i] = plant.c, plant.d
+            self._triangles(i)
+
+    def _triangles(self, i: int) -> None:
+        a, b, c, d = self.a[i], self.b[i], self.c[i], self.d[i]
+        energy = solve_discrete_lyapunov(a.T, np.outer(c, c))
+        for m in range(1, _LONGEST + 1):
+            shape = np.concatenate([np.arange(1, m + 1), np.arange(m - 1, 0, -1)]) / m
+            state, answer = np.zeros(len(b)), np.empty(len(shape))
+            for k, error in enumerate(shape):
+                answer[k] = c @ state + d * error
+                state = a @ state + b * error
+            power, weighed = np.eye(len(b)), np.zeros(len(b))
+            for k in range(m, len(shape)):
+                weighed += (c @ power) * answer[k]
+                power = a @ power
+            self.ramp[i, m, :m] = answer[:m]
+            self.tail[i, m] = weighed + power.T @ (energy @ state)
+            self.norm[i, m] = answer @ answer + state @ energy @ state
+
+
+def across_tolerance_mm(tolerance_mm: float) -> float:
+    """Tolerance across the path: half of it, but no finer than it takes, 1 um up to 5 um."""
+    return max(0.2 * tolerance_mm, min(0.5 * tolerance_mm, 1e-3))
+
+
 def fit_segments(
     timeline: Timeline,
     command_mm: NDArray[np.float64],
     tolerance_mm: float,
+    error_filter: ErrorFilter,
     *,
+    grid_mm: float = 1e-3,
     minimum_s: float = 0.5e-3,
 ) -> Segments:
     """Fit the stretches of a piece.
@@ -60,22 +124,28 @@ def fit_segments(
     command_mm : ndarray, shape (4, n)
         Command on the timeline's grid: x y compensated, z e as planned.
     tolerance_mm : float
-        Largest distance in X Y between command and fit, at the samples.
+        Largest distance in X Y between command and fit.
+    error_filter : ErrorFilter
+        The machine's answer to the error.
+    grid_mm : float
+        X and Y of all vertices but the last of a stretch are multiples of this.
     minimum_s : float
         Samples nearer than this to the start of a stretch are not ends of segments.
     """
     dt = timeline.dt_s
-    tolerance = np.array(
-        [XY_SHARE * tolerance_mm, XY_SHARE * tolerance_mm, 0.5 * tolerance_mm, E_TOLERANCE_MM]
-    )
     capacity = command_mm.shape[1] + len(timeline.groups)
     end_s, end_mm = np.empty(capacity), np.empty((4, capacity))
     groups = np.empty(capacity, dtype=np.int64)
+    direction = np.empty((2, command_mm.shape[1]))
+    path_directions(timeline.position_mm[:2], direction)
+    states = np.zeros_like(error_filter.b)
     count = 0
     for i, group in enumerate(timeline.groups):
-        if group.rest:
-            continue
         start = timeline.end_s[i - 1] if i else 0.0
+        if group.rest:
+            resting = timeline.end_s[i] - timeline.start_s[i]
+            rest_errors(error_filter.a, states, round(resting / dt))
+            continue
         last = round(timeline.end_s[i] / dt)
         if i == len(timeline.groups) - 1:
             last = command_mm.shape[1] - 1
@@ -84,9 +154,46 @@ def fit_segments(
         # Z and E moved in the rest before; X and Y stand where the command left them.
         begin = np.concatenate([command_mm[:2, before], timeline.group_start_mm[i, 2:]])
         n = fit_stretch(
-            command_mm, tolerance, dt, start, first, last, begin, end_s[count:], end_mm[:, count:]
+            command_mm,
+            direction,
+            ALONG_SHARE * tolerance_mm,
+            across_tolerance_mm(tolerance_mm),
+            LOOSE_MM,
+            Z_TOLERANCE_MM,
+            E_TOLERANCE_MM,
+            grid_mm,
+            dt,
+            start,
+            first,
+            last,
+            begin,
+            error_filter.a,
+            error_filter.b,
+            error_filter.c,
+            error_filter.d,
+            error_filter.ramp,
+            error_filter.tail,
+            error_filter.norm,
+            states,
+            end_s[count:],
+            end_mm[:, count:],
         )
+        if group.before_z:
+            n = _merge_crawl(end_s[count:], end_mm[:, count:], n)
         groups[count : count + n] = i
         count += n
     return Segments(end_s[:count].copy(), end_mm[:, :count].copy(), groups[:count].copy())
 
+
+def _merge_crawl(end_s: NDArray[np.float64], end_mm: NDArray[np.float64], n: int) -> int:
+    """Drop vertices before a slow end; returns the new number of segments."""
+    last = n - 1
+    keep = n
+    while keep > 2:
+        way = np.hypot(*(end_mm[:2, last] - end_mm[:2, keep - 2]))
+        if way >= END_SPEED_MM_S * (end_s[last] - end_s[keep - 2]):
+            break
+        keep -= 1
+    end_s[keep - 1] = end_s[last]
+    end_mm[:, keep - 1] = end_mm[:, last]
+    return keep

@@ -31,6 +31,8 @@ class Group:
     last: int
     """One past the last row."""
     rest: bool
+    before_z: bool = False
+    """A stretch that is followed by a move of Z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,14 @@ def group_rows(phases: Phases) -> list[Group]:
     edges = np.flatnonzero(np.diff(moves_xy)) + 1
     bounds = [0, *edges.tolist(), len(moves_xy)]
     return [
-        Group(first, last, rest=not bool(moves_xy[first]))
+        Group(
+            first,
+            last,
+            rest=not bool(moves_xy[first]),
+            before_z=last < len(moves_xy)
+            and bool(moves_xy[first])
+            and phases.direction[last, 2] != 0.0,
+        )
         for first, last in zip(bounds[:-1], bounds[1:], strict=True)
         if last > first
     ]

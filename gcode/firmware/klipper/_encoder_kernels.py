@@ -10,6 +10,10 @@ from models.jit import kernel
 __all__ = ["assign_speeds", "format_moves", "merge_still"]
 
 
+RUSH = 0.5
+"""No segment is hurried to less than this part of its planned time."""
+
+
 @kernel
 def merge_still(
     position: NDArray[np.int64],
@@ -53,11 +57,13 @@ def merge_still(
 
 @kernel
 def assign_speeds(
+    ours: NDArray[np.bool_],
+    stops: NDArray[np.bool_],
     length_mm: NDArray[np.float64],
     end_s: NDArray[np.float64],
-    fixed_s: NDArray[np.float64],
+    planned_s: NDArray[np.float64],
+    speed_mm_s: NDArray[np.float64],
     accel_mm_s2: NDArray[np.float64],
-    limit_mm_s: NDArray[np.float64],
     junction_mm_s: NDArray[np.float64],
     correction_s: NDArray[np.float64],
     start_s: float,
@@ -66,25 +72,70 @@ def assign_speeds(
 ) -> None:
     """Feedrates (mm/min, as they will be printed) that reach every end at its time.
 
-    A move of fixed duration (`fixed_s` >= 0) is not ours to change. For the others the time still
-    to spend is the target minus the time predicted so far; Klipper loses (v1 - v2)^2 / (2 a v) at
-    a step between speeds v1 and v2, and that loss is taken off first (docs/emission.md).
+    Moves with `ours` false have their own speed, moves with `stops` true (extruder alone) start
+    and end at rest. `speed_mm_s` is the speed of a foreign move and the highest one of ours;
+    `junction_mm_s[i]` limits the speed between i - 1 and i.
+
+    The time still to spend is the target minus the time predicted so far. Klipper loses
+    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A Z
+    move ends the later the slower we go on, so its duration and our speed are found together.
     """
     now = start_s
     before = 0.0
     before_accel = 1.0
-    for i in range(len(length_mm)):
-        if fixed_s[i] >= 0.0:
-            predicted_s[i] = fixed_s[i]
-            now += fixed_s[i]
-            before = 0.0
+    pending = -1
+    pending_entry = 0.0
+    late = 0.0
+    count = len(length_mm)
+    for i in range(count):
+        if not ours[i]:
+            entry = 0.0
+            if not stops[i] and i > 0 and not stops[i - 1]:
+                entry = min(before, junction_mm_s[i], speed_mm_s[i])
+            if i > 0 and ours[i - 1]:
+                loss = (before - entry) ** 2 / (2.0 * before_accel * before)
+                predicted_s[i - 1] += loss
+                now += loss
+            if not stops[i] and i + 1 < count and ours[i + 1]:
+                pending = i
+                pending_entry = entry
+                continue
+            leave = 0.0
+            if not stops[i] and i + 1 < count and not stops[i + 1]:
+                leave = min(junction_mm_s[i + 1], speed_mm_s[i], speed_mm_s[i + 1])
+            predicted_s[i] = correction_s[i] + _trapezoid_s(
+                length_mm[i], entry, leave, speed_mm_s[i], accel_mm_s2[i]
+            )
+            now += predicted_s[i]
+            before = leave
+            before_accel = accel_mm_s2[i]
             continue
-        length = length_mm[i]
-        available = end_s[i] - now - correction_s[i]
-        floor = length / limit_mm_s[i]
-        if available < floor:
-            available = floor
-        v = length / available
+
+        # After a rest that took longer than planned everything moves back; no rushing.
+        available = end_s[i] + late - now - correction_s[i]
+        if pending >= 0:
+            available -= correction_s[pending]
+            v, rest_s = _leave_rest(
+                length_mm[i],
+                available,
+                min(junction_mm_s[i], speed_mm_s[pending]),
+                speed_mm_s[i],
+                length_mm[pending],
+                pending_entry,
+                speed_mm_s[pending],
+                accel_mm_s2[pending],
+            )
+            predicted_s[pending] = rest_s + correction_s[pending]
+            now += predicted_s[pending]
+            before = min(v, junction_mm_s[i], speed_mm_s[pending])
+            before_accel = accel_mm_s2[pending]
+            available = end_s[i] + late - now - correction_s[i]
+            pending = -1
+        least = max(length_mm[i] / speed_mm_s[i], RUSH * planned_s[i])
+        if available < least:
+            late += least - available
+            available = least
+        v = length_mm[i] / available
         loss = 0.0
         for _ in range(3):
             corner = min(v, before, junction_mm_s[i])
@@ -92,14 +143,47 @@ def assign_speeds(
             if before > corner:
                 loss += (before - corner) ** 2 / (2.0 * before_accel * before)
             loss = min(loss, 0.8 * available)
-            v = min(length / (available - loss), limit_mm_s[i])
-        f = _printed(60.0 * v)
-        feedrate[i] = f
-        v = f / 60.0
-        predicted_s[i] = length / v + loss + correction_s[i]
+            v = min(length_mm[i] / (available - loss), speed_mm_s[i])
+        feedrate[i] = _printed(60.0 * v)
+        v = feedrate[i] / 60.0
+        predicted_s[i] = length_mm[i] / v + loss + correction_s[i]
         now += predicted_s[i]
         before = v
         before_accel = accel_mm_s2[i]
+
+
+@kernel
+def _trapezoid_s(length: float, entry: float, leave: float, cruise: float, accel: float) -> float:
+    """Time of a move that enters, cruises and leaves at the given speeds where it has room."""
+    peak2 = 0.5 * (2.0 * accel * length + entry * entry + leave * leave)
+    if peak2 <= cruise * cruise:
+        return (2.0 * np.sqrt(peak2) - entry - leave) / accel
+    ramps = ((cruise - entry) ** 2 + (cruise - leave) ** 2) / (2.0 * accel * cruise)
+    return length / cruise + ramps
+
+
+@kernel
+def _leave_rest(
+    length: float,
+    available_s: float,
+    junction: float,
+    limit: float,
+    rest_length: float,
+    entry: float,
+    rest_cruise: float,
+    rest_accel: float,
+) -> tuple[float, float]:
+    """Speed behind a Z move such that both together take `available_s`; and the Z move's time."""
+    low, high = 1e-3, limit
+    for _ in range(50):
+        v = np.sqrt(low * high)
+        rest_s = _trapezoid_s(rest_length, entry, min(v, junction), rest_cruise, rest_accel)
+        if rest_s + length / v > available_s:
+            low = v
+        else:
+            high = v
+    rest_s = _trapezoid_s(rest_length, entry, min(high, junction), rest_cruise, rest_accel)
+    return high, rest_s
 
 
 @kernel(inline=True)
@@ -170,7 +254,6 @@ def format_moves(
     for i in range(len(position)):
         if fixed[i]:
             previous[:] = position[i]
-            rounding = 0.0
             last_f = -1.0
             line_end[i] = at
             continue

@@ -1,0 +1,304 @@
+"""Cut an interpreted file into pieces to compensate and passages that leave as they came.
+
+A *piece* starts and ends with a move of X or Y, at rest, with X and Y known throughout; nothing in
+it stops the machine but its own retractions and Z hops. It lasts at most a minute, so that memory
+does not grow with the file and a fault costs little. Everything else is a *passage*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.klipper.planner import plan_moves
+from gcode.types import EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
+from models.machine import Klipper, Machine
+
+__all__ = ["MIN_STREAM_ACCEL_MM_S2", "Passage", "Piece", "Splitter"]
+
+T = TypeVar("T", Moves, Events, Phases)
+
+MIN_STREAM_ACCEL_MM_S2 = 30_000.0
+"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Lines of the file in order: what pieces and passages have in common.
+
+    Attributes
+    ----------
+    moves, events : Moves, Events
+        `Events.move_index` counts within this item.
+    text : bytes
+        The item's own bytes.
+    text_offset : int
+        Where they start in the file; `byte_start` and `byte_end` columns are absolute.
+    limits, modal : lists
+        The interpreter's tables.
+    limits_before, limits_after : Limits
+        Planner limits in force before the first and after the last line.
+    modal_before, modal_after : ModalState
+    """
+
+    moves: Moves
+    events: Events
+    text: bytes
+    text_offset: int
+    limits: list[Limits]
+    modal: list[ModalState]
+    limits_before: Limits
+    limits_after: Limits
+    modal_before: ModalState
+    modal_after: ModalState
+
+    def line_text(self, byte_start: int, byte_end: int) -> bytes:
+        """Return the bytes of a line by its absolute offsets."""
+        return self.text[byte_start - self.text_offset : byte_end - self.text_offset]
+
+
+@dataclass(frozen=True, slots=True)
+class Piece(Stretch):
+    """Moves to compensate, with the firmware's own plan of them, from rest to rest."""
+
+    phases: Phases
+    forced_stop: bool
+    """The piece ends where the original does not stop."""
+
+
+@dataclass(frozen=True, slots=True)
+class Passage(Stretch):
+    """Lines that leave as they came."""
+
+
+class Splitter:
+    """Cut a stream of program blocks.
+
+    Parameters
+    ----------
+    machine : Machine
+    longest_s : float
+        No piece lasts longer.
+    compensate : bool
+        False makes everything one passage after another (method none).
+    """
+
+    def __init__(
+        self, machine: Machine, *, longest_s: float = 60.0, compensate: bool = True
+    ) -> None:
+        self._firmware: Klipper = machine.firmware
+        self._longest_s = longest_s
+        self._compensate = compensate
+        self._moves: Moves | None = None
+        self._events: Events | None = None
+        self._raw = np.zeros(0, dtype=bool)
+        self._text = b""
+        self._text_offset = 0
+        self._after_mark = False
+        self._tables: tuple[list[Limits], list[ModalState]] = ([], [])
+        self._limits_id = 0
+        self._modal_id = 0
+
+    def push(self, block: ProgramBlock) -> Iterator[Piece | Passage]:
+        """Take a block; yield what is complete."""
+        self._append(block)
+        yield from self._cut(final=False)
+
+    def flush(self) -> Iterator[Piece | Passage]:
+        """Yield the rest at the end of the file."""
+        if self._moves is not None:
+            yield from self._cut(final=True)
+
+    def _append(self, block: ProgramBlock) -> None:
+        self._tables = (block.limits, block.modal)
+        moves, events = block.moves, block.events
+        local = _shifted(events, -block.first_move)
+        raw = self._raw_moves(moves, local)
+        if self._moves is None or self._events is None:
+            self._moves, self._events, self._raw = moves, local, raw
+            self._text, self._text_offset = block.text, block.text_offset
+            return
+        local = _shifted(local, len(self._moves))
+        self._moves = _joined(self._moves, moves)
+        self._events = _joined(self._events, local)
+        self._raw = np.concatenate([self._raw, raw])
+        # A block's text covers its lines and may begin before the end of what we hold.
+        held = self._text_offset + len(self._text)
+        self._text += block.text[held - block.text_offset :]
+
+    def _raw_moves(self, moves: Moves, events: Events) -> NDArray[np.bool_]:
+        """Moves of X or Y that must keep their lines."""
+        travel = moves.end_mm - moves.start_mm
+        xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+        raw = xy & ((moves.known & 3) != 3)
+        length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
+        climb = np.abs(travel[:, 2])
+        steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * self._firmware.planner.max_z_accel_mm_s2
+        raw |= xy & steep
+        # Behind an object mark the firmware may jump: that travel runs as the slicer wrote it.
+        marks = events.move_index[events.kind == EventKind.OBJECT]
+        if self._after_mark:
+            marks = np.concatenate([[0], marks])
+        xy_rows = np.flatnonzero(xy)
+        following = np.searchsorted(xy_rows, marks)
+        self._after_mark = bool(np.any(following == len(xy_rows)))
+        raw[xy_rows[following[following < len(xy_rows)]]] = True
+        if len(moves):
+            # All pieces of an arc share one line and one fate.
+            starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
+            spread = np.maximum.reduceat(raw, starts)
+            raw = np.repeat(spread, np.diff(np.append(starts, len(raw)))) & xy
+        return raw
+
+    def _cut(self, *, final: bool) -> Iterator[Piece | Passage]:
+        while self._moves is not None and self._events is not None:
+            moves, events = self._moves, self._events
+            count = len(moves)
+            travel = moves.end_mm - moves.start_mm
+            xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+            ours = np.flatnonzero(xy & ~self._raw) if self._compensate else np.zeros(0, np.int64)
+            if len(ours) == 0:
+                yield self._passage(None)
+                return
+            head = int(ours[0])
+            if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
+                yield self._passage(int(moves.byte_start[head]))
+                continue
+            barriers = events.move_index[(events.kind >= EventKind.STOP)]
+            stops = np.concatenate([barriers[barriers > 0], np.flatnonzero(self._raw), [count]])
+            end = int(stops.min())
+            closed = final or len(stops) > 1
+            if not closed and _shortest_s(moves) < self._longest_s:
+                return
+            last = int(np.flatnonzero(xy[:end])[-1]) + 1
+            limits = self._tables[0]
+            phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
+            total = _end_s(phases)
+            if total <= self._longest_s:
+                if not closed:
+                    return
+                yield self._piece(last, phases, forced=False)
+                continue
+            last, natural = _place_to_cut(moves, phases, self._longest_s)
+            if natural:
+                phases = _rows(phases, slice(0, last))
+            else:
+                phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
+            yield self._piece(last, phases, forced=not natural)
+
+    def _piece(self, last: int, phases: Phases, *, forced: bool) -> Piece:
+        assert self._moves is not None
+        common = self._take(int(self._moves.byte_end[last - 1]))
+        return Piece(**common, phases=phases, forced_stop=forced)
+
+    def _passage(self, until: int | None) -> Passage:
+        return Passage(**self._take(until))
+
+    def _take(self, until: int | None) -> dict[str, object]:  # Any-typed bag for the constructors
+        """Remove the lines before byte `until` (None: all) from what is held."""
+        assert self._moves is not None and self._events is not None
+        moves, events = self._moves, self._events
+        if until is None:
+            until = self._text_offset + len(self._text)
+        m = int(np.searchsorted(moves.byte_start, until))
+        e = int(np.searchsorted(events.byte_start, until))
+        limits, modal = self._tables
+        before = (self._limits_id, self._modal_id)
+        ends = [(int(moves.byte_start[m - 1]), moves, m - 1)] if m else []
+        ends += [(int(events.byte_start[e - 1]), events, e - 1)] if e else []
+        if ends:
+            _, column, row = max(ends, key=lambda item: item[0])
+            self._limits_id, self._modal_id = int(column.limits_id[row]), int(column.modal_id[row])
+        text = self._text[: until - self._text_offset]
+        taken = {
+            "moves": _rows(moves, slice(0, m)),
+            "events": _rows(events, slice(0, e)),
+            "text": text,
+            "text_offset": self._text_offset,
+            "limits": limits,
+            "modal": modal,
+            "limits_before": limits[before[0]],
+            "limits_after": limits[self._limits_id],
+            "modal_before": modal[before[1]],
+            "modal_after": modal[self._modal_id],
+        }
+        self._text = self._text[len(text) :]
+        self._text_offset = until
+        self._raw = self._raw[m:]
+        if m == len(moves) and e == len(events):
+            self._moves = self._events = None
+        else:
+            self._moves = _rows(moves, slice(m, None))
+            self._events = _shifted(_rows(events, slice(e, None)), -m)
+        return taken
+
+
+def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, bool]:
+    """Row behind which to end a piece, and whether the plan stops there by itself.
+
+    The best place is a rest before filament is fed again (nothing oozes there), then any
+    extruder-only move, then a Z move, then the slowest corner of the last ten seconds.
+    """
+    direction = phases.direction
+    xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    only_e = ~xy & (direction[:, 2] == 0.0)
+    end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    inside = end_s <= longest_s
+    follows = np.zeros(len(xy), dtype=bool)
+    follows[:-1] = xy[:-1] & ~xy[1:]
+    after_e = np.append(only_e[1:], False)
+    feeds = np.append(direction[1:, 3] > 0.0, False)
+    late = inside & follows & (end_s > 0.5 * longest_s)
+    for wanted in (late & after_e & feeds, late & after_e, inside & follows & after_e):
+        rows = np.flatnonzero(wanted)
+        if len(rows):
+            return int(rows[-1]) + 1, True
+    rows = np.flatnonzero(late)
+    if len(rows):
+        return int(rows[-1]) + 1, False
+    line = moves.line[: len(phases)]
+    boundary = np.append(line[1:] != line[:-1], False)
+    rows = np.flatnonzero(boundary & xy & inside & (end_s > longest_s - 10.0))
+    if len(rows) == 0:
+        rows = np.flatnonzero(boundary & xy & inside)
+    if len(rows) == 0:
+        rows = np.flatnonzero(boundary & xy)[:1]
+    if len(rows) == 0:
+        return len(phases), False
+    return int(rows[np.argmin(phases.end_mm_s[rows])]) + 1, False
+
+
+def _shortest_s(moves: Moves) -> float:
+    """Lower bound of the time that the moves take."""
+    travel = moves.end_mm - moves.start_mm
+    length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
+    length = np.where(length > 0.0, length, np.abs(travel[:, 3]))
+    return float(np.sum(length / moves.speed_mm_s))
+
+
+def _end_s(phases: Phases) -> float:
+    last = _rows(phases, slice(-1, None))
+    return float((last.t_s + last.accel_s + last.cruise_s + last.decel_s)[0])
+
+
+def _rows(table: T, rows: slice) -> T:
+    return type(table)(**{f.name: getattr(table, f.name)[rows] for f in fields(table)})
+
+
+def _joined(first: T, second: T) -> T:
+    return type(first)(
+        **{
+            f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+            for f in fields(first)
+        }
+    )
+
+
+def _shifted(events: Events, by: int) -> Events:
+    columns = {f.name: getattr(events, f.name) for f in fields(events)}
+    columns["move_index"] = columns["move_index"] + by
+    return Events(**columns)
