@@ -1,0 +1,1 @@
+"""Command design: from planned positions to commands. Knows plants, not files."""
