@@ -23,7 +23,8 @@ from service.settings import Settings
 
 __all__ = ["router"]
 
-METHOD_PATTERN = r"^(fbf|zpetc|none|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$"
+# The methods are written down once, in the options.
+_METHOD = Options.model_json_schema()["properties"]["method"]["pattern"]
 _BODY = {
     "requestBody": {
         "required": True,
@@ -63,7 +64,7 @@ async def create_job(
     method: Annotated[
         str,
         Query(
-            pattern=METHOD_PATTERN,
+            pattern=_METHOD,
             description="`fbf` (limited-preview filtered basis functions), `zpetc`, "
             "`shaper:NAME` (zv, mzv, ei, 2hump_ei, 3hump_ei) or `none`.",
         ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import types
@@ -12,6 +13,7 @@ import pytest
 from compensation.base import DesignError
 from gcode.errors import GcodeError
 from service.cli import run
+from service.pipeline.options import Options
 from service.pipeline.progress import Progress
 from service.version import __version__
 from tests.service.synthetic import make_result
@@ -198,6 +200,14 @@ def test_machines(capsys):
 def test_refusals(arguments, capsys):
     assert run(arguments.split()) == 2
     one_line(capsys)
+
+
+def test_every_method_that_is_offered_exists(capsys):
+    assert run(["compensate", "--help"]) == 0
+    offered = set(re.findall(r"shaper:\w+|\bfbf\b|\bzpetc\b|\bnone\b", capsys.readouterr().out))
+    pattern = Options.model_json_schema()["properties"]["method"]["pattern"]
+    assert all(re.match(pattern, method) for method in offered)
+    assert {"fbf", "zpetc", "none", "shaper:ei"} <= offered
 
 
 def test_help_and_version_are_quick_and_light():
