@@ -1,0 +1,150 @@
+"""A server process of its own on a free port: streaming, kills and restarts, the real road."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PRETEND = [sys.executable, str(Path(__file__).with_name("pretend_server.py"))]
+REAL = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
+REAL += ["--data-dir"]
+has_road = importlib.util.find_spec("service.pipeline.road") is not None
+
+
+@contextmanager
+def server(command: list[str], data_dir: Path) -> Iterator[tuple[httpx2.Client, subprocess.Popen]]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [*command, str(data_dir)], stdout=subprocess.PIPE, text=True, env=environment, cwd=data_dir
+    )
+    try:
+        assert process.stdout is not None
+        base = process.stdout.readline().removeprefix("stillpath: ").strip()
+        with httpx2.Client(base_url=base, timeout=30) as client:
+            until(lambda: _answers(client))
+            yield client, process
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _answers(client: httpx2.Client) -> bool:
+    try:
+        return client.get("/readyz").status_code == 200
+    except httpx2.TransportError:
+        return False
+
+
+def until(wanted: Callable[[], Any], seconds: float = 60.0) -> Any:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        found = wanted()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError("waited in vain")
+
+
+def finished(client: httpx2.Client, where: str, seconds: float = 60.0) -> dict[str, Any]:
+    def ask() -> dict[str, Any] | None:
+        job = client.get(where).json()
+        return job if job["state"] in ("done", "failed") else None
+
+    return until(ask, seconds)
+
+
+def post(client: httpx2.Client, content: Any, machine: str = "ender3") -> str:
+    answer = client.post("/v1/jobs", params={"machine": machine}, content=content)
+    assert answer.status_code == 202, answer.text
+    return answer.headers["location"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads /proc")
+@pytest.mark.parametrize("form", [False, True], ids=["raw", "form"])
+def test_an_upload_goes_to_disk_and_not_into_memory(tmp_path: Path, form: bool):
+    size = 96 << 20
+    big = tmp_path / "big.gcode"
+    with big.open("wb") as file:
+        file.write(b"slow ")
+        file.truncate(size)
+    data = tmp_path / "data"
+    data.mkdir()
+    with server(PRETEND, data) as (client, process):
+        before = _peak_kb(process.pid)
+        with big.open("rb") as file:
+            sent = {"files": {"file": ("big.gcode", file)}} if form else {"content": file}
+            answer = client.post("/v1/jobs", params={"machine": "ender3"}, **sent)
+        assert answer.status_code == 202
+        assert answer.json()["source_bytes"] == size
+        assert _peak_kb(process.pid) - before < 24 << 10
+        assert client.delete(answer.headers["location"]).status_code == 204
+
+
+def test_a_killed_server_finishes_its_jobs_after_the_next_start(tmp_path: Path):
+    with server(PRETEND, tmp_path) as (client, process):
+        running = post(client, b"slow")
+        waiting = post(client, b"G1 X1")
+        until(lambda: client.get(running).json()["state"] == "running")
+        process.kill()
+        process.wait()
+    source = tmp_path / "jobs" / running.rsplit("/", 1)[1] / "source" / "upload.gcode"
+    source.write_text("G1 X2\n")
+    with server(PRETEND, tmp_path) as (client, _):
+        assert finished(client, running)["state"] == "done"
+        assert finished(client, waiting)["state"] == "done"
+        result = client.get(f"{running}/result")
+        assert result.text == "; compensated\nG1 X2\n"
+
+
+def test_an_interrupted_server_ends_at_once_and_takes_its_worker_along(tmp_path: Path):
+    with server(PRETEND, tmp_path) as (client, process):
+        running = post(client, b"slow")
+        until(lambda: client.get(running).json()["state"] == "running")
+        client.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) in (0, -signal.SIGINT, 130)
+
+
+@pytest.mark.skipif(not has_road, reason="the road is not built yet")
+def test_a_real_file_through_the_real_road(tmp_path: Path):
+    source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
+    with server(REAL, tmp_path) as (client, _):
+        where = post(client, source.read_bytes())
+        bad = [post(client, text) for text in (b"\x00\xff" * 999, b"G1 X1e400\n", b"; nothing\n")]
+        job = finished(client, where, 300)
+        assert job["state"] == "done", job
+        written = client.get(f"{where}/result")
+        assert "attachment" in written.headers["content-disposition"]
+        assert len(written.content) > 1000
+        figures = client.get(f"{where}/report.json").json()
+        rms = {c["name"]: c["extruding"]["contour_rms_um"] for c in figures["channels"]}
+        assert rms["after"] < rms["before"]
+        assert figures["written_bytes"] == len(written.content)
+        assert "<!doctype html>" in client.get(f"{where}/report").text
+        for failing in bad:
+            job = finished(client, failing)
+            assert job["error"]["status"] == 422, job
+            assert client.get(f"{failing}/result").status_code == 409
+
+
+def _peak_kb(pid: int) -> int:
+    (line,) = [
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    ]
+    return int(line.split()[1])
