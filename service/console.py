@@ -36,7 +36,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
     table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
     table.add_column("error, µm")
     for channel in result.channels:
-        table.add_column(channel.label, justify="right")
+        table.add_column(channel.label.split(" (")[0], justify="right")
     for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
         for kind in ("contour", "tracking"):
             for measure in ("rms", "max"):
@@ -47,6 +47,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
                 table.add_row(f"{kind} {measure}, {part}", *cells)
     table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
     console.print(table)
+    console.print(f"best shaper for this machine: {result.best_shaper}")
     if any(channel.name == "after" for channel in result.channels):
         change = 100 * (result.time_s / result.original_time_s - 1) if result.original_time_s else 0
         console.print(

@@ -113,7 +113,7 @@
       }
     }
     redraws.push(lineChart($("bylayer"), $("bylayer-readout"), {
-      series, at: (i) => i, tick: (v) => data.layers[v].name,
+      series, at: (i) => i, tick: (v) => (data.layers[v].name.length < 6 ? data.layers[v].name : ""),
       step: (span, count) => Math.max(1, roundStep(span, count)),
       text: (i) => "Layer " + data.layers[i].name + ", " + clock(data.layers[i].seconds) }));
   }

@@ -57,7 +57,13 @@ def render_report(result: Result) -> str:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
-        um=_um, plain=_plain, duration=_duration, share=_share, megabytes=_megabytes, number=_number
+        um=_um,
+        short=_short,
+        plain=_plain,
+        duration=_duration,
+        share=_share,
+        megabytes=_megabytes,
+        number=_number,
     )
     features = sorted(result.features, key=lambda group: -group.seconds)
     return environment.from_string(_asset("report.html.j2")).render(
@@ -125,7 +131,7 @@ def _widest(groups: Sequence[GroupFigures]) -> float:
 def _data(result: Result) -> str:
     """Return what the script draws, as JSON that is safe inside a script element."""
     data = {
-        "channels": [{"name": c.name, "label": c.label} for c in result.channels],
+        "channels": [{"name": c.name, "label": _short(c.label)} for c in result.channels],
         "scale_um": _legend_top(result),
         "track": {
             "bin_s": result.track.bin_s,
@@ -179,6 +185,11 @@ def _um(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "–"
     return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+
+
+def _short(label: str) -> str:
+    """Drop what a label says in brackets: the headline tells it once."""
+    return label.split(" (")[0]
 
 
 def _plain(value: str | float) -> str:

@@ -16,7 +16,11 @@ from service.pipeline.result import (
     Track,
 )
 
-LABELS = {"before": "As it came", "after": "Compensated", "shaper": "Best shaper"}
+LABELS = {
+    "before": "As it came",
+    "after": "Compensated",
+    "shaper": "Best shaper (ei 38.2 / 31.0 Hz)",
+}
 LEVEL = {"before": 21.0, "after": 0.9, "shaper": 8.4}
 
 
@@ -84,7 +88,7 @@ def make_result(
         warnings=["The firmware's shaper is off after the print: the model does not state it."],
         layers=[
             GroupFigures(
-                name=str(k),
+                name=str(k) if k else "before the first layer",
                 seconds=60 + 10 * rng.random(),
                 contour_rms_um={n: LEVEL[n] * (0.8 + 0.4 * rng.random()) for n in channels},
             )

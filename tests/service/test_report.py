@@ -81,6 +81,7 @@ def test_names_cannot_become_code(result: Result):
     page = render_report(changed)
     assert "<script>alert" not in page
     assert embedded(page)["layers"][0]["name"] == evil
+    assert embedded(page)["channels"][0]["label"] == evil.split(" (")[0]
 
 
 def test_the_scale_is_shared_and_round(page: str, result: Result):
