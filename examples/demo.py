@@ -26,6 +26,7 @@ from service.pipeline.result import Result
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "examples" / "cura_ender3_gear24.gcode"
 OUTPUT = ROOT / "demo-output"
+LOG = OUTPUT / "server.log"
 MACHINE = "ender3"
 START_TIMEOUT_S = 120.0
 _NO_CURVES = {"bin_s": 1.0, "contour_rms_um": {}}
@@ -37,11 +38,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="stillpath-demo-") as data:
         command = [shutil.which("stillpath", path=str(Path(sys.executable).parent)) or "stillpath"]
         command += ["serve", "--port", "0", "--data-dir", data]
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        with LOG.open("w") as log:
+            server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
         try:
             return _talk(server)
         except (OSError, RuntimeError) as error:
-            print(f"demo: {error}", file=sys.stderr)
+            print(f"demo: {error} (the server's log: {LOG})", file=sys.stderr)
             return 1
         finally:
             server.terminate()
@@ -52,7 +54,7 @@ def _talk(server: subprocess.Popen[str]) -> int:
     assert server.stdout is not None
     base = server.stdout.readline().removeprefix("stillpath: ").strip().rstrip("/")
     if not base.startswith("http://"):
-        raise RuntimeError("the server did not start; its last words are above")
+        raise RuntimeError("the server did not start")
     _wait_until_ready(base, server)
     print(f"server     {base}/ (the page), {base}/openapi.json (the API)")
 
@@ -91,7 +93,7 @@ def _wait_until_ready(base: str, server: subprocess.Popen[str]) -> None:
                 return
         except OSError:
             time.sleep(0.1)
-    raise RuntimeError("the server does not get ready; its last words are above")
+    raise RuntimeError("the server does not get ready")
 
 
 def _wait_until_over(where: str) -> dict[str, Any]:
