@@ -10,6 +10,7 @@ exclude_object.py, klippy/toolhead.py, 2026-08.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -44,6 +45,9 @@ _NEEDED = {
     "M220": "S",
     "M221": "S",
 }
+
+
+_WORK_SPACE = frozenset({"_mf", "_mi", "_ei", "_ef", "_g_table", "_m_table"})
 
 
 class Interpreter:
@@ -210,6 +214,21 @@ class Interpreter:
         self._offset += len(text)
         self._text = b""
         return blocks
+
+    def snapshot(self) -> Interpreter:
+        """Return an interpreter that goes on from here, whatever this one reads next."""
+        other = copy.copy(self)
+        # Work space is empty between calls and may be shared; all that is state is copied.
+        for name, value in vars(self).items():
+            if name in _WORK_SPACE:
+                continue
+            if isinstance(value, np.ndarray | list | dict):
+                setattr(other, name, value.copy())
+            elif isinstance(value, _Names):
+                setattr(other, name, copy.deepcopy(value))
+        other.feature_names = other._features.names
+        other.object_names = other._objects.names
+        return other
 
     def _block(self, begun: int, end: int) -> ProgramBlock:
         """Copy the rows out and empty them."""

@@ -177,6 +177,10 @@ class Splitter:
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
             limits = self._tables[0]
             phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
+            if len(phases) != last:
+                # A move of no length has no plan; leave its neighbourhood as it is.
+                self._raw[:last] |= xy[:last]
+                continue
             total = _end_s(phases)
             if total <= self._longest_s:
                 if not closed:

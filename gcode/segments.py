@@ -28,6 +28,7 @@ Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 1e-3
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
+END_EXCESS_MM = 3e-3
 _LONGEST = 64
 
 
@@ -179,19 +180,34 @@ def fit_segments(
             end_mm[:, count:],
         )
         if group.before_z:
-            n = _merge_crawl(end_s[count:], end_mm[:, count:], n)
+            allowed = tolerance_mm + END_EXCESS_MM
+            n = _merge_crawl(end_s[count:], end_mm[:, count:], n, command_mm, dt, allowed)
         groups[count : count + n] = i
         count += n
     return Segments(end_s[:count].copy(), end_mm[:, :count].copy(), groups[:count].copy())
 
 
-def _merge_crawl(end_s: NDArray[np.float64], end_mm: NDArray[np.float64], n: int) -> int:
-    """Drop vertices before a slow end; returns the new number of segments."""
+def _merge_crawl(
+    end_s: NDArray[np.float64],
+    end_mm: NDArray[np.float64],
+    n: int,
+    command_mm: NDArray[np.float64],
+    dt_s: float,
+    allowed_mm: float,
+) -> int:
+    """Drop vertices before a slow end, as far as the command allows; returns the new count."""
     last = n - 1
     keep = n
     while keep > 2:
-        way = np.hypot(*(end_mm[:2, last] - end_mm[:2, keep - 2]))
-        if way >= END_SPEED_MM_S * (end_s[last] - end_s[keep - 2]):
+        begin_s, begin = end_s[keep - 2], end_mm[:2, keep - 2]
+        way = np.hypot(*(end_mm[:2, last] - begin))
+        if way >= END_SPEED_MM_S * (end_s[last] - begin_s):
+            break
+        begin_s, begin = end_s[keep - 3], end_mm[:2, keep - 3]
+        k = np.arange(round(begin_s / dt_s), round(end_s[last] / dt_s) + 1)
+        share = (k * dt_s - begin_s) / (end_s[last] - begin_s)
+        line = begin[:, None] + share * (end_mm[:2, last] - begin)[:, None]
+        if np.max(np.hypot(*(line - command_mm[:2, k]))) > allowed_mm:
             break
         keep -= 1
     end_s[keep - 1] = end_s[last]

@@ -234,18 +234,20 @@ def format_moves(
     position: NDArray[np.int64],
     begin: NDArray[np.int64],
     fixed: NDArray[np.bool_],
+    fresh: NDArray[np.bool_],
     feedrate: NDArray[np.float64],
     extrude_factor: NDArray[np.float64],
     speed_factor: NDArray[np.float64],
-    offset: NDArray[np.int64],
+    origin: NDArray[np.int64],
     buffer: NDArray[np.uint8],
     line_end: NDArray[np.int64],
 ) -> int:
     """Write one G1 line per move of ours; moves with `fixed` set are left out.
 
-    `position` (n, 4) and `begin` (4,) are in 1e-6 mm; `offset` (3,) is added to x y z to turn
-    machine into G-code coordinates. Extruder values are relative, rounded to 1e-5 mm so that the
-    sum never drifts. `line_end[i]` is where the text of move i ends.
+    `position` (n, 4) and `begin` (4,) are in 1e-6 mm; `origin` (n, 3) is where the G-code's zero
+    lies. `fresh[i]` says that the modal feedrate is not ours before move i. Extruder values are
+    relative and rounded to 1e-5 mm so that the sum never drifts. `line_end[i]` is where the text
+    of move i ends.
     """
     at = 0
     previous = begin.copy()
@@ -257,6 +259,8 @@ def format_moves(
             last_f = -1.0
             line_end[i] = at
             continue
+        if fresh[i]:
+            last_f = -1.0
         buffer[at] = 71
         buffer[at + 1] = 49
         at += 2
@@ -264,7 +268,7 @@ def format_moves(
             if position[i, axis] != previous[axis]:
                 buffer[at] = 32
                 buffer[at + 1] = 88 + axis
-                at = _put_fixed(buffer, at + 2, position[i, axis] + offset[axis], 6)
+                at = _put_fixed(buffer, at + 2, position[i, axis] - origin[i, axis], 6)
         wanted = (position[i, 3] - previous[3]) / (10.0 * extrude_factor[i]) + rounding
         written = np.int64(np.round(wanted))
         rounding = wanted - written

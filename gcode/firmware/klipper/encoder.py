@@ -18,7 +18,7 @@ from gcode.firmware.klipper._encoder_kernels import assign_speeds, format_moves,
 from gcode.firmware.klipper.planner import plan_moves
 from gcode.pieces import Piece
 from gcode.segments import Segments
-from gcode.timeline import Timeline
+from gcode.timeline import Group, Timeline
 from gcode.types import Limits, Moves, Phases
 from models.machine import Klipper, Machine
 
@@ -48,6 +48,8 @@ class Encoded:
     feedrate_mm_min : ndarray, shape (n,)
     start_s : ndarray, shape (n,)
         When each move begins, on the timeline.
+    row_start_s : ndarray, shape (rows of the piece,)
+        When each original move begins on the timeline.
     rest_s : ndarray, shape (groups,)
         How long each rest takes under the stream's limits.
     phases : Phases
@@ -59,6 +61,7 @@ class Encoded:
     row: NDArray[np.int64]
     feedrate_mm_min: NDArray[np.float64]
     start_s: NDArray[np.float64]
+    row_start_s: NDArray[np.float64]
     rest_s: NDArray[np.float64]
     phases: Phases
 
@@ -84,7 +87,7 @@ class KlipperEncoder:
             minimum_cruise_ratio=0.0,
         )
 
-    def rest_durations(self, piece: Piece, timeline_groups: Sequence[object]) -> NDArray[np.float64]:
+    def rest_durations(self, piece: Piece, timeline_groups: Sequence[Group]) -> NDArray[np.float64]:
         """First guess of the rests' durations: the piece's own moves under the stream's limits."""
         phases = self._plan(
             piece.moves.start_mm, piece.moves.end_mm, piece.moves.speed_mm_s
@@ -140,6 +143,7 @@ class KlipperEncoder:
             row=rows,
             feedrate_mm_min=feedrate,
             start_s=timeline.start_s[0] + phases.t_s,
+            row_start_s=timeline.row_start_s,
             rest_s=rest_s,
             phases=phases,
         )
@@ -238,9 +242,9 @@ class KlipperEncoder:
         return plan_moves(moves, [self.limits], self._firmware)
 
 
-def _group_durations(phases: Phases, groups: Sequence[object]) -> NDArray[np.float64]:
+def _group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    return np.array([duration[g.first : g.last].sum() for g in groups])  # type: ignore[attr-defined]
+    return np.array([duration[g.first : g.last].sum() for g in groups])
 
 
 def _integers(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:

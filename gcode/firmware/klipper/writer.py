@@ -1,0 +1,320 @@
+"""The written file: our lines among those of the original, with the printer's state kept right.
+
+Lines that are not ours leave byte for byte. Whatever the stream needs different (limits, firmware
+shaper, modes) is set before its first line and put back before any line that could depend on it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.klipper._encoder_kernels import format_moves
+from gcode.firmware.klipper.encoder import Encoded
+from gcode.pieces import Passage, Piece
+from gcode.types import EventKind, Limits, ModalState
+from models.machine import Machine
+
+__all__ = ["KlipperWriter"]
+
+_BYTES_PER_LINE = 96
+_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?G[01](?![0-9])", re.IGNORECASE)
+_FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
+_STOP = b"G4 P0 ; stand still\n"
+
+
+class KlipperWriter:
+    """Write passages and pieces in order.
+
+    Parameters
+    ----------
+    machine : Machine
+    limits : Limits
+        What the stream runs under.
+    stamp : str
+        Says who processed the file; one line in header and footer.
+    """
+
+    def __init__(self, machine: Machine, limits: Limits, stamp: str) -> None:
+        self._shaper = machine.firmware.shaper
+        self._limits = limits
+        self._stamp = stamp
+        self._streaming = False
+        self._shaper_off = False
+        self._shaper_lines: list[bytes] = []
+        self._at_rest = True
+        self._modal: ModalState | None = None
+        """What the printer's modes are now, where they may differ from the file's."""
+        self.shaper_unknown = False
+
+    def header(self) -> bytes:
+        """First lines of the file."""
+        return (
+            f"; Processed by stillpath {self._stamp}\n"
+            "; stillpath: between the lines 'stream on' and 'stream off' the acceleration limit is\n"
+            "; stillpath: raised and every move is timed. Set no speed slider there. PAUSE and\n"
+            "; stillpath: CANCEL_PRINT must restore the limits first: use the macros of stillpath.cfg.\n"
+        ).encode()
+
+    def footer(self, ends_with_newline: bool) -> bytes:
+        """Last lines of the file."""
+        lead = b"" if ends_with_newline else b"\n"
+        return lead + self._off(None) + f"; Processed by stillpath {self._stamp}\n".encode()
+
+    def passage(self, passage: Passage) -> bytes:
+        """Text of lines that leave as they came."""
+        moves, events = passage.moves, passage.events
+        lead = self._off(passage)
+        for row in np.flatnonzero(events.kind == EventKind.SHAPER):
+            line = passage.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
+            self._shaper_lines = [*self._shaper_lines[-3:], line.rstrip() + b"\n"]
+        if len(moves):
+            last_stop = events.move_index[events.kind >= EventKind.STOP]
+            stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
+            self._at_rest = stands or _extruder_only(passage, len(moves) - 1)
+        elif np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)):
+            self._at_rest = True
+        return lead + passage.text
+
+    def piece(self, piece: Piece, encoded: Encoded) -> bytes:
+        """Text of a compensated piece."""
+        parts = [self._on(piece)]
+        starts, rows = encoded.start_s, encoded.row
+        events = piece.events
+        index = self._event_places(piece, encoded)
+        modes = self._modes(piece, encoded, index)
+        text, line_end = self._format(encoded, modes, index, events.kind)
+
+        rest_rows = np.flatnonzero(rows >= 0)
+        stops: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
+        stops += [(int(i), 1, int(rows[i])) for i in rest_rows]
+        done = 0
+        last_line = -1
+        for at, kind, what in sorted(stops):
+            upto = int(line_end[at - 1]) if at else 0
+            if upto > done:
+                parts += [self._our_modes(modes[at - 1]), text[done:upto]]
+                done = upto
+            if kind == 0:
+                parts.append(self._event(piece, what))
+            elif int(piece.moves.line[what]) != last_line:
+                last_line = int(piece.moves.line[what])
+                parts.append(self._rest_line(piece, what))
+        if len(text) > done:
+            parts += [self._our_modes(modes[len(starts) - 1]), text[done:]]
+        assert self._modal is not None
+        self._modal = replace(self._modal, feedrate_mm_min=-1.0)
+        self._at_rest = False
+        return b"".join(parts)
+
+    def _event_places(self, piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
+        """Index of the written move before which each event of the piece stands."""
+        first = np.full(len(piece.moves) + 1, len(encoded.row), np.int64)
+        planned = encoded.row_start_s
+        place = np.searchsorted(encoded.start_s, planned - 1e-6)
+        first[:-1] = np.minimum(place, len(encoded.row))
+        rest = encoded.row >= 0
+        first[encoded.row[rest]] = np.flatnonzero(rest)
+        # An event never moves past a rest or back behind one.
+        first = np.maximum.accumulate(first)
+        return first[np.minimum(piece.events.move_index, len(piece.moves))]
+
+    def _modes(self, piece: Piece, encoded: Encoded, index: NDArray[np.int64]) -> list[ModalState]:
+        """The file's modal state at every written move."""
+        current = piece.modal_before
+        changes = [
+            (int(i), piece.modal[int(m)])
+            for i, m, k in zip(index, piece.events.modal_id, piece.events.kind, strict=True)
+            if k == EventKind.MODE
+        ]
+        if not changes:
+            return [current] * len(encoded.row)
+        states: list[ModalState] = []
+        for at, state in changes:
+            states += [current] * (at - len(states))
+            current = state
+        return states + [current] * (len(encoded.row) - len(states))
+
+    def _format(
+        self,
+        encoded: Encoded,
+        modes: list[ModalState],
+        index: NDArray[np.int64],
+        kinds: NDArray[np.int8],
+    ) -> tuple[bytes, NDArray[np.int64]]:
+        n = len(encoded.row)
+        fresh = np.zeros(n + 1, dtype=bool)
+        fresh[index[kinds == EventKind.MODE]] = True
+        fresh[0] = True
+        same = all(m is modes[0] for m in (modes[0], modes[-1])) and modes[0] == modes[-1]
+        if same and modes.count(modes[0]) == n:
+            extrude = np.full(n, modes[0].extrude_factor)
+            speed = np.full(n, modes[0].speed_factor)
+            origin = np.tile(_integer_origin(modes[0]), (n, 1))
+        else:
+            extrude = np.array([m.extrude_factor for m in modes])
+            speed = np.array([m.speed_factor for m in modes])
+            origin = np.stack([_integer_origin(m) for m in modes])
+        buffer = np.empty(n * _BYTES_PER_LINE + 16, np.uint8)
+        line_end = np.empty(n, np.int64)
+        size = format_moves(
+            encoded.position,
+            encoded.begin,
+            encoded.row >= 0,
+            fresh,
+            encoded.feedrate_mm_min,
+            extrude,
+            speed,
+            origin,
+            buffer,
+            line_end,
+        )
+        return buffer[:size].tobytes(), line_end
+
+    def _event(self, piece: Piece, k: int) -> bytes:
+        events = piece.events
+        line = piece.line_text(int(events.byte_start[k]), int(events.byte_end[k]))
+        if events.kind[k] == EventKind.LIMITS:
+            return b"; stillpath, held back: " + line
+        if events.kind[k] == EventKind.MODE and self._modal is not None:
+            state = piece.modal[int(events.modal_id[k])]
+            text = line.upper()
+            lead = b""
+            if b"G92" in text:
+                lead = self._file_modes(state)
+            # Only what the line itself says changes: our own modes differ from the file's.
+            if re.match(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)", text):
+                self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
+            elif re.match(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)", text):
+                self._modal = replace(self._modal, absolute_e=state.absolute_e)
+            self._modal = replace(self._modal, feedrate_mm_min=-1.0)
+            return lead + line
+        return line
+
+    def _rest_line(self, piece: Piece, row: int) -> bytes:
+        moves = piece.moves
+        line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
+        code = line.split(b";", 1)[0]
+        state = piece.modal[int(moves.modal_id[row])]
+        lead = self._file_modes(state)
+        if _MOVE.match(code) and not _FEED.search(code):
+            lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
+        return lead + line
+
+    def _our_modes(self, state: ModalState) -> bytes:
+        """Lines that make the printer read X Y Z as absolute and E as relative."""
+        assert self._modal is not None
+        text = b""
+        if not self._modal.absolute_xyz:
+            text += b"G90\n"
+        if self._modal.absolute_e:
+            text += b"M83\n"
+        self._modal = replace(state, absolute_xyz=True, absolute_e=False, feedrate_mm_min=-1.0)
+        return text
+
+    def _file_modes(self, state: ModalState) -> bytes:
+        """Lines that make the printer read as the file expects (not the feedrate)."""
+        assert self._modal is not None
+        text = b""
+        if self._modal.absolute_xyz != state.absolute_xyz:
+            text += b"G90\n" if state.absolute_xyz else b"G91\n"
+        if self._modal.absolute_e != state.absolute_e:
+            text += b"M82\n" if state.absolute_e else b"M83\n"
+        self._modal = replace(
+            self._modal, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e
+        )
+        return text
+
+    def _on(self, piece: Piece) -> bytes:
+        """Lines before the first segment of a piece."""
+        parts: list[bytes] = []
+        if not self._at_rest:
+            parts.append(_STOP)
+        if not self._streaming:
+            parts.append(b"; stillpath: stream on\n")
+            if not self._shaper_off:
+                parts.append(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n")
+                self._shaper_off = True
+            parts.append(_limits_line(self._limits))
+            self._streaming = True
+        if self._modal is None:
+            self._modal = piece.modal_before
+        return b"".join(parts)
+
+    def _off(self, passage: Passage | None) -> bytes:
+        """Lines that give the printer back to the file."""
+        if not self._streaming:
+            return b"" if passage is None else self._shaper_on(passage)
+        parts: list[bytes] = []
+        if not self._at_rest and not (passage is not None and _extruder_only(passage, 0)):
+            parts.append(_STOP)
+        self._streaming = False
+        if passage is None:
+            return b"".join(parts)
+        parts.append(_limits_line(passage.limits_before))
+        state = passage.modal_before
+        parts.append(self._file_modes(state))
+        parts.append(_feed_line(state.feedrate_mm_min))
+        parts.append(b"; stillpath: stream off\n")
+        parts.append(self._shaper_on(passage))
+        self._modal = None
+        return b"".join(parts)
+
+    def _shaper_on(self, passage: Passage) -> bytes:
+        """The firmware's shaper, before lines that move X or Y on their own."""
+        if not self._shaper_off:
+            return b""
+        travel = passage.moves.end_mm - passage.moves.start_mm
+        moves_xy = bool(np.any(travel[:, :2] != 0.0))
+        foreign = bool(np.any(passage.events.kind == EventKind.UNKNOWN))
+        if not (moves_xy or foreign):
+            return b""
+        self._shaper_off = False
+        if self._shaper is None and not self._shaper_lines:
+            self.shaper_unknown = True
+            self._shaper_off = True
+            return b""
+        text = b""
+        if self._shaper is not None:
+            s = self._shaper
+            text = (
+                f"SET_INPUT_SHAPER SHAPER_TYPE_X={s.type_x} SHAPER_FREQ_X={s.freq_x_hz:g} "
+                f"DAMPING_RATIO_X={s.damping_x:g} SHAPER_TYPE_Y={s.type_y} "
+                f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
+            ).encode()
+        return text + b"".join(self._shaper_lines)
+
+
+def _limits_line(limits: Limits) -> bytes:
+    # ACCEL_TO_DECEL is what Klipper before 2024-03 reads instead of MINIMUM_CRUISE_RATIO.
+    to_decel = limits.accel_mm_s2 * (1.0 - limits.minimum_cruise_ratio)
+    return (
+        f"SET_VELOCITY_LIMIT VELOCITY={limits.velocity_mm_s:.10g} ACCEL={limits.accel_mm_s2:.10g} "
+        f"ACCEL_TO_DECEL={to_decel:.10g} "
+        f"SQUARE_CORNER_VELOCITY={limits.square_corner_velocity_mm_s:.10g} "
+        f"MINIMUM_CRUISE_RATIO={limits.minimum_cruise_ratio:.10g}\n"
+    ).encode()
+
+
+def _feed_line(feedrate_mm_min: float) -> bytes:
+    digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
+    return f"G1 F{digits}\n".encode()
+
+
+def _integer_origin(state: ModalState) -> NDArray[np.int64]:
+    return np.round(np.array(state.origin_mm) * 1e6).astype(np.int64)
+
+
+def _extruder_only(passage: Passage, row: int) -> bool:
+    """Whether a move of the passage stops the machine before and after itself."""
+    moves, events = passage.moves, passage.events
+    if len(moves) == 0:
+        return bool(np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)))
+    if row == 0 and np.any((events.move_index == 0) & (events.kind >= EventKind.STOP)
+                           & (events.kind != EventKind.OBJECT)):
+        return True
+    travel = moves.end_mm[row] - moves.start_mm[row]
+    return bool(travel[0] == 0.0 and travel[1] == 0.0 and travel[2] == 0.0)

@@ -1,0 +1,164 @@
+"""One piece of a print: from its planned path to a command, segments and timed moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import Compensator, DesignError, compensator
+from gcode.errors import GcodeError
+from gcode.firmware.klipper.encoder import Encoded, KlipperEncoder
+from gcode.pieces import Piece
+from gcode.sampler import sample_phases
+from gcode.segments import ErrorFilter, Segments, fit_segments
+from gcode.timeline import Timeline, build_timeline, group_rows
+from gcode.types import Phases
+from models.machine import Machine
+from models.plants import plant_set
+from service.pipeline.options import Options
+from service.pipeline.yardstick import BestShaper
+
+__all__ = ["DT_S", "CompensatedPiece", "PieceCompensator", "Unfit", "deviation"]
+
+DT_S = 1e-3
+"""Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
+
+_REST_TOLERANCE_S = 0.3e-3
+_ROUNDS = 4
+_GRID_MM = 1e-3
+
+
+class Unfit(ValueError):
+    """A piece that had better leave as it came; the message is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatedPiece:
+    """A piece with its command.
+
+    Attributes
+    ----------
+    timeline : Timeline
+    command_mm : ndarray, shape (4, n)
+        x y as commanded, z e as planned, on the timeline's grid.
+    extruding : ndarray of bool, shape (n,)
+    segments : Segments
+    encoded : Encoded
+    """
+
+    timeline: Timeline
+    command_mm: NDArray[np.float64]
+    extruding: NDArray[np.bool_]
+    segments: Segments
+    encoded: Encoded
+
+
+class PieceCompensator:
+    """Compensate pieces one after another with one method.
+
+    Parameters
+    ----------
+    machine : Machine
+    options : Options
+    shaper : BestShaper
+        The tuned frequencies, for `shaper:NAME` of the same type.
+    """
+
+    def __init__(self, machine: Machine, options: Options, shaper: BestShaper) -> None:
+        settings: dict[str, object] = {}
+        if options.method == "fbf":
+            settings["basis"] = options.basis
+        elif options.method == f"shaper:{shaper.type}":
+            settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
+        self._machine = machine
+        self._tolerance_mm = 1e-3 * options.tolerance_um
+        self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
+        self.encoder = KlipperEncoder(machine)
+        self._filter = ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
+
+    def compensate(self, piece: Piece) -> CompensatedPiece:
+        """Return the piece with its command.
+
+        Raises
+        ------
+        Unfit
+            When no command within the machine's limits is found, or the firmware would refuse it.
+        """
+        try:
+            return self._compensate(piece)
+        except (DesignError, GcodeError) as error:
+            raise Unfit(str(error)) from error
+
+    def _compensate(self, piece: Piece) -> CompensatedPiece:
+        phases = piece.phases
+        groups = group_rows(phases)
+        resting = np.array([group.rest for group in groups])
+        rest_s = self.encoder.rest_durations(piece, groups)
+        feeds = phases.direction[:, 3] > 0.0
+        # How long a rest takes depends a little on the speeds around it: repeat until it agrees.
+        for _ in range(_ROUNDS):
+            timeline = build_timeline(
+                phases,
+                groups,
+                rest_s,
+                DT_S,
+                lead_s=self.compensator.lead_s,
+                tail_s=self.compensator.tail_s,
+            )
+            extruding = timeline.moving & feeds[timeline.row]
+            command = timeline.position_mm.copy()
+            command[:2] = self.compensator.compensate(command[:2], extruding, timeline.rests)
+            self._check_travel(command)
+            segments, encoded = self._fit(piece, timeline, command)
+            change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
+            if change < _REST_TOLERANCE_S:
+                break
+            rest_s = np.where(resting, encoded.rest_s, rest_s)
+        return CompensatedPiece(timeline, command, extruding, segments, encoded)
+
+    def _fit(
+        self, piece: Piece, timeline: Timeline, command: NDArray[np.float64]
+    ) -> tuple[Segments, Encoded]:
+        """Segments and moves; finer where a motor's speed would step too far."""
+        limit = self._machine.command.speed_step_mm_s
+        tolerance = self._tolerance_mm
+        for _ in range(3):
+            segments = fit_segments(timeline, command, tolerance, self._filter, grid_mm=_GRID_MM)
+            encoded = self.encoder.encode(piece, timeline, segments)
+            step = self._speed_step(encoded.phases)
+            if step <= limit:
+                return segments, encoded
+            tolerance *= 0.5
+        raise Unfit(
+            f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
+            f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
+        )
+
+    def _speed_step(self, phases: Phases) -> float:
+        velocity = phases.direction[:, :2] * phases.cruise_mm_s[:, None]
+        if self._machine.kinematics == "corexy":
+            velocity = velocity @ np.array([[1.0, 1.0], [1.0, -1.0]])
+        return float(np.max(np.abs(np.diff(velocity, axis=0)), initial=0.0))
+
+    def _check_travel(self, command: NDArray[np.float64]) -> None:
+        for i, axis in enumerate(("x", "y")):
+            travel = self._machine.travel[axis]  # type: ignore[index]
+            low, high = float(command[i].min()), float(command[i].max())
+            if low < travel.min_mm or high > travel.max_mm:
+                raise Unfit(
+                    f"the command would take {axis} to {low if low < travel.min_mm else high:.3f} "
+                    f"mm, outside {travel.min_mm:g} to {travel.max_mm:g} mm"
+                )
+
+
+def deviation(
+    piece: CompensatedPiece, executed: Phases
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return executed X Y (2, n) on the piece's grid, and its distance from the command (n,)."""
+    timeline = piece.timeline
+    n = piece.command_mm.shape[1]
+    position, _ = sample_phases(executed, (-float(timeline.start_s[0]), timeline.dt_s, n))
+    gap = position[:2] - piece.command_mm[:2]
+    return position, np.hypot(gap[0], gap[1])

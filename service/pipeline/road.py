@@ -1,0 +1,548 @@
+"""The road: a print file in, a compensated and verified file out, in bounded memory.
+
+A file is read block by block, cut into pieces and passages, and written in order. Every piece that
+was changed is read back from the bytes as written, planned by the firmware's rules and compared
+with what it should do; a piece that fails leaves as it came. All figures come from that motion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import hashlib
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from gcode.errors import GcodeError
+from gcode.firmware.klipper.planner import join_phases, plan_moves
+from gcode.firmware.klipper.writer import KlipperWriter
+from gcode.interpreter import Interpreter
+from gcode.pieces import Passage, Piece, Splitter
+from gcode.sampler import sample_phases
+from gcode.types import EventKind, Moves, Phases
+from models.machine import Machine
+from service.pipeline.compensating import (
+    DT_S,
+    CompensatedPiece,
+    PieceCompensator,
+    Unfit,
+    deviation,
+)
+from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.options import Options
+from service.pipeline.progress import Progress
+from service.pipeline.result import PutBack, Result, StageTime
+from service.pipeline.yardstick import cached_shaper
+from service.version import __version__
+
+__all__ = ["compensate_file"]
+
+ProgressCallback = Callable[[Progress], None]
+
+_BLOCK_BYTES = 1 << 17
+_EXTRUDING_EXCESS_MM = 5e-3
+_TRAVEL_EXCESS_MM = 50e-3
+"""How far the executed motion may be from the command beyond the tolerance, at worst."""
+_TIME_EXCESS_S = 1e-3
+_FILAMENT_MM = 1e-4
+
+
+def compensate_file(
+    source: Path,
+    target: Path,
+    machine: Machine,
+    options: Options,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+) -> Result:
+    """Compensate a print file.
+
+    Parameters
+    ----------
+    source, target : Path
+        The target is written beside itself and renamed when it is complete; the source is only
+        read. They may be the same file.
+    machine : Machine
+    options : Options
+    cache_dir : Path, optional
+        Where the tuned shaper of a machine revision is kept.
+    progress : callable, optional
+        Called now and then; may raise `Cancelled`.
+
+    Returns
+    -------
+    Result
+        Figures measured on the written file.
+
+    Raises
+    ------
+    GcodeError
+        The file cannot be read as G-code of this machine, moves nothing, or was processed before.
+    DesignError, ModelError
+        The method cannot be designed for this machine.
+    """
+    with _replacing(target) as temporary:
+        return _Job(source, temporary, machine, options, cache_dir, progress).run()
+
+
+class _Clock:
+    """CPU seconds by stage."""
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.process_time()
+        try:
+            yield
+        finally:
+            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start
+
+
+class _Job:
+    """State of one file on its way."""
+
+    def __init__(
+        self,
+        source: Path,
+        target: Path,
+        machine: Machine,
+        options: Options,
+        cache_dir: Path | None,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._source, self._target = source, target
+        self._machine, self._options = machine, options
+        self._progress = progress
+        self._began = time.monotonic()
+        self._clock = _Clock()
+        self._say("tuning the yardstick", 0.0)
+        with self._clock.stage("yardstick"):
+            self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+        self._changes = options.method != "none"
+        self._reader = Interpreter(machine)
+        self._checker = Interpreter(machine)
+        self._splitter = Splitter(machine, compensate=self._changes)
+        self._measurement = Measurement(machine, DT_S, self._shaper, compensated=True)
+        if self._changes:
+            with self._clock.stage("design"):
+                self._work = PieceCompensator(machine, options, self._shaper)
+            self._writer = KlipperWriter(machine, self._work.encoder.limits, self._stamp())
+        self._sum = _Sums()
+
+    def run(self) -> Result:
+        size = self._source.stat().st_size
+        with self._source.open("rb") as source, self._target.open("wb") as target:
+            if self._changes:
+                self._emit(target, self._writer.header())
+            for item in self._items(source):
+                if isinstance(item, Piece):
+                    self._emit(target, self._piece(item))
+                else:
+                    self._emit(target, self._passage(item))
+                self._say("compensating", source.tell() / max(size, 1))
+            if self._sum.moves == 0:
+                raise GcodeError("the file contains no moves: is it G-code?")
+            if self._changes:
+                self._emit(target, self._writer.footer(self._sum.newline))
+            target.flush()
+            os.fsync(target.fileno())
+        self._measurement.finish()
+        self._say("done", 1.0)
+        return self._result(size)
+
+    def _items(self, source: object) -> Iterator[Piece | Passage]:
+        while True:
+            with self._clock.stage("read"):
+                data = source.read(_BLOCK_BYTES)  # type: ignore[attr-defined]
+                blocks = self._reader.push(data) if data else self._reader.flush()
+            for block in blocks:
+                if np.any(block.events.kind == EventKind.STAMP):
+                    row = int(np.argmax(block.events.kind == EventKind.STAMP))
+                    raise GcodeError(
+                        "this file was already processed by stillpath; compensate the original",
+                        line=int(block.events.line[row]),
+                    )
+                yield from self._timed(self._splitter.push(block))
+            if not data:
+                yield from self._timed(self._splitter.flush())
+                return
+
+    def _timed(self, items: Iterator[Piece | Passage]) -> Iterator[Piece | Passage]:
+        while True:
+            with self._clock.stage("plan"):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
+
+    def _piece(self, piece: Piece) -> bytes:
+        self._sum.pieces += 1
+        self._sum.moves += len(piece.moves)
+        original_s = _duration_s(piece.phases)
+        self._sum.original_s += original_s
+        writer, checker = copy.copy(self._writer), None
+        try:
+            with self._clock.stage("compensate"):
+                made = self._work.compensate(piece)
+            with self._clock.stage("write"):
+                text = self._writer.piece(piece, made.encoded)
+            with self._clock.stage("read back"):
+                checker = self._checker.snapshot()
+                executed = self._read_back(text)
+                position, gap = deviation(made, executed)
+                self._verify(piece, made, position, gap, executed)
+        except (Unfit, GcodeError) as error:
+            self._writer = writer
+            if checker is not None:
+                self._checker = checker
+            return self._put_back(piece, original_s, str(error))
+        self._work.compensator.commit()
+        self._sum.add_piece(made, executed, gap)
+        with self._clock.stage("measure"):
+            timeline = made.timeline
+            last = len(timeline.row) - 1
+            samples = _samples(piece, timeline.row, timeline.position_mm, made.extruding)
+            self._measurement.add(_cut(samples, last), position[:2, :last])
+        return text
+
+    def _put_back(self, piece: Piece, seconds: float, reason: str) -> bytes:
+        """Let a piece leave as it came."""
+        passage = Passage(
+            moves=piece.moves,
+            events=piece.events,
+            text=piece.text,
+            text_offset=piece.text_offset,
+            limits=piece.limits,
+            modal=piece.modal,
+            limits_before=piece.limits_before,
+            limits_after=piece.limits_after,
+            modal_before=piece.modal_before,
+            modal_after=piece.modal_after,
+        )
+        phases = piece.phases
+        row_s = phases.accel_s + phases.cruise_s + phases.decel_s
+        extruding_s = float(np.sum(row_s[_feeding(phases)]))
+        self._sum.put_back.append(
+            PutBack(
+                line_first=int(piece.moves.line[0]),
+                line_last=int(piece.moves.line[-1]),
+                seconds=seconds,
+                extruding_seconds=extruding_s,
+                reason=reason,
+            )
+        )
+        self._sum.original_s -= seconds
+        self._sum.moves -= len(piece.moves)
+        return self._passage(passage)
+
+    def _passage(self, passage: Passage) -> bytes:
+        text = passage.text
+        if self._changes:
+            text = self._writer.passage(passage)
+            with self._clock.stage("read back"):
+                self._checker.push(text)
+        self._sum.moves += len(passage.moves)
+        self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
+        with self._clock.stage("plan"):
+            parts = list(plan_passage(passage, self._machine))
+        with self._clock.stage("measure"):
+            for part in parts:
+                if part is None:
+                    self._measurement.jump()
+                    self._observe(None)
+                    continue
+                self._measure_passage(passage, *part)
+        return text
+
+    def _measure_passage(self, passage: Passage, phases: Phases, total_s: float) -> None:
+        n = round(total_s / DT_S)
+        position, row = sample_phases(phases, (0.0, DT_S, max(n, 1)))
+        moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        t = DT_S * np.arange(max(n, 1))
+        moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
+        extruding = moving & (phases.direction[row, 3] > 0.0)
+        samples = _samples(passage, phases.move_index[row], position, extruding)
+        self._sum.original_s += total_s
+        self._sum.time_s += total_s
+        self._sum.extruding_s += float(np.sum(duration[_feeding(phases)]))
+        self._measurement.add(_cut(samples, n))
+        self._observe(position[:2])
+
+    def _observe(self, command: np.ndarray | None) -> None:
+        if not self._changes:
+            return
+        if command is None:
+            self._sum.jumped = True
+            return
+        if self._sum.jumped and command.shape[1]:
+            self._work.compensator.reset(command[:, 0])
+            self._sum.jumped = False
+        self._work.compensator.observe(command)
+
+    def _read_back(self, text: bytes) -> Phases:
+        """Plan the written lines of a piece by the firmware's rules."""
+        blocks = self._checker.push(text)
+        parts = [
+            (block.moves, block.limits) for block in blocks if len(block.moves)
+        ]
+        if len(parts) == 1:
+            return plan_moves(parts[0][0], parts[0][1], self._machine.firmware)
+        from gcode.firmware.klipper.planner import Planner
+
+        planner = Planner(self._machine.firmware)
+        phases = [planner.push_moves(moves, limits) for moves, limits in parts]
+        phases.append(planner.flush())
+        return join_phases(phases)
+
+    def _verify(
+        self,
+        piece: Piece,
+        made: CompensatedPiece,
+        position: np.ndarray,
+        gap: np.ndarray,
+        executed: Phases,
+    ) -> None:
+        """Compare executed with intended motion; raise `Unfit` with the reason."""
+        tolerance = 1e-3 * self._options.tolerance_um
+        worst_print = float(np.max(gap[made.extruding], initial=0.0))
+        worst = float(np.max(gap, initial=0.0))
+        if worst_print > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
+            raise Unfit(
+                f"read back, the motion is {1e3 * worst_print:.1f} um from its command while "
+                f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
+                f"{self._options.tolerance_um:g} um)"
+            )
+        late = _duration_s(executed) - float(made.timeline.end_s[-1] - made.timeline.start_s[0])
+        if abs(late) > _TIME_EXCESS_S:
+            raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
+        end = executed.start_mm[-1] + executed.direction[-1] * _length_mm(executed)
+        wanted = piece.moves.end_mm[-1]
+        if np.max(np.abs(end[:3] - wanted[:3])) > 1e-6 or abs(end[3] - wanted[3]) > _FILAMENT_MM:
+            raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
+
+    def _stamp(self) -> str:
+        options = self._options.model_dump_json()
+        settings = hashlib.sha256(options.encode()).hexdigest()[:8]
+        return (
+            f"{__version__} machine={self._machine.name} model={self._machine.revision} "
+            f"method={self._options.method} settings={settings}"
+        )
+
+    def _emit(self, target: object, text: bytes) -> None:
+        self._sum.written += len(text)
+        target.write(text)  # type: ignore[attr-defined]
+
+    def _say(self, stage: str, fraction: float) -> None:
+        if self._progress is None:
+            return
+        elapsed = time.monotonic() - self._began
+        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
+        seconds = self._sum.time_s if hasattr(self, "_sum") else 0.0
+        self._progress(Progress(stage, fraction, seconds, elapsed, eta))
+
+    def _result(self, size: int) -> Result:
+        total, measured = self._sum, self._measurement
+        put_back_s = sum(p.extruding_seconds for p in total.put_back)
+        warnings = list(total.warnings)
+        if self._changes and self._writer.shaper_unknown:
+            warnings.append(
+                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
+                "is switched off and stays off; set it again after the print."
+            )
+        shaper = self._shaper
+        return Result(
+            version=__version__,
+            machine=self._machine.name,
+            machine_title=self._machine.title,
+            machine_revision=self._machine.revision,
+            settings={k: v for k, v in self._options.model_dump().items()},
+            source_name=self._source.name,
+            channels=measured.channels(),
+            best_shaper=f"{shaper.type} {shaper.fx_hz:.1f} / {shaper.fy_hz:.1f} Hz",
+            original_time_s=total.original_s,
+            time_s=total.time_s,
+            original_bytes=size,
+            written_bytes=total.written,
+            segments=total.segments,
+            segments_per_s=total.segments / total.compensated_s if total.compensated_s else 0.0,
+            peak_segments_per_s=total.peak_rate,
+            peak_velocity_mm_s=total.peak_velocity,
+            peak_accel_mm_s2=total.peak_accel,
+            emission_rms_um=1e3 * np.sqrt(total.gap2 / max(total.gap_count, 1)),
+            emission_max_um=1e3 * total.gap_max,
+            filament_error_mm=total.filament_error,
+            compensated_s=total.compensated_s,
+            extruding_s=total.extruding_s,
+            pieces=total.pieces,
+            put_back=total.put_back,
+            put_back_extruding_share=put_back_s / total.extruding_s if total.extruding_s else 0.0,
+            warnings=warnings,
+            layers=measured.layers(),
+            features=measured.features(self._reader.feature_names),
+            track=measured.track(),
+            layer_views=measured.layer_views(),
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+        )
+
+
+class _Sums:
+    """What adds up along a file."""
+
+    def __init__(self) -> None:
+        self.moves = self.pieces = self.segments = self.written = 0
+        self.original_s = self.time_s = self.compensated_s = self.extruding_s = 0.0
+        self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
+        self.gap2 = self.gap_max = self.filament_error = 0.0
+        self.gap_count = 0
+        self.put_back: list[PutBack] = []
+        self.warnings: list[str] = []
+        self.newline = True
+        self.jumped = True
+
+    def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
+        timeline, segments = made.timeline, made.segments
+        seconds = float(timeline.end_s[-1])
+        self.time_s += seconds
+        self.compensated_s += seconds
+        self.extruding_s += DT_S * float(np.sum(made.extruding))
+        self.segments += len(segments)
+        if len(segments):
+            rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
+            self.peak_rate = max(self.peak_rate, float(rate.max()))
+        command = made.command_mm[:2]
+        self.peak_velocity = max(
+            self.peak_velocity, float(np.max(np.hypot(*np.diff(command)), initial=0.0)) / DT_S
+        )
+        self.peak_accel = max(
+            self.peak_accel, float(np.max(np.abs(np.diff(command, 2)), initial=0.0)) / DT_S**2
+        )
+        self.gap2 += float(gap @ gap)
+        self.gap_count += len(gap)
+        self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
+        end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * _length_mm(executed)
+        self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
+
+
+def plan_passage(passage: Passage, machine: Machine) -> Iterator[tuple[Phases, float] | None]:
+    """Plan the moves of a passage between its stops.
+
+    Yields
+    ------
+    (phases, seconds)
+        A stretch of motion with the dwell behind it; phases start at time 0.
+    None
+        The position becomes unknown here.
+    """
+    events = passage.events
+    stops = np.flatnonzero(events.kind >= EventKind.STOP)
+    done = 0
+    for k in [*stops.tolist(), None]:
+        end = len(passage.moves) if k is None else int(events.move_index[k])
+        dwell = 0.0 if k is None else float(events.dwell_s[k])
+        if k is not None and events.kind[k] in (EventKind.OBJECT, EventKind.STAMP):
+            continue
+        if end > done:
+            rows = _move_rows(passage, done, end)
+            phases = plan_moves(rows, passage.limits, machine.firmware)
+            if len(phases):
+                shifted = phases.move_index - phases.move_index[0] + done
+                yield _renumbered(phases, shifted), _duration_s(phases) + dwell
+            done = end
+        if k is not None and events.kind[k] == EventKind.UNKNOWN:
+            yield None
+
+
+def default_cache_dir() -> Path:
+    """Folder for what is worth keeping between jobs."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(base) if base else Path.home() / ".cache") / "stillpath"
+
+
+@contextlib.contextmanager
+def _replacing(target: Path) -> Iterator[Path]:
+    """A temporary file beside the target that takes its place when all went well."""
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
+        temporary.chmod(mode & 0o7777)
+        temporary.replace(target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _duration_s(phases: Phases) -> float:
+    if len(phases) == 0:
+        return 0.0
+    last = phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
+    return float(phases.t_s[-1] + last - phases.t_s[0])
+
+
+def _length_mm(phases: Phases) -> float:
+    """Length of the last move."""
+    v0, v1, v2 = phases.start_mm_s[-1], phases.cruise_mm_s[-1], phases.end_mm_s[-1]
+    return float(
+        0.5 * (v0 + v1) * phases.accel_s[-1]
+        + v1 * phases.cruise_s[-1]
+        + 0.5 * (v1 + v2) * phases.decel_s[-1]
+    )
+
+
+def _feeding(phases: Phases) -> np.ndarray:
+    direction = phases.direction
+    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    return np.asarray(moves_xy & (direction[:, 3] > 0.0))
+
+
+def _samples(
+    item: Piece | Passage, row: np.ndarray, position: np.ndarray, extruding: np.ndarray
+) -> MotionSamples:
+    moves = item.moves
+    return MotionSamples(
+        path_mm=position[:2],
+        z_mm=position[2],
+        extruding=extruding,
+        line=moves.line[row],
+        layer=moves.layer[row],
+        feature=moves.feature[row],
+    )
+
+
+def _cut(samples: MotionSamples, n: int) -> MotionSamples:
+    """First n samples: the last one of an item is the first one of the next."""
+    return MotionSamples(
+        samples.path_mm[:, :n],
+        samples.z_mm[:n],
+        samples.extruding[:n],
+        samples.line[:n],
+        samples.layer[:n],
+        samples.feature[:n],
+    )
+
+
+def _move_rows(passage: Passage, first: int, last: int) -> Moves:
+    moves = passage.moves
+    return Moves(**{f.name: getattr(moves, f.name)[first:last] for f in fields(moves)})
+
+
+def _renumbered(phases: Phases, move_index: np.ndarray) -> Phases:
+    return replace(phases, move_index=move_index)
