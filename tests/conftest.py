@@ -12,6 +12,7 @@ import pytest
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+_MISSING = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
 _ROOT = Path(__file__).resolve().parent.parent
 if "NUMBA_CACHE_DIR" not in os.environ and not os.access(_ROOT / "models", os.W_OK):
     os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / "stillpath-tests-numba")
@@ -31,12 +32,8 @@ def _in_ci() -> bool:
 def shared_dir() -> Path:
     """Folder of shared test data; tests that use it carry the marker `shared`."""
     folder = _shared()
-    if folder is not None:
-        return folder
-    reason = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
-    if _in_ci():
-        pytest.fail(reason)
-    pytest.skip(reason)
+    assert folder is not None, _MISSING  # a test without it is stopped before, by its marker
+    return folder
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -46,12 +43,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("shared")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Judge the marker, whichever way a test finds its data."""
+    if item.get_closest_marker("shared") is not None and _shared() is None:
+        if _in_ci():
+            pytest.fail(_MISSING)
+        pytest.skip(_MISSING)
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say it loudly when a part of the evidence was left out."""
     skipped = [
         report
         for report in terminalreporter.getreports("skipped")
-        if "no shared test data" in str(report.longrepr)
+        if "no shared test data" in str(report.longrepr).lower()
     ]
     if skipped:
         terminalreporter.write_line(
