@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -20,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[2]
 PRETEND = [sys.executable, str(Path(__file__).with_name("pretend_server.py"))]
 REAL = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
 REAL += ["--data-dir"]
-has_road = importlib.util.find_spec("service.pipeline.road") is not None
 
 
 @contextmanager
@@ -119,7 +117,6 @@ def test_an_interrupted_server_ends_at_once_and_takes_its_worker_along(tmp_path:
         assert process.wait(timeout=20) in (0, -signal.SIGINT, 130)
 
 
-@pytest.mark.skipif(not has_road, reason="the road is not built yet")
 def test_a_real_file_through_the_real_road(tmp_path: Path):
     source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
     with server(REAL, tmp_path) as (client, _):
