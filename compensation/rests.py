@@ -19,7 +19,7 @@ __all__ = ["EFFORT_PRICE", "solve_window"]
 
 EFFORT_PRICE = 0.5
 """Price of squared increments (mm/sample^2)^2 against squared error mm^2."""
-EDGE_PRICE = 30.0
+EDGE_PRICE = 3.0
 """How much more the one increment costs with which the command stops or starts."""
 
 

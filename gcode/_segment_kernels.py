@@ -171,9 +171,16 @@ def fit_stretch(
             across_slope = min(max((cx * dy - cy * dx) / span, wide_low[1]), wide_high[1])
             slope[0] = cx * along_slope - cy * across_slope
             slope[1] = cy * along_slope + cx * across_slope
+            moves = False
             for axis in range(2):
-                target = grid * np.round((origin[axis] + slope[axis] * span) / grid)
+                wish[axis] = slope[axis] * span
+                target = grid * np.round((origin[axis] + wish[axis]) / grid)
                 slope[axis] = (target - origin[axis]) / span
+                moves = moves or abs(target - origin[axis]) > 0.5 * grid
+            if not moves:
+                # A segment of no length cannot pass the time; one grid step can.
+                axis = 0 if abs(wish[0]) >= abs(wish[1]) else 1
+                slope[axis] = (grid if wish[axis] >= 0.0 else -grid) / span
             slope[2] = 0.5 * (low[2] + high[2])
             slope[3] = 0.5 * (low[3] + high[3])
         else:

@@ -130,7 +130,8 @@ def build_timeline(
             start[i], end[i] = now, now + rest_s[i]
             row_start[rows] = now + scale * offset[:-1]
             first = int(np.ceil(now / dt_s - _GRID_EPS)) + 1
-            last = int(np.floor(end[i] / dt_s + _GRID_EPS)) + 1
+            # A sample just behind the end of the rest has no time to get anywhere.
+            last = int(np.floor(end[i] / dt_s + 0.5)) + 1
             if last > first:
                 rests.append((first, last))
             now = end[i]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,13 @@ from models.plants import plant_set
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
-__all__ = ["DT_S", "CompensatedPiece", "PieceCompensator", "Unfit", "deviation"]
+__all__ = ["DT_S", "CompensatedPiece", "PieceCompensator", "Unfit", "as_executed", "deviation"]
 
 DT_S = 1e-3
 """Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
 
-_REST_TOLERANCE_S = 0.3e-3
-_ROUNDS = 4
+_REST_TOLERANCE_S = 1e-3
+_ROUNDS = 3
 _GRID_MM = 1e-3
 
 
@@ -153,12 +153,46 @@ class PieceCompensator:
                 )
 
 
-def deviation(
-    piece: CompensatedPiece, executed: Phases
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return executed X Y (2, n) on the piece's grid, and its distance from the command (n,)."""
-    timeline = piece.timeline
+def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
+    """Distance in X Y of the executed motion from the command, at the command's samples.
+
+    A stretch counts from its own start: rests may take a little longer or shorter than planned.
+    """
+    timeline, encoded = piece.timeline, piece.encoded
     n = piece.command_mm.shape[1]
-    position, _ = sample_phases(executed, (-float(timeline.start_s[0]), timeline.dt_s, n))
+    t = timeline.dt_s * np.arange(n)
+    starts = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
+    group = np.clip(np.searchsorted(starts, np.arange(n), "right") - 1, 0, len(starts) - 1)
+    shift = (encoded.group_start_s - timeline.start_s)[group]
+    # In a rest, time waits where the stretch behind it begins.
+    until = np.append(encoded.group_start_s[1:], np.inf)[group]
+    moved = np.maximum.accumulate(np.minimum(t + shift, until)) - float(timeline.start_s[0])
+    position, _ = sample_phases(executed, moved)
     gap = position[:2] - piece.command_mm[:2]
-    return position, np.hypot(gap[0], gap[1])
+    return np.asarray(np.hypot(gap[0], gap[1]))
+
+
+def as_executed(
+    piece: CompensatedPiece, phases: Phases, executed: Phases
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Planned and executed motion of a piece on one grid of real time.
+
+    Returns
+    -------
+    planned_mm, executed_mm : ndarray, shape (4, n)
+    row : ndarray of int64, shape (n,)
+        Row of the piece's `phases`.
+    extruding : ndarray of bool, shape (n,)
+    """
+    dt_s = piece.timeline.dt_s
+    origin = float(piece.timeline.start_s[0])
+    last = executed.accel_s[-1] + executed.cruise_s[-1] + executed.decel_s[-1]
+    n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
+    moved = replace(phases, t_s=piece.encoded.row_start_s)
+    planned, row = sample_phases(moved, (0.0, dt_s, n))
+    position, _ = sample_phases(executed, (-origin, dt_s, n))
+    duration = phases.accel_s + phases.cruise_s + phases.decel_s
+    moving = dt_s * np.arange(n) <= moved.t_s[row] + duration[row]
+    direction = phases.direction[row]
+    xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    return planned, position, row, moving & xy & (direction[:, 3] > 0.0)

@@ -32,6 +32,7 @@ from service.pipeline.compensating import (
     CompensatedPiece,
     PieceCompensator,
     Unfit,
+    as_executed,
     deviation,
 )
 from service.pipeline.measure import Measurement, MotionSamples
@@ -198,8 +199,8 @@ class _Job:
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
                 executed = self._read_back(text)
-                position, gap = deviation(made, executed)
-                self._verify(piece, made, position, gap, executed)
+                gap = deviation(made, executed)
+                self._verify(piece, made, gap, executed)
         except (Unfit, GcodeError) as error:
             self._writer = writer
             if checker is not None:
@@ -208,9 +209,9 @@ class _Job:
         self._work.compensator.commit()
         self._sum.add_piece(made, executed, gap)
         with self._clock.stage("measure"):
-            timeline = made.timeline
-            last = len(timeline.row) - 1
-            samples = _samples(piece, timeline.row, timeline.position_mm, made.extruding)
+            planned, position, row, extruding = as_executed(made, piece.phases, executed)
+            last = len(row) - 1
+            samples = _samples(piece, row, planned, extruding)
             self._measurement.add(_cut(samples, last), position[:2, :last])
         return text
 
@@ -308,7 +309,6 @@ class _Job:
         self,
         piece: Piece,
         made: CompensatedPiece,
-        position: np.ndarray,
         gap: np.ndarray,
         executed: Phases,
     ) -> None:
@@ -322,7 +322,10 @@ class _Job:
                 f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
                 f"{self._options.tolerance_um:g} um)"
             )
-        late = _duration_s(executed) - float(made.timeline.end_s[-1] - made.timeline.start_s[0])
+        encoded = made.encoded
+        stretch = made.timeline.end_s[-1] - made.timeline.start_s[-1]
+        planned_end = encoded.group_start_s[-1] + stretch - made.timeline.start_s[0]
+        late = _duration_s(executed) - float(planned_end)
         if abs(late) > _TIME_EXCESS_S:
             raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
         end = executed.start_mm[-1] + executed.direction[-1] * _length_mm(executed)
@@ -411,7 +414,7 @@ class _Sums:
 
     def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
         timeline, segments = made.timeline, made.segments
-        seconds = float(timeline.end_s[-1])
+        seconds = _duration_s(executed) + float(timeline.start_s[0])
         self.time_s += seconds
         self.compensated_s += seconds
         self.extruding_s += DT_S * float(np.sum(made.extruding))

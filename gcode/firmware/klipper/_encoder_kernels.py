@@ -77,8 +77,8 @@ def assign_speeds(
     `junction_mm_s[i]` limits the speed between i - 1 and i.
 
     The time still to spend is the target minus the time predicted so far. Klipper loses
-    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A Z
-    move ends the later the slower we go on, so its duration and our speed are found together.
+    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A stretch
+    starts when the rest before it is over: its times move with that.
     """
     now = start_s
     before = 0.0
@@ -111,26 +111,24 @@ def assign_speeds(
             before_accel = accel_mm_s2[i]
             continue
 
-        # After a rest that took longer than planned everything moves back; no rushing.
-        available = end_s[i] + late - now - correction_s[i]
         if pending >= 0:
-            available -= correction_s[pending]
-            v, rest_s = _leave_rest(
-                length_mm[i],
-                available,
-                min(junction_mm_s[i], speed_mm_s[pending]),
-                speed_mm_s[i],
+            nominal = min(length_mm[i] / planned_s[i], speed_mm_s[i])
+            leave = min(nominal, junction_mm_s[i], speed_mm_s[pending])
+            predicted_s[pending] = correction_s[pending] + _trapezoid_s(
                 length_mm[pending],
                 pending_entry,
+                leave,
                 speed_mm_s[pending],
                 accel_mm_s2[pending],
             )
-            predicted_s[pending] = rest_s + correction_s[pending]
             now += predicted_s[pending]
-            before = min(v, junction_mm_s[i], speed_mm_s[pending])
+            before = leave
             before_accel = accel_mm_s2[pending]
-            available = end_s[i] + late - now - correction_s[i]
             pending = -1
+        if i > 0 and not ours[i - 1]:
+            # The stretch starts when its rest is over, whenever that is.
+            late = now + planned_s[i] - end_s[i]
+        available = end_s[i] + late - now - correction_s[i]
         least = max(length_mm[i] / speed_mm_s[i], RUSH * planned_s[i])
         if available < least:
             late += least - available
@@ -160,30 +158,6 @@ def _trapezoid_s(length: float, entry: float, leave: float, cruise: float, accel
         return (2.0 * np.sqrt(peak2) - entry - leave) / accel
     ramps = ((cruise - entry) ** 2 + (cruise - leave) ** 2) / (2.0 * accel * cruise)
     return length / cruise + ramps
-
-
-@kernel
-def _leave_rest(
-    length: float,
-    available_s: float,
-    junction: float,
-    limit: float,
-    rest_length: float,
-    entry: float,
-    rest_cruise: float,
-    rest_accel: float,
-) -> tuple[float, float]:
-    """Speed behind a Z move such that both together take `available_s`; and the Z move's time."""
-    low, high = 1e-3, limit
-    for _ in range(50):
-        v = np.sqrt(low * high)
-        rest_s = _trapezoid_s(rest_length, entry, min(v, junction), rest_cruise, rest_accel)
-        if rest_s + length / v > available_s:
-            low = v
-        else:
-            high = v
-    rest_s = _trapezoid_s(rest_length, entry, min(high, junction), rest_cruise, rest_accel)
-    return high, rest_s
 
 
 @kernel(inline=True)

@@ -47,7 +47,9 @@ class Encoded:
         Row of the piece for a rest's own move, -1 for a segment of ours.
     feedrate_mm_min : ndarray, shape (n,)
     start_s : ndarray, shape (n,)
-        When each move begins, on the timeline.
+        When each move begins, counted as on the timeline.
+    group_start_s : ndarray, shape (groups,)
+        When each group begins; rests move the groups behind them a little.
     row_start_s : ndarray, shape (rows of the piece,)
         When each original move begins on the timeline.
     rest_s : ndarray, shape (groups,)
@@ -61,6 +63,7 @@ class Encoded:
     row: NDArray[np.int64]
     feedrate_mm_min: NDArray[np.float64]
     start_s: NDArray[np.float64]
+    group_start_s: NDArray[np.float64]
     row_start_s: NDArray[np.float64]
     rest_s: NDArray[np.float64]
     phases: Phases
@@ -137,13 +140,16 @@ class KlipperEncoder:
             correction += miss
         rest_s = np.zeros(len(timeline.groups))
         np.add.at(rest_s, group[~ours], actual[~ours])
+        start_s = timeline.start_s[0] + phases.t_s
+        group_start_s = _group_starts(timeline, group, start_s, actual)
         return Encoded(
             position=position,
             begin=begin,
             row=rows,
             feedrate_mm_min=feedrate,
-            start_s=timeline.start_s[0] + phases.t_s,
-            row_start_s=timeline.row_start_s,
+            start_s=start_s,
+            group_start_s=group_start_s,
+            row_start_s=_moved_rows(timeline, group_start_s),
             rest_s=rest_s,
             phases=phases,
         )
@@ -245,6 +251,30 @@ class KlipperEncoder:
 def _group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
     return np.array([duration[g.first : g.last].sum() for g in groups])
+
+
+def _group_starts(
+    timeline: Timeline,
+    group: NDArray[np.int64],
+    start_s: NDArray[np.float64],
+    duration_s: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """When each group begins; one without moves begins where the one before ends."""
+    starts = np.full(len(timeline.groups), np.nan)
+    first = np.append(True, group[1:] != group[:-1])
+    starts[group[first]] = start_s[first]
+    for i in np.flatnonzero(np.isnan(starts)):
+        earlier = np.flatnonzero(group < i)
+        starts[i] = timeline.start_s[0]
+        if len(earlier):
+            starts[i] = start_s[earlier[-1]] + duration_s[earlier[-1]]
+    return starts
+
+
+def _moved_rows(timeline: Timeline, group_start_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    shift = group_start_s - timeline.start_s
+    lengths = [group.last - group.first for group in timeline.groups]
+    return timeline.row_start_s + np.repeat(shift, lengths)
 
 
 def _integers(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:
