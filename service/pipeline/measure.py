@@ -76,9 +76,7 @@ class Measurement:
         self._meters = {name: MotionMeter(dt_s) for name in self._names}
         self._streams: dict[str, PlantStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
-        self._shaper_label = (
-            f"best shaper ({shaper.type} {shaper.fx_hz:.1f} / {shaper.fy_hz:.1f} Hz)"
-        )
+        self._shaper_label = f"best shaper ({shaper.label})"
         self._track = {name: _Bins() for name in self._names}
         self._views = _Views([n for n in self._names if n != "shaper"])
         self._fresh = True

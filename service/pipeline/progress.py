@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Cancelled", "Progress"]
+__all__ = ["Cancelled", "Progress", "ProgressCallback"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,3 +35,7 @@ class Progress:
 
 class Cancelled(Exception):
     """Raised by a progress callback: stop the job and leave nothing behind."""
+
+
+ProgressCallback = Callable[[Progress], None]
+"""Called now and then; may raise `Cancelled`."""

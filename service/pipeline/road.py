@@ -7,13 +7,10 @@ with what it should do; a piece that fails leaves as it came. All figures come f
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import hashlib
-import os
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -27,6 +24,7 @@ from gcode.pieces import Passage, Piece, Splitter
 from gcode.sampler import sample_phases
 from gcode.types import EventKind, Moves, Phases
 from models.machine import Machine
+from service.pipeline.clock import StageClock
 from service.pipeline.compensating import (
     DT_S,
     CompensatedPiece,
@@ -35,16 +33,16 @@ from service.pipeline.compensating import (
     as_executed,
     deviation,
 )
+from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.motion import plan_file, simulate_file
 from service.pipeline.options import Options
-from service.pipeline.progress import Progress
+from service.pipeline.progress import Progress, ProgressCallback
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
-__all__ = ["compensate_file"]
-
-ProgressCallback = Callable[[Progress], None]
+__all__ = ["compensate_file", "plan_file", "simulate_file"]
 
 _BLOCK_BYTES = 1 << 17
 _EXTRUDING_EXCESS_MM = 5e-3
@@ -89,23 +87,8 @@ def compensate_file(
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
-    with _replacing(target) as temporary:
+    with replacing(target) as temporary:
         return _Job(source, temporary, machine, options, cache_dir, progress).run()
-
-
-class _Clock:
-    """CPU seconds by stage."""
-
-    def __init__(self) -> None:
-        self.cpu_s: dict[str, float] = {}
-
-    @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start = time.process_time()
-        try:
-            yield
-        finally:
-            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start
 
 
 class _Job:
@@ -124,7 +107,7 @@ class _Job:
         self._machine, self._options = machine, options
         self._progress = progress
         self._began = time.monotonic()
-        self._clock = _Clock()
+        self._clock = StageClock()
         self._say("tuning the yardstick", 0.0)
         with self._clock.stage("yardstick"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
@@ -154,8 +137,6 @@ class _Job:
                 raise GcodeError("the file contains no moves: is it G-code?")
             if self._changes:
                 self._emit(target, self._writer.footer(self._sum.newline))
-            target.flush()
-            os.fsync(target.fileno())
         self._measurement.finish()
         self._say("done", 1.0)
         return self._result(size)
@@ -371,7 +352,7 @@ class _Job:
             settings={k: v for k, v in self._options.model_dump().items()},
             source_name=self._source.name,
             channels=measured.channels(),
-            best_shaper=f"{shaper.type} {shaper.fx_hz:.1f} / {shaper.fy_hz:.1f} Hz",
+            best_shaper=shaper.label,
             original_time_s=total.original_s,
             time_s=total.time_s,
             original_bytes=size,
@@ -463,34 +444,6 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[tuple[Phases, f
             done = end
         if k is not None and events.kind[k] == EventKind.UNKNOWN:
             yield None
-
-
-def default_cache_dir() -> Path:
-    """Folder for what is worth keeping between jobs."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "stillpath"
-
-
-@contextlib.contextmanager
-def _replacing(target: Path) -> Iterator[Path]:
-    """A temporary file beside the target that takes its place when all went well."""
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
-        temporary.chmod(mode & 0o7777)
-        temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _duration_s(phases: Phases) -> float:

@@ -63,6 +63,11 @@ class BestShaper:
     contour_rms_um: float
     tracking_rms_um: float
 
+    @property
+    def label(self) -> str:
+        """Type and frequencies for a person."""
+        return f"{self.type} {self.fx_hz:.1f} / {self.fy_hz:.1f} Hz"
+
 
 def tune_shaper(
     machine: Machine, y_d_mm: Array, dt_s: float, extruding: NDArray[np.bool_]

@@ -1,0 +1,31 @@
+"""CPU seconds by stage."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+
+__all__ = ["StageClock"]
+
+
+class StageClock:
+    """Add up the CPU seconds of named stages.
+
+    Attributes
+    ----------
+    cpu_s : dict
+        Stage to seconds, in the order in which the stages first ran.
+    """
+
+    def __init__(self) -> None:
+        self.cpu_s: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count what runs inside the `with` block."""
+        start = time.process_time()
+        try:
+            yield
+        finally:
+            self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start

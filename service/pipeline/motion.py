@@ -1,0 +1,244 @@
+"""The motion that a file makes, without changing it: to a table of samples, or to a report."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.errors import GcodeError
+from gcode.firmware.klipper.planner import Planner
+from gcode.interpreter import Interpreter
+from gcode.sampler import Sampler, Samples
+from gcode.types import EventKind, Moves, ProgramBlock
+from models.machine import Machine
+from service.pipeline.clock import StageClock
+from service.pipeline.compensating import DT_S
+from service.pipeline.files import default_cache_dir, replacing
+from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.progress import Progress, ProgressCallback
+from service.pipeline.result import Result, StageTime
+from service.pipeline.yardstick import cached_shaper
+from service.version import __version__
+
+__all__ = ["plan_file", "simulate_file"]
+
+_BLOCK_BYTES = 1 << 17
+_COLUMNS = ("t", "x", "y", "z", "e")
+
+
+def plan_file(
+    source: Path,
+    target_npz: Path,
+    machine: Machine,
+    *,
+    rate_hz: float = 1000.0,
+    progress: ProgressCallback | None = None,
+) -> None:
+    """Write the motion that the firmware makes of a file as a table of samples.
+
+    Parameters
+    ----------
+    source : Path
+        Any print file, also one that was compensated.
+    target_npz : Path
+        Arrays ``t`` [s, 0 at the first move], ``x y z`` [mm, machine axes] and ``e`` [mm, the
+        firmware's cumulative extruder position], written whole or not at all.
+    machine : Machine
+    rate_hz : float
+        Samples per second.
+    progress : callable, optional
+
+    Raises
+    ------
+    GcodeError
+        The file cannot be read as G-code of this machine, or moves nothing.
+    """
+    if not (np.isfinite(rate_hz) and 0 < rate_hz <= 100_000):
+        raise GcodeError(f"the rate of {rate_hz:g} samples per second is outside 0 to 100000")
+    with (
+        replacing(target_npz) as temporary,
+        tempfile.TemporaryDirectory(dir=target_npz.parent, prefix=".stillpath-plan-") as folder,
+    ):
+        columns = {name: Path(folder, name) for name in _COLUMNS}
+        files = {name: path.open("wb") for name, path in columns.items()}
+        count = 0
+        try:
+            for part in _Motion(source, machine, 1.0 / rate_hz, progress):
+                samples = part.samples
+                rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
+                for name, row in zip(_COLUMNS, rows, strict=True):
+                    files[name].write(np.ascontiguousarray(row, dtype="<f8").tobytes())
+                count += len(samples)
+        finally:
+            for file in files.values():
+                file.close()
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for name, path in columns.items():
+                entry = zipfile.ZipInfo(f"{name}.npy")
+                with archive.open(entry, "w", force_zip64=True) as out, path.open("rb") as column:
+                    header = {"descr": "<f8", "fortran_order": False, "shape": (count,)}
+                    np.lib.format.write_array_header_1_0(out, header)
+                    shutil.copyfileobj(column, out, 1 << 20)
+
+
+def simulate_file(
+    source: Path,
+    machine: Machine,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+) -> Result:
+    """Predict the vibration of a file as it is, and with the best firmware shaper.
+
+    Parameters and errors are those of `service.pipeline.road.compensate_file`.
+    """
+    clock = StageClock()
+    with clock.stage("yardstick"):
+        shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+    measurement = Measurement(machine, DT_S, shaper, compensated=False)
+    motion = _Motion(source, machine, DT_S, progress)
+    extruding_s = 0.0
+    peak_velocity = 0.0
+    for part in motion:
+        if part.jumped:
+            measurement.jump()
+        with clock.stage("measure"):
+            samples = part.motion()
+            measurement.add(samples)
+        extruding_s += DT_S * float(np.sum(samples.extruding))
+        if len(samples) > 1:
+            step = np.hypot(*np.diff(samples.path_mm))
+            peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
+    measurement.finish()
+    size = source.stat().st_size
+    return Result(
+        version=__version__,
+        machine=machine.name,
+        machine_title=machine.title,
+        machine_revision=machine.revision,
+        settings={"method": "simulate"},
+        source_name=source.name,
+        channels=measurement.channels(),
+        best_shaper=shaper.label,
+        original_time_s=motion.time_s,
+        time_s=motion.time_s,
+        original_bytes=size,
+        written_bytes=size,
+        segments=0,
+        segments_per_s=0.0,
+        peak_segments_per_s=0.0,
+        peak_velocity_mm_s=peak_velocity,
+        peak_accel_mm_s2=0.0,
+        emission_rms_um=0.0,
+        emission_max_um=0.0,
+        filament_error_mm=0.0,
+        compensated_s=0.0,
+        extruding_s=extruding_s,
+        pieces=0,
+        put_back=[],
+        put_back_extruding_share=0.0,
+        warnings=[],
+        layers=measurement.layers(),
+        features=measurement.features(motion.feature_names),
+        track=measurement.track(),
+        layer_views=measurement.layer_views(),
+        stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Samples with the moves they belong to; `jumped`: the position was lost before them."""
+
+    samples: Samples
+    moves: Moves
+    first_move: int
+    jumped: bool
+
+    def motion(self) -> MotionSamples:
+        """Samples with line, layer and feature."""
+        row = self.samples.move_index - self.first_move
+        moves = self.moves
+        travel = moves.end_mm - moves.start_mm
+        feeds = ((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)) & (travel[:, 3] > 0.0)
+        return MotionSamples(
+            path_mm=self.samples.xyz_mm[:2],
+            z_mm=self.samples.xyz_mm[2],
+            extruding=feeds[row],
+            line=moves.line[row],
+            layer=moves.layer[row],
+            feature=moves.feature[row],
+        )
+
+
+class _Motion:
+    """Iterate over the sampled motion of a file in bounded memory."""
+
+    def __init__(
+        self, source: Path, machine: Machine, dt_s: float, progress: ProgressCallback | None
+    ) -> None:
+        self._source, self._machine = source, machine
+        self._dt_s, self._progress = dt_s, progress
+        self._began = time.monotonic()
+        self._held: list[tuple[int, Moves]] = []
+        self.time_s = 0.0
+        self.feature_names: list[str] = []
+
+    def __iter__(self) -> Iterator[_Part]:
+        reader = Interpreter(self._machine)
+        planner = Planner(self._machine.firmware)
+        sampler = Sampler(self._dt_s)
+        self.feature_names = reader.feature_names
+        size = max(self._source.stat().st_size, 1)
+        moves = 0
+        with self._source.open("rb") as file:
+            while True:
+                data = file.read(_BLOCK_BYTES)
+                for block in reader.push(data) if data else reader.flush():
+                    moves += len(block.moves)
+                    jumped = bool(np.any(block.events.kind == EventKind.UNKNOWN))
+                    self._hold(block)
+                    yield from self._part(sampler.push(planner.push(block)), jumped)
+                self.time_s = planner.time_s
+                self._say(file.tell() / size)
+                if not data:
+                    break
+        yield from self._part(sampler.push(planner.flush()), False)
+        yield from self._part(sampler.flush(), False)
+        self.time_s = planner.time_s
+        if moves == 0:
+            raise GcodeError("the file contains no moves: is it G-code?")
+
+    def _hold(self, block: ProgramBlock) -> None:
+        if len(block.moves):
+            self._held.append((block.first_move, block.moves))
+
+    def _part(self, samples: Samples, jumped: bool) -> Iterator[_Part]:
+        if len(samples) == 0:
+            return
+        first = int(samples.move_index[0])
+        while len(self._held) > 1 and self._held[1][0] <= first:
+            self._held.pop(0)
+        yield _Part(samples, _joined([m for _, m in self._held]), self._held[0][0], jumped)
+
+    def _say(self, fraction: float) -> None:
+        if self._progress is None:
+            return
+        elapsed = time.monotonic() - self._began
+        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
+        self._progress(Progress("planning", min(fraction, 1.0), self.time_s, elapsed, eta))
+
+
+def _joined(parts: list[Moves]) -> Moves:
+    if len(parts) == 1:
+        return parts[0]
+    names = Moves.__dataclass_fields__
+    return Moves(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
