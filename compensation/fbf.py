@@ -36,6 +36,8 @@ LADDER = (
 )
 """Designs from the most accurate to the gentlest."""
 
+REST_FUNCTIONS = 60
+"""Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
 WEIGHT_TRAVEL = 0.3
 WEIGHT_REST = 0.05
 ACCEL_RATIO = 2.0
@@ -172,16 +174,16 @@ class _Axis:
         self.rung = self.next_rung = 0
         self._basis = basis
         self._lifted: Sequence[LiftedPlant] = [lifted_plant(plant, 1.0, window, update)]
-        self._designs: dict[int, PreviewDesign] = {}
+        self._designs: dict[tuple[int, float], PreviewDesign] = {}
         self._plants = [plant]
         self.reset(0.0)
 
-    def design(self, rung: int) -> PreviewDesign:
-        if rung not in self._designs:
-            step = LADDER[rung]
-            n = max(4, round(step.n * self.window / 300))
-            self._designs[rung] = PreviewDesign(self._lifted, n, self._basis, step.price)
-        return self._designs[rung]
+    def design(self, rung: int, most: int = 300) -> PreviewDesign:
+        step = LADDER[rung]
+        n = max(4, round(min(step.n, most) * self.window / 300))
+        if (n, step.price) not in self._designs:
+            self._designs[n, step.price] = PreviewDesign(self._lifted, n, self._basis, step.price)
+        return self._designs[n, step.price]
 
     def reset(self, position: float) -> None:
         # States are kept relative to `origin`: the digits belong to the vibration.
@@ -218,7 +220,7 @@ class _Axis:
         weight: NDArray[np.float64],
         stops: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        design = self.design(rung)
+        design, resting_design = self.design(rung), self.design(rung, REST_FUNCTIONS)
         n, window, update = len(path), self.window, self.update
         windows = -(-n // update)
         self._move_origin(float(path[0]))
@@ -242,7 +244,7 @@ class _Axis:
             if resting[w]:
                 near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
                 committed = solve_window(
-                    design,
+                    resting_design,
                     z,
                     padded[start : start + window],
                     weights[start : start + window],

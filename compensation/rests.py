@@ -48,16 +48,24 @@ def solve_window(
     ndarray, shape (window,)
     """
     last, previous = z[-2], z[-1]
-    tied, offset, rows = _tie_down(design.basis, last - previous, rests, design.window)
+    window = design.window
+    spans = [(max(int(a), 0), min(int(b), window)) for a, b in rests]
+    tied, offset = _tie_down(design.basis, last - previous, spans)
     squared = weight * weight
     price = max(EFFORT_PRICE, design.price)
-    # The price of the untied functions keeps the matrix definite when a rest leaves few samples.
-    normal = price * (tied.T @ tied + design.effort)
-    right = -price * (tied.T @ offset)
-    edges = np.clip(rests[rests > 0], 0, design.window - 1)
-    normal += EDGE_PRICE * price * (tied[edges].T @ tied[edges])
-    right -= EDGE_PRICE * price * (tied[edges].T @ offset[edges])
-    change = tied[rows] - design.basis[rows]
+
+    # Outside the rests the increments are the untied ones, so their effort is known.
+    edges = [k for span in spans for k in span if 0 < k < window]
+    normal = 2.0 * price * design.effort
+    for a, b in spans:
+        normal -= price * (design.basis[a:b].T @ design.basis[a:b])
+        normal += price * np.outer(tied[a], tied[a])
+    right = -price * (offset @ tied)
+    for k in edges:
+        # The price of the untied functions keeps the matrix definite when a rest leaves few
+        # samples; where the command stops or starts, acceleration costs more.
+        normal += EDGE_PRICE * price * np.outer(tied[k], tied[k])
+        right -= EDGE_PRICE * price * offset[k] * tied[k]
     first = 0
     for member, filtered in zip(design.members, design.filtered, strict=True):
         states = len(member.plant.b)
@@ -67,20 +75,24 @@ def solve_window(
             - member.from_history @ z[-2:]
             - member.integrated @ offset
         )
-        response = filtered + member.integrated[:, rows] @ change
+        response = filtered.copy()
+        for a, b in spans:
+            # The plant is causal: what is tied at a shows from a on.
+            response[a:] += member.integrated[a:, a:b] @ (tied[a:b] - design.basis[a:b])
         weighted = response * (member.weight * squared)[:, None]
         normal += weighted.T @ response
-        right += weighted.T @ error
+        right += error @ weighted
         first += states
-    factor = cho_factor(normal, lower=True, overwrite_a=True)
-    coefficients = cho_solve(factor, right)
-    free = last + np.arange(1.0, design.window + 1.0) * (last - previous)
-    fixed = free + np.cumsum(np.cumsum(offset))
-    pins = rests[rests[:, 0] > 0, 0] - 1
-    if len(pins):
+    factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
+    coefficients = cho_solve(factor, right, check_finite=False)
+    step = np.arange(1.0, window + 1.0)
+    fixed = last + step * (last - previous) + np.cumsum(np.cumsum(offset))
+    pins = [a - 1 for a, _ in spans if a > 0]
+    if pins:
         # Equality constraints by their multipliers: u(pin) = path(pin).
-        through = np.cumsum(np.cumsum(tied, axis=0), axis=0)[pins]
-        reach = cho_solve(factor, through.T)
+        reach_of = np.maximum(np.array(pins)[:, None] + 1.0 - np.arange(window), 0.0)
+        through = reach_of @ tied
+        reach = cho_solve(factor, through.T, check_finite=False)
         miss = through @ coefficients - (path_mm[pins] - fixed[pins])
         coefficients = coefficients - reach @ np.linalg.solve(through @ reach, miss)
     command = fixed + np.cumsum(np.cumsum(tied @ coefficients))
@@ -92,22 +104,16 @@ def solve_window(
 
 
 def _tie_down(
-    basis: NDArray[np.float64],
-    speed: float,
-    rests: NDArray[np.int64],
-    window: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Basis and fixed increments that obey the rests, and the rows that differ from `basis`."""
+    basis: NDArray[np.float64], speed: float, spans: list[tuple[int, int]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Basis and fixed increments that obey the rests."""
     tied = basis.copy()
-    offset = np.zeros(window)
+    offset = np.zeros(len(basis))
     moving = 0
-    rows: list[NDArray[np.int64]] = []
-    for begin, end in rests:
-        a, b = max(int(begin), 0), min(int(end), window)
+    for a, b in spans:
         tied[a] = -basis[moving:a].sum(axis=0)
         tied[a + 1 : b] = 0.0
         if moving == 0:
             offset[a] = -speed
-        rows.append(np.arange(a, b))
         moving = b
-    return tied, offset, np.concatenate(rows)
+    return tied, offset

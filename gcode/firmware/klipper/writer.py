@@ -7,7 +7,7 @@ shaper, modes) is set before its first line and put back before any line that co
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,17 @@ _BYTES_PER_LINE = 96
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?G[01](?![0-9])", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
 _STOP = b"G4 P0 ; stand still\n"
+
+
+@dataclass(frozen=True, slots=True)
+class _Modes:
+    """Modal states of a piece's written moves: states[i] holds from move first[i] on."""
+
+    first: NDArray[np.int64]
+    states: list[ModalState]
+
+    def at(self, move: int) -> ModalState:
+        return self.states[int(np.searchsorted(self.first, move, "right")) - 1]
 
 
 class KlipperWriter:
@@ -82,8 +93,7 @@ class KlipperWriter:
     def piece(self, piece: Piece, encoded: Encoded) -> bytes:
         """Text of a compensated piece."""
         parts = [self._on(piece)]
-        starts, rows = encoded.start_s, encoded.row
-        events = piece.events
+        rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = self._modes(piece, encoded, index)
         text, line_end = self._format(encoded, modes, index, events.kind)
@@ -96,7 +106,7 @@ class KlipperWriter:
         for at, kind, what in sorted(stops):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._our_modes(modes[at - 1]), text[done:upto]]
+                parts += [self._our_modes(modes.at(at - 1)), text[done:upto]]
                 done = upto
             if kind == 0:
                 parts.append(self._event(piece, what))
@@ -104,7 +114,7 @@ class KlipperWriter:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what))
         if len(text) > done:
-            parts += [self._our_modes(modes[len(starts) - 1]), text[done:]]
+            parts += [self._our_modes(modes.at(len(rows) - 1)), text[done:]]
         assert self._modal is not None
         self._modal = replace(self._modal, feedrate_mm_min=-1.0)
         self._at_rest = False
@@ -122,42 +132,25 @@ class KlipperWriter:
         first = np.maximum.accumulate(first)
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
-    def _modes(self, piece: Piece, encoded: Encoded, index: NDArray[np.int64]) -> list[ModalState]:
+    def _modes(self, piece: Piece, encoded: Encoded, index: NDArray[np.int64]) -> _Modes:
         """The file's modal state at every written move."""
-        current = piece.modal_before
-        changes = [
-            (int(i), piece.modal[int(m)])
-            for i, m, k in zip(index, piece.events.modal_id, piece.events.kind, strict=True)
-            if k == EventKind.MODE
-        ]
-        if not changes:
-            return [current] * len(encoded.row)
-        states: list[ModalState] = []
-        for at, state in changes:
-            states += [current] * (at - len(states))
-            current = state
-        return states + [current] * (len(encoded.row) - len(states))
+        changes = piece.events.kind == EventKind.MODE
+        first = np.concatenate([[0], index[changes]])
+        states = [piece.modal_before]
+        states += [piece.modal[int(m)] for m in piece.events.modal_id[changes]]
+        # Of several changes at one place the last one counts.
+        last = np.append(first[1:] != first[:-1], True)
+        return _Modes(first[last], [s for s, keep in zip(states, last, strict=True) if keep])
 
     def _format(
-        self,
-        encoded: Encoded,
-        modes: list[ModalState],
-        index: NDArray[np.int64],
-        kinds: NDArray[np.int8],
+        self, encoded: Encoded, modes: _Modes, index: NDArray[np.int64], kinds: NDArray[np.int8]
     ) -> tuple[bytes, NDArray[np.int64]]:
         n = len(encoded.row)
         fresh = np.zeros(n + 1, dtype=bool)
         fresh[index[kinds == EventKind.MODE]] = True
         fresh[0] = True
-        same = all(m is modes[0] for m in (modes[0], modes[-1])) and modes[0] == modes[-1]
-        if same and modes.count(modes[0]) == n:
-            extrude = np.full(n, modes[0].extrude_factor)
-            speed = np.full(n, modes[0].speed_factor)
-            origin = np.tile(_integer_origin(modes[0]), (n, 1))
-        else:
-            extrude = np.array([m.extrude_factor for m in modes])
-            speed = np.array([m.speed_factor for m in modes])
-            origin = np.stack([_integer_origin(m) for m in modes])
+        lengths = np.diff(np.append(modes.first, n))
+        states = modes.states
         buffer = np.empty(n * _BYTES_PER_LINE + 16, np.uint8)
         line_end = np.empty(n, np.int64)
         size = format_moves(
@@ -166,9 +159,9 @@ class KlipperWriter:
             encoded.row >= 0,
             fresh,
             encoded.feedrate_mm_min,
-            extrude,
-            speed,
-            origin,
+            np.repeat([m.extrude_factor for m in states], lengths),
+            np.repeat([m.speed_factor for m in states], lengths),
+            np.repeat([_integer_origin(m) for m in states], lengths, axis=0),
             buffer,
             line_end,
         )
