@@ -238,9 +238,12 @@ class _Axis:
         resting = np.zeros(windows, dtype=bool)
         for a, b in stops:
             resting[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = True
+        last_states = z[:-2]
         w = 0
         while w < windows:
             start = w * update
+            if w == windows - 1:
+                last_states = z[:-2].copy()
             if resting[w]:
                 near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
                 committed = solve_window(
@@ -266,27 +269,19 @@ class _Axis:
                     u,
                 )
                 w = following
+        # The windows run on past the end of the path, where the command stands.
         end = path[-1] - origin
         u[n - 1] = end
-        self._after = (float(path[-1]), self._end_states(z, u, n, end))
-        return np.asarray(u[:n] + origin)
-
-    def _end_states(
-        self, z: NDArray[np.float64], u: NDArray[np.float64], n: int, end: float
-    ) -> NDArray[np.float64]:
-        """States at sample n - 1, relative to the end of the path.
-
-        The windows run on past the end, where the command stands: step back is not possible, so
-        the last window is stepped again from the states it started with.
-        """
-        states = np.empty(len(z) - 2)
+        begun = (windows - 1) * update
+        states = np.empty_like(self._states)
         row = 0
         for plant in self._plants:
             part = slice(row, row + plant.order)
-            states[part] = advance_state(plant.a, plant.b, self._states[part], u[: n - 1])
+            states[part] = advance_state(plant.a, plant.b, last_states[part], u[begun : n - 1])
             states[part] -= plant.rest_state(end)
             row = part.stop
-        return states
+        self._after = (float(path[-1]), states)
+        return np.asarray(u[:n] + origin)
 
 
 def _advanced(

@@ -27,36 +27,13 @@ def path_directions(path: NDArray[np.float64], out: NDArray[np.float64]) -> None
 
 
 @kernel
-def rest_errors(a: NDArray[np.float64], states: NDArray[np.float64], samples: int) -> None:
-    """Let the error states of both axes decay over `samples` without error, in place."""
-    axes, order = states.shape
-    following = np.empty(order)
-    for axis in range(axes):
-        for _ in range(samples):
-            for r in range(order):
-                total = 0.0
-                for c in range(order):
-                    total += a[axis, r, c] * states[axis, c]
-                following[r] = total
-            states[axis] = following
-
-
-@kernel
-def _follow(
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    state: NDArray[np.float64],
-    error: float,
-    following: NDArray[np.float64],
+def rest_errors(
+    pole: NDArray[np.complex128], states: NDArray[np.complex128], samples: int
 ) -> None:
-    order = len(b)
-    for r in range(order):
-        total = b[r] * error
-        for c in range(order):
-            total += a[r, c] * state[c]
-        following[r] = total
-    for r in range(order):
-        state[r] = following[r]
+    """Let the error states of both axes decay over `samples` without error, in place."""
+    for axis in range(states.shape[0]):
+        for r in range(states.shape[1]):
+            states[axis, r] *= pole[axis, r] ** samples
 
 
 @kernel
@@ -74,14 +51,14 @@ def fit_stretch(
     first: int,
     last: int,
     begin: NDArray[np.float64],
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    c: NDArray[np.float64],
-    d: NDArray[np.float64],
+    pole: NDArray[np.complex128],
+    weight: NDArray[np.complex128],
+    direct: NDArray[np.float64],
     ramp: NDArray[np.float64],
-    tail: NDArray[np.float64],
+    ramp_state: NDArray[np.complex128],
+    tail: NDArray[np.complex128],
     norm: NDArray[np.float64],
-    states: NDArray[np.float64],
+    states: NDArray[np.complex128],
     out_t: NDArray[np.float64],
     out_position: NDArray[np.float64],
 ) -> int:
@@ -90,11 +67,12 @@ def fit_stretch(
     The fit starts at `begin` at `start_s` and ends exactly at sample `last`. A funnel of slopes in
     the frame of the path's direction says how long a segment may be; where exactly it ends,
     inside the (slightly looser) funnel, is chosen so that the machine's answer to the error stays
-    small: `a b c d` filter the error per axis, `ramp tail norm` are the answer to a triangular
-    error (`gcode.segments.ErrorFilter`), `states` carries the filter and is updated in place.
+    small. That answer is direct e + sum of Re(weight x), x <- pole x + e, per axis; `ramp`,
+    `ramp_state`, `tail` and `norm` are what it is for a triangular error
+    (`gcode.segments.ErrorFilter`); `states` carries x and is updated in place.
     Vertices in X and Y lie on multiples of `grid`. Returns the number of segments.
     """
-    order = b.shape[1]
+    order = pole.shape[1]
     longest = ramp.shape[1] - 1
     low, high = np.empty(4), np.empty(4)
     new_low, new_high = np.empty(4), np.empty(4)
@@ -103,7 +81,7 @@ def fit_stretch(
     value = np.empty(4)
     slope = np.empty(4)
     wish = np.empty(2)
-    trial, following = np.empty(order), np.empty(order)
+    trial = np.empty((2, order), np.complex128)
     origin = begin.copy()
     origin_s = start_s
     k = first
@@ -146,25 +124,29 @@ def fit_stretch(
         samples = end - k + 1
         span = end * dt_s - origin_s
         shaped = j > k and end < last
-        if shaped:
-            for axis in range(2):
-                wish[axis] = 0.0
-                if samples > longest:
-                    continue
-                trial[:] = states[axis]
-                straight = (position[axis, end] - origin[axis]) / span
-                inner = 0.0
-                for i in range(samples):
-                    at = k + i
-                    error = origin[axis] + straight * (at * dt_s - origin_s) - position[axis, at]
-                    out = d[axis] * error
-                    for r in range(order):
-                        out += c[axis, r] * trial[r]
-                    inner += out * ramp[axis, samples, i]
-                    _follow(a[axis], b[axis], trial, error, following)
+        # The answer to the straight line to the sample `end`; any other end adds a ramp to it.
+        for axis in range(2):
+            wish[axis] = 0.0
+            straight = (position[axis, end] - origin[axis]) / span
+            weigh = shaped and samples <= longest
+            inner = 0.0
+            for r in range(order):
+                trial[axis, r] = states[axis, r]
+            for i in range(samples):
+                at = k + i
+                error = origin[axis] + straight * (at * dt_s - origin_s) - position[axis, at]
+                answer = direct[axis] * error
                 for r in range(order):
-                    inner += trial[r] * tail[axis, samples, r]
+                    x = trial[axis, r]
+                    answer += (weight[axis, r] * x).real
+                    trial[axis, r] = pole[axis, r] * x + error
+                if weigh:
+                    inner += answer * ramp[axis, samples, i]
+            if weigh:
+                for r in range(order):
+                    inner += (trial[axis, r] * tail[axis, samples, r]).real
                 wish[axis] = -inner / norm[axis, samples]
+        if shaped:
             dx = position[0, end] + wish[0] - origin[0]
             dy = position[1, end] + wish[1] - origin[1]
             along_slope = min(max((cx * dx + cy * dy) / span, wide_low[0]), wide_high[0])
@@ -188,10 +170,11 @@ def fit_stretch(
             for i in range(4):
                 slope[i] = (position[i, end] - origin[i]) / span
         for axis in range(2):
-            for i in range(samples):
-                at = k + i
-                error = origin[axis] + slope[axis] * (at * dt_s - origin_s) - position[axis, at]
-                _follow(a[axis], b[axis], states[axis], error, following)
+            shift = origin[axis] + slope[axis] * span - position[axis, end]
+            for r in range(order):
+                states[axis, r] = trial[axis, r]
+                if samples <= longest:
+                    states[axis, r] += shift * ramp_state[axis, samples, r]
         for i in range(4):
             origin[i] = position[i, last] if end == last else origin[i] + slope[i] * span
         origin_s = end * dt_s

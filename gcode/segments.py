@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_lyapunov
 
 from gcode._segment_kernels import fit_stretch, path_directions, rest_errors
 from gcode.timeline import Timeline
+from models.modal import modal_form
 from models.plants import DiscretePlant
 
 __all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
@@ -60,46 +60,55 @@ class ErrorFilter:
     Parameters
     ----------
     plants : sequence of DiscretePlant
-        Plants of X and Y at the sampling time of the fit.
+        Plants of X and Y at the sampling time of the fit. A plant whose modes crowd too much for
+        partial fractions is taken as answering everything alike.
 
     Notes
     -----
-    For a triangular error that rises over m samples and falls over m - 1, `ramp[:, m]` is the
-    answer while it rises, `tail[:, m]` weighs a state at its peak with all that follows, and
-    `norm[:, m]` is the answer's energy. They give the peak that minimises the energy of the
-    answer to what is already there plus the triangle.
+    The answer to an error e is direct e + sum of Re(weight x) with x <- pole x + e. For a
+    triangular error that rises over m samples and falls over m - 1, `ramp[:, m]` is the answer
+    while it rises, `ramp_state[:, m]` the state at its peak, `tail[:, m]` weighs a state at the
+    peak with all that follows, and `norm[:, m]` is the answer's energy. They give the peak that
+    minimises the energy of the answer to what is already there plus the triangle.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
-        order = max(1, *(p.order for p in plants))
-        axes = len(plants)
-        self.a, self.b = np.zeros((axes, order, order)), np.zeros((axes, order))
-        self.c, self.d = np.zeros((axes, order)), np.zeros(axes)
+        forms = [modal_form(plant) for plant in plants]
+        rows = [np.zeros((0, 4)) if form is None else form for form in forms]
+        order, axes = max(1, *(len(form) for form in rows)), len(plants)
+        self.pole = np.zeros((axes, order), complex)
+        self.weight = np.zeros((axes, order), complex)
+        self.direct = np.ones(axes)
         self.ramp = np.zeros((axes, _LONGEST + 1, _LONGEST))
-        self.tail = np.zeros((axes, _LONGEST + 1, order))
+        self.ramp_state = np.zeros((axes, _LONGEST + 1, order), complex)
+        self.tail = np.zeros((axes, _LONGEST + 1, order), complex)
         self.norm = np.ones((axes, _LONGEST + 1))
-        for i, plant in enumerate(plants):
-            n = plant.order
-            self.a[i, :n, :n], self.b[i, :n] = plant.a, plant.b
-            self.c[i, :n], self.d[i] = plant.c, plant.d
+        for i, (plant, form) in enumerate(zip(plants, rows, strict=True)):
+            self.pole[i, : len(form)] = form[:, 0] + 1j * form[:, 1]
+            self.weight[i, : len(form)] = form[:, 2] + 1j * form[:, 3]
+            if len(form) or plant.order == 0:
+                self.direct[i] = plant.d
             self._triangles(i)
 
     def _triangles(self, i: int) -> None:
-        a, b, c, d = self.a[i], self.b[i], self.c[i], self.d[i]
-        energy = solve_discrete_lyapunov(a.T, np.outer(c, c))
+        pole, weight, direct = self.pole[i], self.weight[i], self.direct[i]
+        # Sum over k of Re(w_a p_a^k x_a) Re(w_b p_b^k x_b) = Re(x_a (mixed x_b + plain conj x_b)).
+        pairs = np.outer(weight, weight) / (1.0 - np.outer(pole, pole))
+        crossed = np.outer(weight, weight.conj()) / (1.0 - np.outer(pole, pole.conj()))
         for m in range(1, _LONGEST + 1):
             shape = np.concatenate([np.arange(1, m + 1), np.arange(m - 1, 0, -1)]) / m
-            state, answer = np.zeros(len(b)), np.empty(len(shape))
+            state, answer = np.zeros(len(pole), complex), np.empty(len(shape))
             for k, error in enumerate(shape):
-                answer[k] = c @ state + d * error
-                state = a @ state + b * error
-            power, weighed = np.eye(len(b)), np.zeros(len(b))
-            for k in range(m, len(shape)):
-                weighed += (c @ power) * answer[k]
-                power = a @ power
+                answer[k] = (weight @ state).real + direct * error
+                state = pole * state + error
+                if k == m - 1:
+                    self.ramp_state[i, m] = state
+            rest = answer[m:]
+            powers = pole[:, None] ** np.arange(len(rest))
+            after = 0.5 * (pairs @ state + crossed @ state.conj())
             self.ramp[i, m, :m] = answer[:m]
-            self.tail[i, m] = weighed + power.T @ (energy @ state)
-            self.norm[i, m] = answer @ answer + state @ energy @ state
+            self.tail[i, m] = weight * (powers @ rest) + pole ** len(rest) * after
+            self.norm[i, m] = answer @ answer + (state @ after).real
 
 
 def across_tolerance_mm(tolerance_mm: float) -> float:
@@ -139,13 +148,13 @@ def fit_segments(
     groups = np.empty(capacity, dtype=np.int64)
     direction = np.empty((2, command_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
-    states = np.zeros_like(error_filter.b)
+    states = np.zeros_like(error_filter.pole)
     count = 0
     for i, group in enumerate(timeline.groups):
         start = timeline.end_s[i - 1] if i else 0.0
         if group.rest:
             resting = timeline.end_s[i] - timeline.start_s[i]
-            rest_errors(error_filter.a, states, round(resting / dt))
+            rest_errors(error_filter.pole, states, round(resting / dt))
             continue
         last = round(timeline.end_s[i] / dt)
         if i == len(timeline.groups) - 1:
@@ -168,11 +177,11 @@ def fit_segments(
             first,
             last,
             begin,
-            error_filter.a,
-            error_filter.b,
-            error_filter.c,
-            error_filter.d,
+            error_filter.pole,
+            error_filter.weight,
+            error_filter.direct,
             error_filter.ramp,
+            error_filter.ramp_state,
             error_filter.tail,
             error_filter.norm,
             states,

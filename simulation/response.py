@@ -8,39 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from models.modal import modal_form
 from models.plants import DiscretePlant
 from simulation._response_kernels import dense_response, modal_response
 
-__all__ = ["PlantStream", "modal_form", "response"]
+__all__ = ["PlantStream", "response"]
 
 Array = NDArray[np.float64]
-_LARGEST_CONDITION = 1e9
-
-
-def modal_form(plant: DiscretePlant) -> Array | None:
-    """Return the plant as a sum of complex first-order recurrences.
-
-    y(k) = d u(k) + sum_i Re(w_i x_i(k)), x_i(k+1) = lambda_i x_i(k) + u(k): partial fractions,
-    one recurrence for a real pole and one for a pair.
-
-    Returns
-    -------
-    ndarray, shape (m, 4), or None
-        Rows (re lambda, im lambda, re w, im w), m even (padded with zeros). None when poles
-        crowd so much that the partial fractions cancel (condition of the modal matrix > 1e9).
-    """
-    if plant.order == 0:
-        return np.zeros((0, 4))
-    values, vectors = np.linalg.eig(plant.a)
-    if not np.linalg.cond(vectors) < _LARGEST_CONDITION:
-        return None
-    weights = (plant.c @ vectors) * np.linalg.solve(vectors, plant.b.astype(complex))
-    keep = values.imag >= 0
-    twice = np.where(values.imag > 0, 2.0, 1.0)
-    rows = np.column_stack(
-        [values.real, values.imag, (twice * weights).real, (twice * weights).imag]
-    )[keep]
-    return np.vstack([rows, np.zeros((len(rows) % 2, 4))])
 
 
 @dataclass(slots=True)

@@ -25,8 +25,8 @@ __all__ = ["DT_S", "CompensatedPiece", "PieceCompensator", "Unfit", "as_executed
 DT_S = 1e-3
 """Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
 
-_REST_TOLERANCE_S = 1e-3
-_ROUNDS = 3
+_REST_TOLERANCE_S = 5e-3
+_ROUNDS = 2
 _GRID_MM = 1e-3
 
 

@@ -25,6 +25,8 @@ __all__ = ["Measurement", "MotionSamples"]
 
 Array = NDArray[np.float64]
 
+STRIDE = 4
+"""Contour errors are measured at every fourth sample: they change over tens of samples."""
 _LAYERS_SHOWN = 24
 _POINTS_PER_LAYER = 2500
 _TRACK_BINS = 400
@@ -73,7 +75,7 @@ class Measurement:
         self._dt_s = dt_s
         self._plants = [plant_set(machine.axes[a], dt_s).nominal for a in ("x", "y")]
         self._names = ("before", "after", "shaper") if compensated else ("before", "shaper")
-        self._meters = {name: MotionMeter(dt_s) for name in self._names}
+        self._meters = {name: MotionMeter(dt_s, stride=STRIDE) for name in self._names}
         self._streams: dict[str, PlantStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
@@ -156,7 +158,7 @@ class Measurement:
             out.append(
                 GroupFigures(
                     name=label,
-                    seconds=round(2 * tally.count * self._dt_s, 3),
+                    seconds=round(STRIDE * tally.count * self._dt_s, 3),
                     contour_rms_um={
                         n: 1e3 * t[key].rms for n, t in tallies.items() if key in t
                     },
@@ -290,7 +292,7 @@ class _Views:
 
 class _View:
     def __init__(self, names: Sequence[str]) -> None:
-        self._step = 4
+        self._step = 2
         self._rows: list[Array] = []
         self._names = list(names)
         self.count = 0
