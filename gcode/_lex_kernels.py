@@ -28,7 +28,6 @@ F_HOMING = 12  # SET_GCODE_OFFSET
 F_SPEED = 16  # mm/s
 F_SPEED_FACTOR = 17  # mm/s per mm/min of F
 F_EXTRUDE_FACTOR = 18
-F_FEED = 19  # F as written, mm/min
 F_LOW = 20  # travel of x y z
 F_HIGH = 23
 F_ARC_MM = 26
@@ -69,7 +68,7 @@ ERROR_INCHES, ERROR_FEED, ERROR_TRAVEL, ERROR_RANGE = 10, 11, 12, 13
 ERROR_ARC_RADIUS, ERROR_ARC_RELATIVE, ERROR_ARC_CENTER, ERROR_ARC_LONG = 14, 15, 16, 17
 ERROR_POSITIVE, ERROR_SLOW = 18, 19
 
-MODAL_SIZE = 8
+MODAL_SIZE = 7
 
 MARK_NONE, MARK_LAYER, MARK_FEATURE, MARK_OBJECT = 0, 1, 2, 3
 MARK_STRIDE = 1 << 32
@@ -140,9 +139,8 @@ def note_modal(f: Any, i: Any, rows: Any, index: Any) -> None:
     row[1] = i[I_ABS_E]
     row[2] = f[F_SPEED_FACTOR] * 60.0
     row[3] = f[F_EXTRUDE_FACTOR]
-    row[4] = f[F_FEED]
     for k in range(3):
-        row[5 + k] = f[F_BASE + k]
+        row[4 + k] = f[F_BASE + k]
     number = intern_row(rows, index, i[I_N_MODAL], row)
     i[I_N_MODAL] = max(i[I_N_MODAL], number + 1)
     i[I_MODAL_ID] = number
@@ -239,14 +237,11 @@ def travel(f: Any, i: Any, mf: Any, mi: Any, named: int, trusted: bool) -> int:
 
 
 @kernel
-def _set_feed(f: Any, i: Any, feed: float, mod_rows: Any, mod_index: Any) -> int:
+def _set_feed(f: Any, feed: float) -> int:
     if not 0.0 < feed <= MAX_VALUE:
         f[F_ERROR] = feed
         return ERROR_FEED
     f[F_SPEED] = feed * f[F_SPEED_FACTOR]
-    if feed != f[F_FEED]:
-        f[F_FEED] = feed
-        note_modal(f, i, mod_rows, mod_index)
     return OK
 
 
@@ -278,7 +273,7 @@ def _move(
         else:
             f[F_LAST + 3] += length
     if mask & (1 << _F):
-        status = _set_feed(f, i, w[_F], mod_rows, mod_index)
+        status = _set_feed(f, w[_F])
         if status != OK:
             return status
     # A coordinate that only seems to stand where we guess the axis to be may well move it.
@@ -351,7 +346,7 @@ def _arc(
         i[I_NEED] = n
         return FULL
     if mask & (1 << _F):
-        status = _set_feed(f, i, w[_F], mod_rows, mod_index)
+        status = _set_feed(f, w[_F])
         if status != OK:
             return status
     e_here = (f[F_LAST + 3] - f[F_BASE + 3]) / f[F_EXTRUDE_FACTOR]

@@ -109,7 +109,6 @@ class Interpreter:
         f[lex.F_SPEED] = _DEFAULT_SPEED_MM_S
         f[lex.F_SPEED_FACTOR] = 1.0 / 60.0
         f[lex.F_EXTRUDE_FACTOR] = 1.0
-        f[lex.F_FEED] = _DEFAULT_SPEED_MM_S * 60.0
         f[lex.F_ARC_MM] = firmware.arc_resolution_mm
         f[lex.F_LIMITS : lex.F_LIMITS + 4] = (
             planner.max_velocity_mm_s,
@@ -606,9 +605,9 @@ class Interpreter:
     def _note_tables(self) -> None:
         """Bring the public tables up to the kernel's."""
         for row in self._mod_rows[len(self._modal) : int(self._i[lex.I_N_MODAL])].tolist():
-            absolute_xyz, absolute_e, speed, extrude, feed, x, y, z = row
+            absolute_xyz, absolute_e, speed, extrude, x, y, z = row
             self._modal.append(
-                ModalState(bool(absolute_xyz), bool(absolute_e), speed, extrude, feed, (x, y, z))
+                ModalState(bool(absolute_xyz), bool(absolute_e), speed, extrude, (x, y, z))
             )
         for row in self._lim_rows[len(self._limits) : int(self._i[lex.I_N_LIMITS])].tolist():
             self._limits.append(Limits(*row))

@@ -56,8 +56,6 @@ class ModalState:
     """1.0 = 100 % (M220)."""
     extrude_factor: float
     """1.0 = 100 % (M221)."""
-    feedrate_mm_min: float
-    """The modal F as written, before `speed_factor`."""
     origin_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Machine position of the G-code's X0 Y0 Z0 (G92, SET_GCODE_OFFSET): a line that means the
     machine's x says X = x - origin."""

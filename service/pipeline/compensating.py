@@ -169,7 +169,7 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     moved = np.maximum.accumulate(np.minimum(t + shift, until)) - float(timeline.start_s[0])
     position, _ = sample_phases(executed, moved)
     gap = position[:2] - piece.command_mm[:2]
-    return np.asarray(np.hypot(gap[0], gap[1]))
+    return np.asarray(np.sqrt(gap[0] ** 2 + gap[1] ** 2))
 
 
 def as_executed(

@@ -71,7 +71,6 @@ def test_factors(golden_machine: Machine) -> None:
     assert block.moves.end_mm[:, 3].tolist() == [10, 11, 11, 11, 11, 12]
     assert block.moves.speed_mm_s == pytest.approx([100, 100, 50, 25, 50, 50])
     assert block.modal[block.moves.modal_id[3]].speed_factor == pytest.approx(0.5)
-    assert block.modal[block.moves.modal_id[3]].feedrate_mm_min == 3000
 
 
 def test_limits(golden_machine: Machine) -> None:

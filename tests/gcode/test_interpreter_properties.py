@@ -142,7 +142,6 @@ def test_tables_grow(golden_machine: Machine, count: int) -> None:
     moves, last = blocks[-1].moves, blocks[-1]
     assert len({limit.accel_mm_s2 for limit in last.limits}) == count + 1
     assert last.limits[moves.limits_id[-1]].accel_mm_s2 == 999 + count
-    assert last.modal[moves.modal_id[-1]].feedrate_mm_min == 999 + count
 
 
 def test_long_arcs_and_many_lines(golden_machine: Machine) -> None:

@@ -21,7 +21,8 @@ from models.plants import (
     discretise,
 )
 from models.store import builtin_machines, load_machine
-from simulation.response import PlantStream, modal_form, response
+from models.modal import modal_form
+from simulation.response import PlantStream, response
 from simulation.truth import TruthStream, refined, truth_response
 
 PAIRS = PairsSpec(

@@ -59,6 +59,7 @@ class KlipperWriter:
         self._at_rest = True
         self._modal: ModalState | None = None
         """What the printer's modes are now, where they may differ from the file's."""
+        self._file_feed_mm_min = 0.0
         self.shaper_unknown = False
 
     def header(self) -> bytes:
@@ -115,8 +116,8 @@ class KlipperWriter:
                 parts.append(self._rest_line(piece, what))
         if len(text) > done:
             parts += [self._our_modes(modes.at(len(rows) - 1)), text[done:]]
-        assert self._modal is not None
-        self._modal = replace(self._modal, feedrate_mm_min=-1.0)
+        last = piece.moves.speed_mm_s[-1]
+        self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
         return b"".join(parts)
 
@@ -183,7 +184,6 @@ class KlipperWriter:
                 self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
             elif re.match(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)", text):
                 self._modal = replace(self._modal, absolute_e=state.absolute_e)
-            self._modal = replace(self._modal, feedrate_mm_min=-1.0)
             return lead + line
         return line
 
@@ -205,7 +205,7 @@ class KlipperWriter:
             text += b"G90\n"
         if self._modal.absolute_e:
             text += b"M83\n"
-        self._modal = replace(state, absolute_xyz=True, absolute_e=False, feedrate_mm_min=-1.0)
+        self._modal = replace(state, absolute_xyz=True, absolute_e=False)
         return text
 
     def _file_modes(self, state: ModalState) -> bytes:
@@ -250,7 +250,7 @@ class KlipperWriter:
         parts.append(_limits_line(passage.limits_before))
         state = passage.modal_before
         parts.append(self._file_modes(state))
-        parts.append(_feed_line(state.feedrate_mm_min))
+        parts.append(_feed_line(self._file_feed_mm_min))
         parts.append(b"; stillpath: stream off\n")
         parts.append(self._shaper_on(passage))
         self._modal = None

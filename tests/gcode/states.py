@@ -1,0 +1,193 @@
+"""What the machine's state is at every line of a file, and how two files differ in it.
+
+The strongest check of a written file: every line that came from the original must find the
+machine as it was in the original: position, filament, modes, F and limits.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gcode.interpreter import Interpreter
+from gcode.types import EventKind, Limits, ModalState
+from models.machine import Machine
+
+__all__ = ["State", "differences", "states", "tagged"]
+
+_TAG = re.compile(rb";#(\d+)\s*$")
+_HELD = b"; stillpath, held back: "
+_OWN = (b"; stillpath", b"; Processed by stillpath")
+POSITION_MM = 2e-6
+FILAMENT_MM = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One line: `kind` -1 is a move; `modal`, `limits` are in force for a move, after an event."""
+
+    text: bytes
+    kind: int
+    start_mm: np.ndarray
+    end_mm: np.ndarray
+    known: int
+    speed_mm_s: float
+    modal: ModalState
+    limits: Limits
+    stream: bool
+    """Between our own 'stream on' and 'stream off'."""
+
+    @property
+    def moves_xy(self) -> bool:
+        return bool(np.any(self.start_mm[:2] != self.end_mm[:2]))
+
+
+def tagged(data: bytes) -> bytes:
+    """Number every line that holds code, so that it can be found again."""
+    out = []
+    for number, line in enumerate(data.splitlines(keepends=True), 1):
+        body = line.rstrip(b"\r\n")
+        if has_code(body):
+            line = body + b" ;#%d" % number + line[len(body) :]
+        out.append(line)
+    return b"".join(out)
+
+
+def has_code(line: bytes) -> bool:
+    text = line.strip()
+    return bool(text) and not text.startswith(b";")
+
+
+def states(data: bytes, machine: Machine) -> list[State]:
+    """Return one state per line of the file."""
+    reader = Interpreter(machine)
+    lines = data.splitlines(keepends=True)
+    found: dict[int, State] = {}
+    last, known = np.zeros(4), 0
+    streams = _streams(lines)
+    for block in [*reader.push(data), *reader.flush()]:
+        moves, events = block.moves, block.events
+        for i in range(len(moves)):
+            number = int(moves.line[i])
+            first = found.get(number)
+            found[number] = State(
+                lines[number - 1],
+                -1,
+                moves.start_mm[i] if first is None else first.start_mm,
+                moves.end_mm[i],
+                int(moves.known[i]),
+                float(moves.speed_mm_s[i]),
+                block.modal[moves.modal_id[i]],
+                block.limits[moves.limits_id[i]],
+                streams[number - 1],
+            )
+        for i in range(len(events)):
+            number, at = int(events.line[i]), int(events.move_index[i]) - block.first_move
+            if len(moves) and at > 0:
+                last, known = moves.end_mm[at - 1], int(moves.known[at - 1])
+            found[number] = State(
+                lines[number - 1],
+                int(events.kind[i]),
+                last,
+                last,
+                known,
+                0.0,
+                block.modal[events.modal_id[i]],
+                block.limits[events.limits_id[i]],
+                streams[number - 1],
+            )
+        if len(moves):
+            last, known = moves.end_mm[-1], int(moves.known[-1])
+    assert sorted(found) == list(range(1, len(lines) + 1))
+    return [found[k] for k in sorted(found)]
+
+
+def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:
+    """Say where the written file treats a line of the (tagged) original differently."""
+    before = {_tag(s.text): s for s in states(original, machine) if _tag(s.text) is not None}
+    after = states(written, machine)
+    comments = [s.text for s in after if not has_code(s.text) and not s.text.startswith(_OWN)]
+    wanted = [s for s in original.splitlines(keepends=True) if not has_code(s)]
+    problems = [] if comments == wanted else [_first_difference(wanted, comments)]
+    seen: list[int] = []
+    for state in after:
+        tag = _tag(state.text)
+        if tag is None:
+            continue
+        seen.append(tag)
+        problems += [f"#{tag} {before[tag].text!r}: {p}" for p in _compare(before[tag], state)]
+    if sorted(seen) != seen or len(set(seen)) != len(seen):
+        problems.append("lines are out of order, or twice")
+    present = set(seen)
+    must = [t for t, s in before.items() if t is not None and (s.kind >= 0 or not s.moves_xy)]
+    problems += [f"#{t} {before[t].text!r} is missing" for t in must if t not in present]
+    return problems
+
+
+def _compare(old: State, new: State) -> list[str]:
+    if new.text.startswith(_HELD):
+        if old.kind == EventKind.LIMITS and new.stream and new.text == _HELD + old.text:
+            return []
+        return ["wrongly held back"]
+    if new.text != old.text:
+        return [f"became {new.text!r}"]
+    problems = []
+    if new.kind != old.kind:
+        return [f"kind {new.kind}, not {old.kind}"]
+    if new.known != old.known:
+        problems.append(f"known {new.known}, not {old.known}")
+    knows = [bool(old.known >> k & 1) for k in range(3)]
+    if new.kind < 0 or not new.stream:
+        gap = np.abs(new.end_mm - old.end_mm)
+        if np.any(gap[:3][knows] > POSITION_MM) or gap[3] > FILAMENT_MM:
+            problems.append(f"ends at {new.end_mm}, not {old.end_mm}")
+    if new.kind < 0:
+        gap = np.abs(new.start_mm - old.start_mm)
+        if np.any(gap[:3][knows] > POSITION_MM) or gap[3] > FILAMENT_MM:
+            problems.append(f"starts at {new.start_mm}, not {old.start_mm}")
+        if abs(new.speed_mm_s - old.speed_mm_s) > 1e-6 * old.speed_mm_s:
+            problems.append(f"speed {new.speed_mm_s}, not {old.speed_mm_s}")
+    if new.stream:
+        if new.kind >= EventKind.STOP:
+            problems.append("stops inside the stream")
+        return problems
+    problems += _differ("modal", old.modal, new.modal, 2e-5)
+    problems += _differ("limits", old.limits, new.limits, 1e-6)
+    return problems
+
+
+def _differ(
+    name: str, old: ModalState | Limits, new: ModalState | Limits, tolerance: float
+) -> list[str]:
+    out = []
+    for field in old.__dataclass_fields__:
+        a, b = np.atleast_1d(getattr(old, field)), np.atleast_1d(getattr(new, field))
+        if not np.allclose(a.astype(float), b.astype(float), rtol=1e-9, atol=tolerance):
+            out.append(f"{name}.{field} {getattr(new, field)}, not {getattr(old, field)}")
+    return out
+
+
+def _streams(lines: Sequence[bytes]) -> list[bool]:
+    on, out = False, []
+    for line in lines:
+        if line.startswith(b"; stillpath: stream on"):
+            on = True
+        elif line.startswith(b"; stillpath: stream off"):
+            on = False
+        out.append(on)
+    return out
+
+
+def _tag(text: bytes) -> int | None:
+    found = _TAG.search(text)
+    return int(found[1]) if found else None
+
+
+def _first_difference(wanted: list[bytes], got: list[bytes]) -> str:
+    for k, (a, b) in enumerate(zip(wanted, got, strict=False)):
+        if a != b:
+            return f"comment {k} is {b!r}, not {a!r}"
+    return f"{len(got)} comments, not {len(wanted)}"
