@@ -22,6 +22,7 @@ from models.plants import DiscretePlant, plant_set
 
 __all__ = ["LADDER", "PreviewFbf"]
 
+
 @dataclass(frozen=True, slots=True)
 class Rung:
     """One step of the ladder: number of functions (per 300 samples) and price of acceleration."""
@@ -228,7 +229,9 @@ class _Axis:
         padding = windows * update + window - n
         padded = np.concatenate([path - origin, np.full(padding, path[-1] - origin)])
         weights = np.concatenate([weight, np.full(padding, WEIGHT_REST)])
-        views = np.lib.stride_tricks.sliding_window_view(padded, window)[: windows * update : update]
+        views = np.lib.stride_tricks.sliding_window_view(padded, window)[
+            : windows * update : update
+        ]
         command_drive = views @ design.path_gain.T
         state_drive = views @ design.state_path_gain.T
 
@@ -237,7 +240,9 @@ class _Axis:
         starts = np.arange(windows) * update
         resting = np.zeros(windows, dtype=bool)
         for a, b in stops:
-            resting[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = True
+            resting[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = (
+                True
+            )
         last_states = z[:-2]
         w = 0
         while w < windows:

@@ -27,9 +27,7 @@ def path_directions(path: NDArray[np.float64], out: NDArray[np.float64]) -> None
 
 
 @kernel
-def rest_errors(
-    pole: NDArray[np.complex128], states: NDArray[np.complex128], samples: int
-) -> None:
+def rest_errors(pole: NDArray[np.complex128], states: NDArray[np.complex128], samples: int) -> None:
     """Let the error states of both axes decay over `samples` without error, in place."""
     for axis in range(states.shape[0]):
         for r in range(states.shape[1]):

@@ -27,8 +27,8 @@ MIN_STREAM_ACCEL_MM_S2 = 30_000.0
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """Lines of the file in order: what pieces and passages have in common.
+class Passage:
+    """Lines of the file in order, to leave as they came.
 
     Attributes
     ----------
@@ -40,9 +40,10 @@ class Stretch:
         Where they start in the file; `byte_start` and `byte_end` columns are absolute.
     limits, modal : lists
         The interpreter's tables.
-    limits_before, limits_after : Limits
-        Planner limits in force before the first and after the last line.
+    limits_before : Limits
+        Planner limits in force before the first line.
     modal_before, modal_after : ModalState
+        Modes before the first and after the last line.
     """
 
     moves: Moves
@@ -52,7 +53,6 @@ class Stretch:
     limits: list[Limits]
     modal: list[ModalState]
     limits_before: Limits
-    limits_after: Limits
     modal_before: ModalState
     modal_after: ModalState
 
@@ -62,17 +62,15 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece(Stretch):
-    """Moves to compensate, with the firmware's own plan of them, from rest to rest."""
+class Piece(Passage):
+    """Lines to compensate, with the firmware's own plan of their moves, from rest to rest."""
 
     phases: Phases
-    forced_stop: bool
-    """The piece ends where the original does not stop."""
 
-
-@dataclass(frozen=True, slots=True)
-class Passage(Stretch):
-    """Lines that leave as they came."""
+    @classmethod
+    def planned(cls, lines: Passage, phases: Phases) -> Piece:
+        """Return the lines of a passage with the plan of its moves."""
+        return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
 
 
 class Splitter:
@@ -152,7 +150,7 @@ class Splitter:
             starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
             spread = np.maximum.reduceat(raw, starts)
             raw = np.repeat(spread, np.diff(np.append(starts, len(raw)))) & xy
-        return raw
+        return np.asarray(raw)
 
     def _cut(self, *, final: bool) -> Iterator[Piece | Passage]:
         while self._moves is not None and self._events is not None:
@@ -162,11 +160,11 @@ class Splitter:
             xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
             ours = np.flatnonzero(xy & ~self._raw) if self._compensate else np.zeros(0, np.int64)
             if len(ours) == 0:
-                yield self._passage(None)
+                yield self._take(None)
                 return
             head = int(ours[0])
             if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
-                yield self._passage(int(moves.byte_start[head]))
+                yield self._take(int(moves.byte_start[head]))
                 continue
             barriers = events.move_index[(events.kind >= EventKind.STOP)]
             stops = np.concatenate([barriers[barriers > 0], np.flatnonzero(self._raw), [count]])
@@ -185,24 +183,20 @@ class Splitter:
             if total <= self._longest_s:
                 if not closed:
                     return
-                yield self._piece(last, phases, forced=False)
+                yield self._piece(last, phases)
                 continue
             last, natural = _place_to_cut(moves, phases, self._longest_s)
             if natural:
                 phases = _rows(phases, slice(0, last))
             else:
                 phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
-            yield self._piece(last, phases, forced=not natural)
+            yield self._piece(last, phases)
 
-    def _piece(self, last: int, phases: Phases, *, forced: bool) -> Piece:
+    def _piece(self, last: int, phases: Phases) -> Piece:
         assert self._moves is not None
-        common = self._take(int(self._moves.byte_end[last - 1]))
-        return Piece(**common, phases=phases, forced_stop=forced)
+        return Piece.planned(self._take(int(self._moves.byte_end[last - 1])), phases)
 
-    def _passage(self, until: int | None) -> Passage:
-        return Passage(**self._take(until))
-
-    def _take(self, until: int | None) -> dict[str, object]:  # Any-typed bag for the constructors
+    def _take(self, until: int | None) -> Passage:
         """Remove the lines before byte `until` (None: all) from what is held."""
         assert self._moves is not None and self._events is not None
         moves, events = self._moves, self._events
@@ -211,25 +205,25 @@ class Splitter:
         m = int(np.searchsorted(moves.byte_start, until))
         e = int(np.searchsorted(events.byte_start, until))
         limits, modal = self._tables
-        before = (self._limits_id, self._modal_id)
-        ends = [(int(moves.byte_start[m - 1]), moves, m - 1)] if m else []
-        ends += [(int(events.byte_start[e - 1]), events, e - 1)] if e else []
-        if ends:
-            _, column, row = max(ends, key=lambda item: item[0])
-            self._limits_id, self._modal_id = int(column.limits_id[row]), int(column.modal_id[row])
+        limits_before, modal_before = limits[self._limits_id], modal[self._modal_id]
+        last_move = int(moves.byte_start[m - 1]) if m else -1
+        last_event = int(events.byte_start[e - 1]) if e else -1
+        if max(last_move, last_event) >= 0:
+            state: Moves | Events = moves if last_move > last_event else events
+            row = (m if last_move > last_event else e) - 1
+            self._limits_id, self._modal_id = int(state.limits_id[row]), int(state.modal_id[row])
         text = self._text[: until - self._text_offset]
-        taken = {
-            "moves": _rows(moves, slice(0, m)),
-            "events": _rows(events, slice(0, e)),
-            "text": text,
-            "text_offset": self._text_offset,
-            "limits": limits,
-            "modal": modal,
-            "limits_before": limits[before[0]],
-            "limits_after": limits[self._limits_id],
-            "modal_before": modal[before[1]],
-            "modal_after": modal[self._modal_id],
-        }
+        taken = Passage(
+            moves=_rows(moves, slice(0, m)),
+            events=_rows(events, slice(0, e)),
+            text=text,
+            text_offset=self._text_offset,
+            limits=limits,
+            modal=modal,
+            limits_before=limits_before,
+            modal_before=modal_before,
+            modal_after=modal[self._modal_id],
+        )
         self._text = self._text[len(text) :]
         self._text_offset = until
         self._raw = self._raw[m:]

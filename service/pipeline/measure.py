@@ -53,7 +53,7 @@ class MotionSamples:
     feature: NDArray[np.int32]
 
     def __len__(self) -> int:
-        return self.path_mm.shape[1]
+        return int(self.path_mm.shape[1])
 
 
 class Measurement:
@@ -159,9 +159,7 @@ class Measurement:
                 GroupFigures(
                     name=label,
                     seconds=round(STRIDE * tally.count * self._dt_s, 3),
-                    contour_rms_um={
-                        n: 1e3 * t[key].rms for n, t in tallies.items() if key in t
-                    },
+                    contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
                 )
             )
         return out
@@ -184,7 +182,9 @@ class _ShaperStream:
 
     def __init__(self, shaper: BestShaper, dt_s: float) -> None:
         self._dt_s = dt_s
-        self._pulses = [shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)]
+        self._pulses = [
+            shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
+        ]
         self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
         self._held: MotionSamples | None = None
         self._before: Array | None = None
@@ -327,9 +327,7 @@ class _View:
             y_mm=np.round(rows[1], 3).tolist(),
             extruding=extruding.tolist(),
             line=rows[4].astype(int).tolist(),
-            contour_um={
-                n: np.round(rows[5 + i], 2).tolist() for i, n in enumerate(self._names)
-            },
+            contour_um={n: np.round(rows[5 + i], 2).tolist() for i, n in enumerate(self._names)},
         )
 
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.planner import Planner

@@ -46,7 +46,7 @@ __all__ = ["compensate_file", "plan_file", "simulate_file"]
 
 _BLOCK_BYTES = 1 << 17
 _EXTRUDING_EXCESS_MM = 5e-3
-_TRAVEL_EXCESS_MM = 50e-3
+_TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
 _TIME_EXCESS_S = 1e-3
 _FILAMENT_MM = 1e-4
@@ -198,18 +198,6 @@ class _Job:
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> bytes:
         """Let a piece leave as it came."""
-        passage = Passage(
-            moves=piece.moves,
-            events=piece.events,
-            text=piece.text,
-            text_offset=piece.text_offset,
-            limits=piece.limits,
-            modal=piece.modal,
-            limits_before=piece.limits_before,
-            limits_after=piece.limits_after,
-            modal_before=piece.modal_before,
-            modal_after=piece.modal_after,
-        )
         phases = piece.phases
         row_s = phases.accel_s + phases.cruise_s + phases.decel_s
         extruding_s = float(np.sum(row_s[_feeding(phases)]))
@@ -224,7 +212,7 @@ class _Job:
         )
         self._sum.original_s -= seconds
         self._sum.moves -= len(piece.moves)
-        return self._passage(passage)
+        return self._passage(piece)
 
     def _passage(self, passage: Passage) -> bytes:
         text = passage.text
@@ -274,9 +262,7 @@ class _Job:
     def _read_back(self, text: bytes) -> Phases:
         """Plan the written lines of a piece by the firmware's rules."""
         blocks = self._checker.push(text)
-        parts = [
-            (block.moves, block.limits) for block in blocks if len(block.moves)
-        ]
+        parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
         if len(parts) == 1:
             return plan_moves(parts[0][0], parts[0][1], self._machine.firmware)
         from gcode.firmware.klipper.planner import Planner

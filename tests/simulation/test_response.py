@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.modal import modal_form
 from models.plants import (
     DiscretePlant,
     FirSpec,
@@ -21,7 +22,6 @@ from models.plants import (
     discretise,
 )
 from models.store import builtin_machines, load_machine
-from models.modal import modal_form
 from simulation.response import PlantStream, response
 from simulation.truth import TruthStream, refined, truth_response
 

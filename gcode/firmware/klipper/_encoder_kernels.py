@@ -155,7 +155,7 @@ def _trapezoid_s(length: float, entry: float, leave: float, cruise: float, accel
     """Time of a move that enters, cruises and leaves at the given speeds where it has room."""
     peak2 = 0.5 * (2.0 * accel * length + entry * entry + leave * leave)
     if peak2 <= cruise * cruise:
-        return (2.0 * np.sqrt(peak2) - entry - leave) / accel
+        return (2.0 * float(np.sqrt(peak2)) - entry - leave) / accel
     ramps = ((cruise - entry) ** 2 + (cruise - leave) ** 2) / (2.0 * accel * cruise)
     return length / cruise + ramps
 
@@ -163,11 +163,8 @@ def _trapezoid_s(length: float, entry: float, leave: float, cruise: float, accel
 @kernel(inline=True)
 def _printed(f: float) -> float:
     """F rounded to the decimals that `format_moves` prints: about six significant digits."""
-    if f >= 100.0:
-        return np.round(f * 10.0) / 10.0
-    if f >= 1.0:
-        return np.round(f * 1000.0) / 1000.0
-    return max(np.round(f * 1e5), 1.0) / 1e5
+    digits = 10.0 if f >= 100.0 else 1000.0 if f >= 1.0 else 1e5
+    return max(float(np.round(f * digits)), 1.0) / digits
 
 
 @kernel
@@ -249,12 +246,12 @@ def format_moves(
         if written != 0:
             buffer[at] = 32
             buffer[at + 1] = 69
-            at = _put_fixed(buffer, at + 2, written, 5)
+            at = _put_fixed(buffer, at + 2, int(written), 5)
         f = feedrate[i] / speed_factor[i]
         if f != last_f:
             buffer[at] = 32
             buffer[at + 1] = 70
-            at = _put_fixed(buffer, at + 2, np.int64(np.round(f * 1e5)), 5)
+            at = _put_fixed(buffer, at + 2, int(np.round(f * 1e5)), 5)
             last_f = f
         buffer[at] = 10
         at += 1

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware.klipper._encoder_kernels import assign_speeds, format_moves, merge_still
+from gcode.firmware.klipper._encoder_kernels import assign_speeds, merge_still
 from gcode.firmware.klipper.planner import plan_moves
 from gcode.pieces import Piece
 from gcode.segments import Segments
@@ -29,7 +29,7 @@ STREAM_ACCEL_MM_S2 = 300_000.0
 that a command of somebody else that slips in is no disaster (docs/emission.md)."""
 STREAM_CORNER_MM_S = 500.0
 
-_UNIT_MM = 1e-6
+_UNITS_PER_MM = 1e6
 _PASSES = 4
 _TIME_TOLERANCE_S = 10e-6
 
@@ -92,9 +92,7 @@ class KlipperEncoder:
 
     def rest_durations(self, piece: Piece, timeline_groups: Sequence[Group]) -> NDArray[np.float64]:
         """First guess of the rests' durations: the piece's own moves under the stream's limits."""
-        phases = self._plan(
-            piece.moves.start_mm, piece.moves.end_mm, piece.moves.speed_mm_s
-        )
+        phases = self._plan(piece.moves.start_mm, piece.moves.end_mm, piece.moves.speed_mm_s)
         return _group_durations(phases, timeline_groups)
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
@@ -108,7 +106,7 @@ class KlipperEncoder:
         rows, position, end_s, group = self._interleave(piece, timeline, segments)
         begin = _integers(piece.phases.start_mm[0])
         start = np.concatenate([begin[None], position[:-1]])
-        start_mm, end_mm = start * _UNIT_MM, position * _UNIT_MM
+        start_mm, end_mm = start / _UNITS_PER_MM, position / _UNITS_PER_MM
         ours = rows < 0
         length, accel, limit, junction, stops = self._motion(start_mm, end_mm)
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
@@ -188,7 +186,13 @@ class KlipperEncoder:
 
     def _motion(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], ...]:
+    ) -> tuple[
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.float64],
+        NDArray[np.bool_],
+    ]:
         """Length, acceleration, speed and junction limit of every move, and which are E alone.
 
         Rules: klippy/toolhead.py, klippy/kinematics/extruder.py, 2026-08.
@@ -278,4 +282,4 @@ def _moved_rows(timeline: Timeline, group_start_s: NDArray[np.float64]) -> NDArr
 
 
 def _integers(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.round(position_mm / _UNIT_MM).astype(np.int64)
+    return np.round(position_mm * _UNITS_PER_MM).astype(np.int64)

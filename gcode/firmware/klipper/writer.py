@@ -306,8 +306,11 @@ def _extruder_only(passage: Passage, row: int) -> bool:
     moves, events = passage.moves, passage.events
     if len(moves) == 0:
         return bool(np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)))
-    if row == 0 and np.any((events.move_index == 0) & (events.kind >= EventKind.STOP)
-                           & (events.kind != EventKind.OBJECT)):
+    if row == 0 and np.any(
+        (events.move_index == 0)
+        & (events.kind >= EventKind.STOP)
+        & (events.kind != EventKind.OBJECT)
+    ):
         return True
     travel = moves.end_mm[row] - moves.start_mm[row]
     return bool(travel[0] == 0.0 and travel[1] == 0.0 and travel[2] == 0.0)
