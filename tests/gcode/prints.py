@@ -90,7 +90,8 @@ class _Print:
         choices += ["SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=8", "M117 layer", "M105"]
         choices += ["G92 E0"] if not self._absolute_e or self._zero() else []
         if self._wild:
-            choices += ["G90", "G91", "M82", "M83", "M220 S80", "M220 S100", "M221 S95", "M221 S100"]
+            choices += ["G90", "G91", "M82", "M83", "M220 S80", "M220 S100"]
+            choices += ["M221 S95", "M221 S100"]
             choices += ["G1 F2400", "G1 F5400", "G92 X", "G92 XY"]
         line = self._random.choice(choices)
         if line in ("G90", "G91"):

@@ -1,0 +1,185 @@
+"""FBF on two axes: where the command stands, its limits, and what it carries over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.base import DesignError, compensator
+from compensation.fbf import PreviewFbf
+from models.machine import CommandLimits, Machine
+from models.plants import plant_set
+from models.store import load_machine
+from simulation.measures import contour_error
+from simulation.response import response
+
+DT_S = 1e-3
+NO_RESTS = np.zeros((0, 2), np.int64)
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return load_machine("ender3")
+
+
+def smooth(samples: int) -> np.ndarray:
+    x = np.linspace(0, 1, samples)
+    return 10 * x**3 - 15 * x**4 + 6 * x**5
+
+
+def strokes(rest: int = 120, count: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Diagonal strokes of 30 mm with rests between: path, extruding, rests."""
+    parts, rests, here, n = [], [], np.array([50.0, 40.0]), 0
+    for k in range(count):
+        step = np.array([30.0, -12.0]) * (-1) ** k + [0.0, 5.0]
+        part = here[:, None] + step[:, None] * smooth(260)
+        parts.append(part)
+        here, n = here + step, n + 260
+        if k + 1 < count:
+            parts.append(np.repeat(here[:, None], rest, axis=1))
+            rests.append((n, n + rest))
+            n += rest
+    path = np.hstack(parts)
+    extruding = np.ones(n, bool)
+    for a, b in rests:
+        extruding[a:b] = False
+    return path, extruding, np.array(rests, np.int64).reshape(-1, 2)
+
+
+def made(machine: Machine, start: np.ndarray, **settings: object) -> PreviewFbf:
+    fbf = PreviewFbf(machine, DT_S, **settings)  # type: ignore[arg-type]
+    fbf.reset(start)
+    return fbf
+
+
+@pytest.mark.parametrize("basis", ["ce-opt", "bspline"])
+def test_stands_on_the_path(machine: Machine, basis: str) -> None:
+    path, extruding, rests = strokes()
+    u = made(machine, path[:, 0], basis=basis).compensate(path, extruding, rests)
+    for a, b in rests:
+        # The sample before the rest is the end of the motion and already stands.
+        assert np.max(np.abs(u[:, a - 1 : b] - path[:, a : a + 1])) < 1e-12
+    np.testing.assert_allclose(u[:, 0], path[:, 0], atol=1e-12)
+    np.testing.assert_allclose(u[:, -1], path[:, -1], atol=1e-12)
+
+
+@pytest.mark.parametrize("rest", [1, 2, 40, 400])
+def test_rests_of_any_length(machine: Machine, rest: int) -> None:
+    path, extruding, rests = strokes(rest)
+    u = made(machine, path[:, 0]).compensate(path, extruding, rests)
+    for a, b in rests:
+        assert np.max(np.abs(u[:, a - 1 : b] - path[:, a : a + 1])) < 1e-12
+    assert np.max(np.abs(u - path)) < 1.0
+
+
+def test_improves(machine: Machine) -> None:
+    path, extruding, rests = strokes()
+    plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
+    u = made(machine, path[:, 0]).compensate(path, extruding, rests)
+    rms = [np.sqrt(np.mean(contour_error(response(plants, c), path, DT_S) ** 2)) for c in (path, u)]
+    assert rms[1] < 0.1 * rms[0]
+
+
+def test_keeps_limits(machine: Machine) -> None:
+    path, extruding, rests = strokes()
+    for accel in (6000.0, 12000.0, 20000.0):
+        command = CommandLimits(accel_mm_s2=accel, velocity_mm_s=400)
+        fbf = made(machine.model_copy(update={"command": command}), path[:, 0])
+        u = fbf.compensate(path, extruding, rests)
+        assert np.max(np.abs(np.diff(u, 2))) / DT_S**2 <= accel * (1 + 1e-9)
+        assert np.max(np.abs(np.diff(u))) / DT_S <= 400 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("command", [CommandLimits(accel_mm_s2=10), CommandLimits(velocity_mm_s=5)])
+def test_impossible_limits(machine: Machine, command: CommandLimits) -> None:
+    path, extruding, rests = strokes()
+    fbf = made(machine.model_copy(update={"command": command}), path[:, 0])
+    with pytest.raises(DesignError, match=r"axis x: even the gentlest design .* \(\d+ mm/s2, \d+"):
+        fbf.compensate(path, extruding, rests)
+
+
+def test_state_is_carried_between_pieces(machine: Machine) -> None:
+    path, extruding, rests = strokes(count=2)
+    whole = made(machine, path[:, 0]).compensate(path, extruding, rests)
+    cut = int(rests[0, 0])
+    split = made(machine, path[:, 0])
+    first = split.compensate(path[:, :cut], extruding[:cut], NO_RESTS)
+    split.commit()
+    split.observe(np.hstack([first[:, -1:], path[:, cut : rests[0, 1]]]))
+    second = split.compensate(path[:, rests[0, 1] - 1 :], extruding[rests[0, 1] - 1 :], NO_RESTS)
+    plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
+    joined = np.hstack([first, path[:, cut : rests[0, 1] - 1], second])
+    assert joined.shape == whole.shape
+    answers = [response(plants, u) for u in (whole, joined)]
+    tail = slice(int(rests[0, 1]), None)
+    errors = [contour_error(y, path, DT_S)[tail] for y in answers]
+    rms = [1e3 * np.sqrt(np.mean(e**2)) for e in errors]
+    # One solution plans across the rest, the other not; both know the vibration they start with.
+    assert abs(rms[1] - rms[0]) < 1.0
+    assert rms[1] < 3.0
+
+
+def test_forgetting_the_state_costs(machine: Machine) -> None:
+    """The state matters: the same second piece after a `reset` is worse."""
+    path, extruding, _ = strokes(count=2)
+    cut = 260
+    rms = []
+    for forget in (False, True):
+        fbf = made(machine, path[:, 0])
+        # The first piece runs uncompensated and leaves the machine ringing.
+        fbf.observe(np.repeat(path[:, :cut:20], 20, axis=1))
+        if forget:
+            fbf.reset(path[:, cut])
+        u = fbf.compensate(path[:, cut:], extruding[cut:], NO_RESTS)
+        command = np.hstack([np.repeat(path[:, :cut:20], 20, axis=1)[:, :-1], u])
+        plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
+        reference = np.hstack([path[:, :cut][:, :-1], path[:, cut:]])
+        error = contour_error(response(plants, command), reference, DT_S)[cut + 20 :]
+        rms.append(np.sqrt(np.mean(error**2)))
+    assert rms[0] < 0.9 * rms[1]
+
+
+def test_observe_is_the_plant(machine: Machine) -> None:
+    """Observing a motion in blocks or at once comes to the same command."""
+    path, extruding, _ = strokes(count=1)
+    ringing = path[:, :1] + np.random.default_rng(2).normal(0, 0.1, (2, 300))
+    ringing[:, -1] = path[:, 0]
+    results = []
+    for cuts in ([300], [100, 300], [1, 2, 299, 300]):
+        fbf = made(machine, ringing[:, 0])
+        begin = 0
+        for end in cuts:
+            fbf.observe(ringing[:, begin:end])
+            begin = end - 1
+        results.append(fbf.compensate(path, extruding, NO_RESTS))
+    for other in results[1:]:
+        np.testing.assert_allclose(other, results[0], atol=1e-9)
+
+
+def test_nothing_counts_before_commit(machine: Machine) -> None:
+    path, extruding, rests = strokes()
+    fbf = made(machine, path[:, 0])
+    first = fbf.compensate(path, extruding, rests)
+    np.testing.assert_array_equal(fbf.compensate(path, extruding, rests), first)
+
+
+def test_deterministic(machine: Machine) -> None:
+    path, extruding, rests = strokes()
+    a, b = (made(machine, path[:, 0]).compensate(path, extruding, rests) for _ in range(2))
+    assert a.tobytes() == b.tobytes()
+
+
+def test_far_from_the_origin(machine: Machine) -> None:
+    """Position does not matter: nothing of the command depends on where the path lies."""
+    path, extruding, rests = strokes()
+    near = made(machine, path[:, 0]).compensate(path, extruding, rests)
+    away = path + 1000.0
+    far = made(machine, away[:, 0]).compensate(away, extruding, rests)
+    np.testing.assert_allclose(far - 1000.0, near, atol=1e-9)
+
+
+def test_registry(machine: Machine) -> None:
+    made = compensator("fbf", machine, DT_S, basis="bspline")
+    assert (made.name, made.lead_s, made.tail_s) == ("fbf", 0.0, 0.0)
+    with pytest.raises(DesignError, match="no compensator is called 'magic'; there are fbf"):
+        compensator("magic", machine, DT_S)

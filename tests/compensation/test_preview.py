@@ -1,0 +1,252 @@
+"""Limited preview: the condensed recursion, the bases, and what a design refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import BSpline
+
+from compensation._preview_kernels import advance_state, run_windows
+from compensation.base import DesignError
+from compensation.basis import BASES, bspline_basis, ce_opt_basis
+from compensation.preview import PreviewDesign, lifted_plant
+from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
+from models.store import load_machine
+from service.pipeline.reference_motion import reference_motion
+from simulation.measures import contour_error
+from simulation.response import response
+
+DT_S = 1e-3
+WINDOW, UPDATE = 300, 150
+
+
+def one_mode(f_hz: float = 45.0, zeta: float = 0.05) -> DiscretePlant:
+    return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), DT_S)
+
+
+def members(count: int, window: int = WINDOW, update: int = UPDATE) -> list:
+    f_hz = [45.0] if count == 1 else np.linspace(41.0, 49.0, count)
+    return [lifted_plant(one_mode(f), 1.0 / count, window, update) for f in f_hz]
+
+
+def windows_of(path: np.ndarray, design: PreviewDesign) -> np.ndarray:
+    padded = np.append(path, np.full(2 * design.window, path[-1]))
+    starts = range(0, len(path), design.update)
+    return np.array([padded[s : s + design.window] for s in starts])
+
+
+def run(design: PreviewDesign, path: np.ndarray) -> np.ndarray:
+    """The design's gains through the kernel, from rest at 0."""
+    views = windows_of(path, design)
+    u = np.empty(len(views) * design.update)
+    z = np.zeros(len(design.state_gain))
+    drives = views @ design.path_gain.T, views @ design.state_path_gain.T
+    run_windows(design.command_gain, design.state_gain, *drives, z, 0, len(views), u)
+    return u
+
+
+def direct(design: PreviewDesign, plants: list[DiscretePlant], path: np.ndarray) -> np.ndarray:
+    """The same by solving every window with lstsq, simulating sample by sample."""
+    window, update = design.window, design.update
+    weights = np.sqrt([m.weight for m in design.members])
+    psi = BASES["ce-opt"](sum(m.weight * m.integrated.T @ m.integrated for m in design.members),
+                          design.n)  # fmt: skip
+    doubled = np.cumsum(np.cumsum(psi, axis=0), axis=0)
+    filtered = np.concatenate([
+        s * np.stack([answer(p, column) for column in doubled.T], axis=1)
+        for s, p in zip(weights, plants, strict=True)
+    ])  # fmt: skip
+    states = [np.zeros(p.order) for p in plants]
+    last = previous = 0.0
+    u: list[float] = []
+    for y_d in windows_of(path, design):
+        free = last + np.arange(1.0, window + 1.0) * (last - previous)
+        error = np.concatenate([
+            s * (y_d - answer(p, free, x)) for s, p, x in zip(weights, plants, states, strict=True)
+        ])  # fmt: skip
+        c = np.linalg.lstsq(filtered, error, rcond=1e-14)[0]
+        command = (free + doubled @ c)[:update]
+        u.extend(command)
+        last, previous = command[-1], command[-2]
+        for p, x in zip(plants, states, strict=True):
+            for value in command:
+                x[:] = p.a @ x + p.b * value
+    return np.array(u)
+
+
+def answer(plant: DiscretePlant, u: np.ndarray, x: np.ndarray | None = None) -> np.ndarray:
+    state = np.zeros(plant.order) if x is None else x.copy()
+    y = np.empty(len(u))
+    for k, value in enumerate(u):
+        y[k] = plant.c @ state + plant.d * value
+        state = plant.a @ state + plant.b * value
+    return y
+
+
+def stroke(samples: int) -> np.ndarray:
+    x = np.linspace(0, 1, samples)
+    return 20 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_recursion_is_the_window_solution(count: int) -> None:
+    lifted = members(count)
+    design = PreviewDesign(lifted, 60)
+    path = np.concatenate([stroke(400), 20 - stroke(350)])
+    expected = direct(design, [m.plant for m in lifted], path)
+    np.testing.assert_allclose(run(design, path), expected, rtol=0, atol=1e-9 * 20)
+
+
+def test_price_is_a_ridge() -> None:
+    """One window with a price equals the stacked least squares with sqrt(price) Psi under it."""
+    lifted = members(1)
+    free, priced = PreviewDesign(lifted, 60), PreviewDesign(lifted, 60, price=0.3)
+    path = stroke(WINDOW)
+    m = lifted[0]
+    stacked = np.concatenate([m.integrated @ free.basis, np.sqrt(0.3) * free.basis])
+    c = np.linalg.lstsq(stacked, np.append(path, np.zeros(WINDOW)), rcond=1e-14)[0]
+    u = np.cumsum(np.cumsum(free.basis @ c))[:UPDATE]
+    np.testing.assert_allclose(priced.path_gain @ path, u, atol=1e-8)
+
+
+def test_lifted_plant_is_the_simulation() -> None:
+    plant = one_mode()
+    lifted = lifted_plant(plant, 1.0, 40, 20)
+    rng = np.random.default_rng(1)
+    v, x, (u1, u2) = rng.normal(size=40), rng.normal(size=plant.order), rng.normal(size=2)
+    doubled = np.cumsum(np.cumsum(v))
+    free = u1 + np.arange(1.0, 41.0) * (u1 - u2)
+    predicted = lifted.integrated @ v + lifted.from_state @ x + lifted.from_history @ [u1, u2]
+    np.testing.assert_allclose(predicted, answer(plant, free + doubled, x), atol=1e-9)
+    u = rng.normal(size=20)
+    after = lifted.advance @ x + lifted.drive @ u
+    np.testing.assert_allclose(after, advance_state(plant.a, plant.b, x, u), atol=1e-12)
+
+
+@pytest.mark.parametrize("basis", ["ce-opt", "bspline"])
+@pytest.mark.parametrize("n", [4, 20, 45])
+def test_bases_are_orthonormal(basis: str, n: int) -> None:
+    g = members(1, 150, 75)[0].integrated
+    psi = BASES[basis](g.T @ g, n)
+    assert psi.shape == (150, n)
+    np.testing.assert_allclose(psi.T @ psi, np.eye(n), atol=1e-10)
+
+
+def test_ce_opt_are_singular_vectors() -> None:
+    g = members(1, 150, 75)[0].integrated
+    psi = ce_opt_basis(g.T @ g, 12)
+    _, sigma, vt = np.linalg.svd(g)
+    assert np.all(np.diff(sigma[:13]) < 0)
+    np.testing.assert_allclose(np.abs(np.sum(psi * vt[:12].T, axis=0)), 1, atol=1e-6)
+
+
+def test_bsplines_span() -> None:
+    psi = bspline_basis(np.zeros((120, 120)), 14, 3)
+    knots = np.concatenate([[0.0] * 3, np.linspace(0, 119, 12), [119.0] * 3])
+    design = BSpline.design_matrix(np.arange(120.0), knots, 3).toarray()
+    np.testing.assert_allclose(psi @ (psi.T @ design), design, atol=1e-10)
+    # Cubics are cubic splines.
+    cubic = (np.arange(120.0) / 119) ** 3
+    np.testing.assert_allclose(psi @ (psi.T @ cubic), cubic, atol=1e-10)
+
+
+@pytest.mark.parametrize(("basis", "n"), [("ce-opt", 0), ("ce-opt", 151), ("bspline", 3)])
+def test_wrong_numbers_of_functions(basis: str, n: int) -> None:
+    with pytest.raises(DesignError, match=f"n = {n} "):
+        PreviewDesign(members(1, 150, 75), n, basis)
+
+
+def test_acceptance_figures() -> None:
+    design = PreviewDesign(members(1), 60)
+    assert design.spectral_radius == pytest.approx(
+        np.abs(np.linalg.eigvals(design.state_gain)).max()
+    )
+    assert design.spectral_radius < 0.9
+    assert 1 < design.condition < 1e10
+
+
+@pytest.mark.parametrize(("window", "update", "n"), [(60, 30, 55), (20, 19, 2)])
+def test_unstable_design_is_refused(window: int, update: int, n: int) -> None:
+    """Short windows, or n / window near 1, on a non-minimum-phase axis (METHOD 3)."""
+    taz = plant_set(load_machine("taz6-x").axes["x"], DT_S).nominal
+    with pytest.raises(DesignError, match=r"spectral radius \d+\.\d+, limit 0.9; take a longer"):
+        PreviewDesign([lifted_plant(taz, 1.0, window, update)], n)
+
+
+def test_nearly_dependent_basis_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def twice(gram: np.ndarray, n: int) -> np.ndarray:
+        psi = ce_opt_basis(gram, n)
+        psi[:, -1] = psi[:, 0] * (1 + 1e-13)
+        return psi
+
+    monkeypatch.setitem(BASES, "ce-opt", twice)
+    with pytest.raises(DesignError, match=r"nearly dependent .*condition .*limit 1e\+10.*fewer"):
+        PreviewDesign(members(1), 20)
+
+
+@pytest.mark.parametrize("machine", ["ender3", "voron-v0", "taz6-x"])
+def test_no_drift(machine: str) -> None:
+    """rho(F) < 1 is the stability test: the state of a standing machine fades."""
+    plant = plant_set(load_machine(machine).axes["x"], DT_S).nominal
+    design = PreviewDesign([lifted_plant(plant, 1.0, WINDOW, UPDATE)], 60, price=0.03)
+    z = design.rest_state(100.0)
+    u = np.empty(UPDATE * 400)
+    views = np.full((400, WINDOW), 100.0)
+    z[:-2] += 1.0
+    run_windows(design.command_gain, design.state_gain, views @ design.path_gain.T,
+                views @ design.state_path_gain.T, z, 0, 400, u)  # fmt: skip
+    np.testing.assert_allclose(u[-UPDATE:], 100.0, atol=1e-5)
+
+
+def test_figures_of_the_method() -> None:
+    """METHOD 3, 45 Hz / .05: contour rms 1.2 um with n = 60, .3 with n = 100, tens without."""
+    plant = one_mode()
+    path, _ = reference_motion()
+    before = contour_error(response([plant, plant], path), path, DT_S)
+    rms = {0: 1e3 * np.sqrt(np.mean(before**2))}
+    for n in (60, 100):
+        design = PreviewDesign(members(1), n)
+        u = np.stack([run(design, row)[: path.shape[1]] for row in path])
+        error = contour_error(response([plant, plant], u), path, DT_S)
+        rms[n] = 1e3 * np.sqrt(np.mean(error**2))
+    assert rms[0] > 25
+    assert rms[60] <= 1.5
+    assert rms[100] <= 0.5
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    seed=st.integers(0, 2**31),
+    update=st.integers(1, 6),
+    states=st.integers(1, 5),
+    first=st.integers(0, 6),
+    count=st.integers(0, 6),
+)
+def test_twin_of_run_windows(seed: int, update: int, states: int, first: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    e, f = rng.normal(size=(update, states)), 0.5 * rng.normal(size=(states, states))
+    s, h = rng.normal(size=(12, update)), rng.normal(size=(12, states))
+    z, u = rng.normal(size=states), np.zeros(12 * update)
+    expected_u, expected_z = u.copy(), z.copy()
+    for w in range(first, first + count):
+        expected_u[w * update : (w + 1) * update] = e @ expected_z + s[w]
+        expected_z = f @ expected_z + h[w]
+    run_windows(e, f, s, h, z, first, first + count, u)
+    np.testing.assert_allclose(u, expected_u, atol=1e-9, rtol=1e-9)
+    np.testing.assert_allclose(z, expected_z, atol=1e-9, rtol=1e-9)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**31), st.integers(1, 6), st.integers(0, 50))
+def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
+    rng = np.random.default_rng(seed)
+    a = 0.9 * np.linalg.qr(rng.normal(size=(order, order)))[0]
+    b, x, u = rng.normal(size=order), rng.normal(size=order), rng.normal(size=samples)
+    expected = x.copy()
+    for value in u:
+        expected = a @ expected + b * value
+    kept = x.copy()
+    np.testing.assert_allclose(advance_state(a, b, x, u), expected, atol=1e-10)
+    np.testing.assert_array_equal(x, kept)
