@@ -1,0 +1,425 @@
+"""What a print file makes the machine do, read from the bytes alone, and the judge of that motion.
+
+Shared by the benchmarks. Nothing here knows how a file was made: a file is interpreted, planned by
+the firmware's rules and sampled at 10 kHz, and the continuous plants answer that motion.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.shapers import shape, shaper_pulses
+from gcode.firmware.klipper.planner import STOPPING, Planner, join_phases
+from gcode.interpreter import Interpreter
+from gcode.sampler import sample_phases
+from gcode.types import Moves, Phases
+from models.machine import Machine
+from models.plants import DiscretePlant, plant_set
+from simulation.measures import Tally, distance_to_path
+from simulation.response import PlantStream
+
+__all__ = [
+    "DT_S",
+    "Aligned",
+    "Judge",
+    "Motion",
+    "Own",
+    "ReadBackError",
+    "Shaped",
+    "Timed",
+    "find_input",
+    "forced_stops",
+    "plain_copy",
+    "read_motion",
+    "shared_folder",
+]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+T = TypeVar("T", Moves, Phases)
+
+DT_S = 1e-4
+WINDOW_S = 0.08
+_CONTOUR_STRIDE = 20
+_BLOCK = 200_000
+_READ_BYTES = 1 << 20
+_SAME_MM, _SAME_E_MM = 1e-4, 5e-3
+_SHAPER_REACH_S = 0.15
+_STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
+
+
+class ReadBackError(RuntimeError):
+    """The written file does not do what the original does."""
+
+
+def shared_folder(given: Path | None = None) -> Path | None:
+    """Return the folder of shared data: as given, $STILLPATH_SHARED, or beside the checkout."""
+    root = Path(__file__).resolve().parent.parent
+    named = os.environ.get("STILLPATH_SHARED")
+    folder = given or (Path(named) if named else root.parent / "shared")
+    return folder if folder.is_dir() else None
+
+
+def find_input(name: str, shared: Path | None) -> Path:
+    """Return a print file by path, or by its name in the shared corpus."""
+    path = Path(name)
+    if path.is_file():
+        return path
+    for folder in ("own", "third-party"):
+        for ending in (".gcode.gz", ".gcode"):
+            if shared is not None and (shared / "corpus" / folder / f"{name}{ending}").is_file():
+                return shared / "corpus" / folder / f"{name}{ending}"
+    sys.exit(f"there is no file {name}, and no such name in the shared corpus")
+
+
+def plain_copy(source: Path, folder: Path) -> Path:
+    """Return the path of the file without compression, made in `folder` if need be."""
+    if source.suffix != ".gz":
+        return source
+    target = folder / source.stem
+    with gzip.open(source) as packed, target.open("wb") as out:
+        while data := packed.read(_READ_BYTES):
+            out.write(data)
+    return target
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The motion of a whole file.
+
+    Attributes
+    ----------
+    phases : Phases
+        `move_index` counts the moves of the file.
+    end_mm : ndarray, shape (moves, 4)
+        Where each move ends.
+    line : ndarray of int64, shape (moves,)
+    stops : ndarray of int64, shape (stops,)
+        Number of moves before each line that stops the machine, rising.
+    time_s : float
+        From the first move to the last, dwells included.
+    """
+
+    phases: Phases
+    end_mm: Array
+    line: Ints
+    stops: Ints
+    time_s: float
+
+    def stretches(self) -> tuple[Ints, Ints]:
+        """First and last row of `phases` of each unbroken motion in X and Y."""
+        phases = self.phases
+        xy = _moves_xy(phases)
+        stopped = np.searchsorted(self.stops, phases.move_index, "right")
+        begins = xy & np.append(True, ~xy[:-1] | (np.diff(stopped) > 0))
+        begins[self.jumps()] = xy[self.jumps()]
+        ends = xy & np.append(begins[1:] | ~xy[1:], True)
+        return np.flatnonzero(begins), np.flatnonzero(ends)
+
+    def jumps(self) -> Ints:
+        """Rows of `phases` before which the position changes without a motion (homing)."""
+        before = self.end_mm[self.phases.move_index[:-1], :2]
+        return (
+            np.flatnonzero(np.max(np.abs(self.phases.start_mm[1:, :2] - before), axis=1) > 1e-6) + 1
+        )
+
+    def row_end_s(self) -> Array:
+        """When each row of `phases` ends."""
+        phases = self.phases
+        return np.asarray(phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s)
+
+
+def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Motion:
+    """Interpret and plan a file.
+
+    Parameters
+    ----------
+    forced : sequence of int
+        Rising numbers of moves behind which the machine stops although the file does not say so.
+    """
+    reader, planner = Interpreter(machine), Planner(machine.firmware)
+    parts: list[Phases] = []
+    ends: list[Array] = []
+    lines: list[Ints] = []
+    stops: list[Ints] = [np.array(forced, dtype=np.int64)]
+    with path.open("rb") as file:
+        while True:
+            data = file.read(_READ_BYTES)
+            for block in reader.push(data) if data else reader.flush():
+                events, first, n = block.events, block.first_move, len(block.moves)
+                rows = np.flatnonzero(np.isin(events.kind, _STOPPING))
+                stops.append(events.move_index[rows])
+                here = [
+                    (int(events.move_index[row]) - first, float(events.dwell_s[row]))
+                    for row in rows.tolist()
+                ]
+                here += [(k - first, 0.0) for k in forced if first <= k < first + n]
+                done = 0
+                for at, dwell_s in sorted(here):
+                    parts.append(planner.push_moves(_rows(block.moves, done, at), block.limits))
+                    parts.append(planner.stop(dwell_s))
+                    done = at
+                parts.append(planner.push_moves(_rows(block.moves, done, n), block.limits))
+                ends.append(block.moves.end_mm.copy())
+                lines.append(block.moves.line.copy())
+            if not data:
+                break
+    parts.append(planner.flush())
+    return Motion(
+        phases=join_phases(parts),
+        end_mm=np.concatenate(ends),
+        line=np.concatenate(lines),
+        stops=np.sort(np.concatenate(stops)),
+        time_s=planner.time_s,
+    )
+
+
+def forced_stops(original: Motion, written: Motion) -> list[int]:
+    """Find where the written file stops: numbers of moves of the original, rising.
+
+    A stop is found by its place: the next move of the original that ends at the same X Y Z and the
+    same amount of filament.
+    """
+    found: list[int] = []
+    at = 0
+    places = written.end_mm[np.unique(written.stops[written.stops > 0]) - 1]
+    for place in places:
+        row = _next_match(original.end_mm, place, at)
+        if row is None:
+            raise ReadBackError(f"the written file stops at {place}, where the original never is")
+        at = row
+        found.append(row + 1)
+    return sorted(set(found))
+
+
+class Timed:
+    """A motion between two jumps of position, to be judged: what is wanted and what is commanded.
+
+    Times count from the start of the section on the 10 kHz grid.
+    """
+
+    samples: int
+
+    def path(self, first: int, last: int) -> tuple[Array, Mask]:
+        """Planned X Y of the samples [first, last), and where they extrude."""
+        raise NotImplementedError
+
+    def command(self, first: int, last: int) -> Array:
+        """X Y of the commanded motion."""
+        raise NotImplementedError
+
+
+class Own(Timed):
+    """A file as it is: commanded and planned motion are the same."""
+
+    def __init__(self, motion: Motion, first_row: int, last_row: int) -> None:
+        self._phases = _rows(motion.phases, first_row, last_row)
+        self._start_s = float(self._phases.t_s[0])
+        self._end_s = motion.row_end_s()[first_row:last_row]
+        self.samples = int(np.ceil((self._end_s[-1] - self._start_s) / DT_S)) + 1
+
+    @classmethod
+    def sections(cls, motion: Motion) -> list[Own]:
+        """All sections of a file."""
+        bounds = [0, *motion.jumps().tolist(), len(motion.phases)]
+        return [cls(motion, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+
+    def path(self, first: int, last: int) -> tuple[Array, Mask]:
+        t_s = self._start_s + DT_S * np.arange(first, last)
+        phases, offset = _around(self._phases, t_s)
+        position, row = sample_phases(phases, t_s)
+        moving = t_s <= self._end_s[offset + row]
+        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+
+    def command(self, first: int, last: int) -> Array:
+        return self.path(first, last)[0]
+
+
+class Shaped(Own):
+    """A file as it is, driven through the firmware's shaper."""
+
+    shaper: tuple[str, float, float, float]
+
+    def command(self, first: int, last: int) -> Array:
+        kind, fx_hz, fy_hz, zeta = self.shaper
+        reach = round(_SHAPER_REACH_S / DT_S)
+        path, _ = self.path(first - reach, last + reach)
+        pulses = [shaper_pulses(kind, f, zeta) for f in (fx_hz, fy_hz)]
+        rows = [shape(row, DT_S, p) for row, p in zip(path, pulses, strict=True)]
+        return np.stack(rows)[:, reach:-reach]
+
+
+class Aligned(Timed):
+    """A written file against the original's path, laid on the written file's time.
+
+    Both files consist of stretches of X Y motion between the same rests. A stretch of the original
+    starts when the written one starts and runs in its own time; then the path stands still until
+    the next stretch starts. `original` must be planned with the written file's stops.
+    """
+
+    def __init__(self, original: Motion, written: Motion) -> None:
+        self._path, self._written = original.phases, written.phases
+        self.original_rows, self.written_rows = _match(original, written)
+        ends = original.row_end_s()
+        self._from_s = self._path.t_s[self.original_rows[0]]
+        self._until_s = ends[self.original_rows[1]]
+        self._begin_s = written.phases.t_s[self.written_rows[0]]
+        self._start_s = 0.0
+        self._last_s = written.time_s
+        self.samples = int(np.ceil(written.time_s / DT_S)) + 1
+
+    def sections(self, original: Motion, written: Motion) -> list[Aligned]:
+        """Cut at the jumps of the written file's position."""
+        jumps = written.jumps()
+        if len(jumps) != len(original.jumps()):
+            raise ReadBackError("the written file loses its position elsewhere")
+        ends = written.row_end_s()
+        bounds = [0, *jumps.tolist(), len(written.phases)]
+        parts = []
+        for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+            inside = (self.written_rows[0] >= a) & (self.written_rows[0] < b)
+            if not inside.any():
+                continue
+            part = object.__new__(Aligned)
+            part._path, part._written = self._path, _rows(written.phases, a, b)
+            part._from_s, part._until_s = self._from_s[inside], self._until_s[inside]
+            part._begin_s = self._begin_s[inside]
+            part._start_s, part._last_s = float(written.phases.t_s[a]), float(ends[b - 1])
+            part.samples = int(np.ceil((part._last_s - part._start_s) / DT_S)) + 1
+            parts.append(part)
+        return parts
+
+    def path(self, first: int, last: int) -> tuple[Array, Mask]:
+        t_s = self._start_s + DT_S * np.arange(first, last)
+        k = np.maximum(np.searchsorted(self._begin_s, t_s, "right") - 1, 0)
+        since_s = np.maximum(t_s - self._begin_s[k], 0.0)
+        wanted_s = self._from_s[k] + since_s
+        moving = wanted_s < self._until_s[k]
+        wanted_s = np.where(moving, wanted_s, self._until_s[k] - 1e-9)
+        phases, _ = _around(self._path, wanted_s)
+        position, row = sample_phases(phases, wanted_s)
+        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+
+    def command(self, first: int, last: int) -> Array:
+        t_s = self._start_s + DT_S * np.arange(first, last)
+        return sample_phases(_around(self._written, t_s)[0], t_s)[0][:2]
+
+
+class Judge:
+    """Add up the errors of the continuous plants over the sections of a motion.
+
+    Contour error: every 20th sample of 10 kHz that extrudes, distance to the path within 80 ms.
+    Tracking error: every sample that extrudes. Second difference of the command: 1 kHz, all motion.
+
+    Attributes
+    ----------
+    contour : list of Tally
+        Nominal plant first, then the members, in mm.
+    tracking : Tally
+    bend : Tally
+        Second difference of the commanded X Y in mm.
+    """
+
+    def __init__(self, machine: Machine, *, members: bool) -> None:
+        sets = [plant_set(machine.axes[axis], DT_S) for axis in ("x", "y")]
+        pairs: list[list[DiscretePlant]] = [[s.nominal for s in sets]]
+        if members:
+            pairs += [list(pair) for pair in zip(*(s.members for s in sets), strict=False)]
+        self._pairs = pairs
+        self.contour = [Tally() for _ in pairs]
+        self.tracking, self.bend = Tally(), Tally()
+        self.extruding_s = 0.0
+        self.worst: tuple[float, int] = (0.0, 0)
+
+    def add(self, motion: Timed) -> None:
+        """Judge one section, from rest."""
+        streams = [PlantStream(pair) for pair in self._pairs]
+        window, n = round(WINDOW_S / DT_S), motion.samples
+        tail = np.zeros((2, 0))
+        for k0 in range(0, n, _BLOCK):
+            k1 = min(n, k0 + _BLOCK)
+            a, b = max(0, k0 - window), min(n, k1 + window)
+            path, extruding = motion.path(a, b)
+            u = motion.command(k0, k1)
+            coarse = np.hstack([tail, u[:, ::10]])
+            bend = np.diff(coarse, 2)
+            self.bend.add(np.hypot(bend[0], bend[1]))
+            tail = coarse[:, -2:]
+            use = extruding[k0 - a : k1 - a]
+            self.extruding_s += DT_S * float(np.sum(use))
+            at = np.flatnonzero(use[::_CONTOUR_STRIDE]) * _CONTOUR_STRIDE
+            for i, (stream, tally) in enumerate(zip(streams, self.contour, strict=True)):
+                y = stream.push(u)
+                if len(at) == 0:
+                    continue
+                error = distance_to_path(path, y[:, at], at + (k0 - a), DT_S, WINDOW_S)
+                tally.add(error)
+                if i == 0:
+                    miss = y - path[:, k0 - a : k1 - a]
+                    self.tracking.add(np.hypot(miss[0], miss[1]), use)
+
+    @property
+    def member_rms_mm(self) -> list[float]:
+        """Contour rms of each member (the nominal plant if there are none)."""
+        return [tally.rms for tally in self.contour[1:] or self.contour]
+
+
+def _match(original: Motion, written: Motion) -> tuple[tuple[Ints, Ints], tuple[Ints, Ints]]:
+    """Pair the stretches of both files by where they end; return their first and last rows."""
+    ours, theirs = written.stretches(), original.stretches()
+    ends_w = written.end_mm[written.phases.move_index[ours[1]]]
+    ends_o = original.end_mm[original.phases.move_index[theirs[1]]]
+    if len(ends_w) == len(ends_o) and bool(np.all(_same(ends_w, ends_o))):
+        return theirs, ours
+    firsts, lasts = [], []
+    at = 0
+    for k, place in enumerate(ends_o):
+        row = _next_match(ends_w, place, at)
+        if row is None:
+            line = int(original.line[original.phases.move_index[theirs[1][k]]])
+            raise ReadBackError(f"the written file never comes to {place} (line {line})")
+        firsts.append(int(ours[0][at]))
+        lasts.append(int(ours[1][row]))
+        at = row + 1
+    return theirs, (np.array(firsts), np.array(lasts))
+
+
+def _next_match(places: Array, wanted: Array, start: int) -> int | None:
+    size = 1000
+    while start < len(places):
+        rows = np.flatnonzero(_same(places[start : start + size], wanted))
+        if len(rows):
+            return start + int(rows[0])
+        start += size
+        size *= 4
+    return None
+
+
+def _same(places: Array, wanted: Array) -> Mask:
+    gap = np.abs(places - wanted)
+    return np.asarray(np.all(gap[:, :3] < _SAME_MM, axis=1) & (gap[:, 3] < _SAME_E_MM))
+
+
+def _moves_xy(phases: Phases) -> Mask:
+    return np.asarray((phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0))
+
+
+def _around(phases: Phases, t_s: Array) -> tuple[Phases, int]:
+    """Rows needed for ascending times, and the number of the first of them."""
+    first = max(int(np.searchsorted(phases.t_s, t_s[0], "right")) - 1, 0)
+    last = max(int(np.searchsorted(phases.t_s, t_s[-1], "right")), first + 1)
+    return _rows(phases, first, last), first
+
+
+def _rows(table: T, first: int, last: int) -> T:
+    return replace(table, **{f.name: getattr(table, f.name)[first:last] for f in fields(table)})
