@@ -255,8 +255,6 @@ def _move(
     mi: Any,
     ei: Any,
     ef: Any,
-    mod_rows: Any,
-    mod_index: Any,
 ) -> int:
     named = 0
     for k in range(3):
@@ -296,8 +294,6 @@ def _arc(
     mi: Any,
     ei: Any,
     ef: Any,
-    mod_rows: Any,
-    mod_index: Any,
 ) -> int:
     if not i[I_ABS_XYZ]:
         return ERROR_ARC_RELATIVE
@@ -416,9 +412,9 @@ def execute(
         Values of the words A to Z and which of them are present.
     """
     if action == 20:
-        return _move(w, mask, f, i, mf, mi, ei, ef, mod_rows, mod_index)
+        return _move(w, mask, f, i, mf, mi, ei, ef)
     if action == 21 or action == 22:
-        return _arc(action == 21, w, mask, f, i, mf, mi, ei, ef, mod_rows, mod_index)
+        return _arc(action == 21, w, mask, f, i, mf, mi, ei, ef)
     if action == 23:
         dwell_ms = w[_P] if mask & (1 << _P) else 0.0
         if not 0.0 <= dwell_ms <= MAX_VALUE:
@@ -663,7 +659,7 @@ def run(
             if action < 20:
                 put_event(i, ei, ef, action, 0.0)
             elif action == 20:  # here again: passing so many arrays on costs as much as the rest
-                status = _move(w, mask, f, i, mf, mi, ei, ef, mod_rows, mod_index)
+                status = _move(w, mask, f, i, mf, mi, ei, ef)
                 if status != OK:
                     return status
             else:

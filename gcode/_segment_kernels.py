@@ -12,7 +12,7 @@ __all__ = ["fit_stretch", "path_directions", "rest_errors"]
 
 @kernel
 def path_directions(path: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Unit direction of the path (2, n) at every sample; at a stand, the last one before it."""
+    """Find the unit direction of the path (2, n) at every sample; at a stand, the last one."""
     n = path.shape[1]
     x, y = 1.0, 0.0
     for k in range(n):

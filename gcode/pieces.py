@@ -129,7 +129,7 @@ class Splitter:
         self._text += block.text[held - block.text_offset :]
 
     def _raw_moves(self, moves: Moves, events: Events) -> NDArray[np.bool_]:
-        """Moves of X or Y that must keep their lines."""
+        """Mark the moves of X or Y that must keep their lines."""
         travel = moves.end_mm - moves.start_mm
         xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
         raw = xy & ((moves.known & 3) != 3)
@@ -198,7 +198,8 @@ class Splitter:
 
     def _take(self, until: int | None) -> Passage:
         """Remove the lines before byte `until` (None: all) from what is held."""
-        assert self._moves is not None and self._events is not None
+        assert self._moves is not None
+        assert self._events is not None
         moves, events = self._moves, self._events
         if until is None:
             until = self._text_offset + len(self._text)

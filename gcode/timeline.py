@@ -10,6 +10,7 @@ stretches move in time. A rest starts on the sampling grid; a stretch starts whe
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +86,7 @@ def group_rows(phases: Phases) -> list[Group]:
             and bool(moves_xy[first])
             and phases.direction[last, 2] != 0.0,
         )
-        for first, last in zip(bounds[:-1], bounds[1:], strict=True)
+        for first, last in pairwise(bounds)
         if last > first
     ]
 

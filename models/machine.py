@@ -101,7 +101,7 @@ class Klipper(_Document):
     arcs: bool = True
     retraction: FirmwareRetraction | None = FirmwareRetraction()
     shaper: FirmwareShaper | None = None
-    """None: unknown. Then it is switched off for our moves and stays off, and the report says so."""
+    """None: unknown. It is switched off for our moves and stays off, and the report says so."""
     harmless_macros: tuple[str, ...] = ()
     """Configured macros that neither move nor wait, for instance _ON_LAYER_CHANGE."""
     stopping_macros: tuple[str, ...] = ()

@@ -163,7 +163,7 @@ class _Part:
     jumped: bool
 
     def motion(self) -> MotionSamples:
-        """Samples with line, layer and feature."""
+        """Return the samples with line, layer and feature."""
         row = self.samples.move_index - self.first_move
         moves = self.moves
         travel = moves.end_mm - moves.start_mm

@@ -335,7 +335,7 @@ class _Job:
             machine=self._machine.name,
             machine_title=self._machine.title,
             machine_revision=self._machine.revision,
-            settings={k: v for k, v in self._options.model_dump().items()},
+            settings=dict(self._options.model_dump()),
             source_name=self._source.name,
             channels=measured.channels(),
             best_shaper=shaper.label,

@@ -77,8 +77,8 @@ def assign_speeds(
     `junction_mm_s[i]` limits the speed between i - 1 and i.
 
     The time still to spend is the target minus the time predicted so far. Klipper loses
-    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A stretch
-    starts when the rest before it is over: its times move with that.
+    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A
+    stretch starts when the rest before it is over: its times move with that.
     """
     now = start_s
     before = 0.0

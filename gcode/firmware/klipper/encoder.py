@@ -155,7 +155,7 @@ class KlipperEncoder:
     def _interleave(
         self, piece: Piece, timeline: Timeline, segments: Segments
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-        """Rounded segments with the rests' own moves between them."""
+        """Round the segments and put the rests' own moves between them."""
         groups = timeline.groups
         position = _integers(segments.end_mm.T)
         grid = self._grid

@@ -66,9 +66,9 @@ class KlipperWriter:
         """First lines of the file."""
         return (
             f"; Processed by stillpath {self._stamp}\n"
-            "; stillpath: between the lines 'stream on' and 'stream off' the acceleration limit is\n"
-            "; stillpath: raised and every move is timed. Set no speed slider there. PAUSE and\n"
-            "; stillpath: CANCEL_PRINT must restore the limits first: use the macros of stillpath.cfg.\n"
+            "; stillpath: between 'stream on' and 'stream off' the acceleration limit is raised\n"
+            "; stillpath: and every move is timed: leave the speed slider at 100 %. PAUSE and\n"
+            "; stillpath: CANCEL_PRINT must restore the limits first: see stillpath.cfg.\n"
         ).encode()
 
     def footer(self, ends_with_newline: bool) -> bytes:
@@ -96,7 +96,7 @@ class KlipperWriter:
         parts = [self._on(piece)]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
-        modes = self._modes(piece, encoded, index)
+        modes = self._modes(piece, index)
         text, line_end = self._format(encoded, modes, index, events.kind)
 
         rest_rows = np.flatnonzero(rows >= 0)
@@ -133,8 +133,8 @@ class KlipperWriter:
         first = np.maximum.accumulate(first)
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
-    def _modes(self, piece: Piece, encoded: Encoded, index: NDArray[np.int64]) -> _Modes:
-        """The file's modal state at every written move."""
+    def _modes(self, piece: Piece, index: NDArray[np.int64]) -> _Modes:
+        """Return the file's modal state at every written move."""
         changes = piece.events.kind == EventKind.MODE
         first = np.concatenate([[0], index[changes]])
         states = [piece.modal_before]
@@ -257,7 +257,7 @@ class KlipperWriter:
         return b"".join(parts)
 
     def _shaper_on(self, passage: Passage) -> bytes:
-        """The firmware's shaper, before lines that move X or Y on their own."""
+        """Set the firmware's shaper again before lines that move X or Y on their own."""
         if not self._shaper_off:
             return b""
         travel = passage.moves.end_mm - passage.moves.start_mm
