@@ -296,7 +296,8 @@ def print_row(r: Row) -> None:
         f"{r.ours_rms:5.2f}/{r.ours_max:<4.0f} {r.ratio:6.3f} {r.members_ratio:6.3f} "
         f"{r.tracking_none:5.1f}/{r.tracking_ours:<4.1f} {r.tracking_ratio:6.3f} "
         f"{r.bend_rms_ratio:4.2f}/{r.bend_max_ratio:<5.2f} {r.time_percent:+6.3f} "
-        f"{r.megabytes:6.1f} {r.size_ratio:5.2f} {r.segments_per_s:4.0f}/{r.peak_segments_per_s:<4.0f} "
+        f"{r.megabytes:6.1f} {r.size_ratio:5.2f} "
+        f"{r.segments_per_s:4.0f}/{r.peak_segments_per_s:<4.0f} "
         f"{r.put_back:3d}/{r.put_back_percent:<4.2f}% {r.emission_rms:4.2f}/{r.emission_max:<4.1f} "
         f"{r.cpu_s:5.0f}  {verdict}",
         flush=True,

@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -152,7 +153,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     ends: list[Array] = []
     lines: list[Ints] = []
     stops: list[Ints] = [np.array(forced, dtype=np.int64)]
-    with path.open("rb") as file:
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
         while True:
             data = file.read(_READ_BYTES)
             for block in reader.push(data) if data else reader.flush():
@@ -232,10 +233,10 @@ class Own(Timed):
     def sections(cls, motion: Motion) -> list[Own]:
         """All sections of a file."""
         bounds = [0, *motion.jumps().tolist(), len(motion.phases)]
-        return [cls(motion, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        return [cls(motion, a, b) for a, b in pairwise(bounds)]
 
     def path(self, first: int, last: int) -> tuple[Array, Mask]:
-        t_s = self._start_s + DT_S * np.arange(first, last)
+        t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
         phases, offset = _around(self._phases, t_s)
         position, row = sample_phases(phases, t_s)
         moving = t_s <= self._end_s[offset + row]
@@ -286,7 +287,7 @@ class Aligned(Timed):
         ends = written.row_end_s()
         bounds = [0, *jumps.tolist(), len(written.phases)]
         parts = []
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+        for a, b in pairwise(bounds):
             inside = (self.written_rows[0] >= a) & (self.written_rows[0] < b)
             if not inside.any():
                 continue
@@ -300,7 +301,7 @@ class Aligned(Timed):
         return parts
 
     def path(self, first: int, last: int) -> tuple[Array, Mask]:
-        t_s = self._start_s + DT_S * np.arange(first, last)
+        t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
         k = np.maximum(np.searchsorted(self._begin_s, t_s, "right") - 1, 0)
         since_s = np.maximum(t_s - self._begin_s[k], 0.0)
         wanted_s = self._from_s[k] + since_s
@@ -311,7 +312,7 @@ class Aligned(Timed):
         return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
-        t_s = self._start_s + DT_S * np.arange(first, last)
+        t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
         return sample_phases(_around(self._written, t_s)[0], t_s)[0][:2]
 
 

@@ -1,0 +1,144 @@
+"""How fast the road is and how much memory it takes, compilation apart.
+
+Three fresh processes: one on a short file, which fills numba's cache and the cached shaper; one on
+the file; one on the file made ten times as long (its layers repeated). All times are CPU seconds of
+the whole job, reading, design, read-back, measurement and the HTML report included.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from readback import find_input, plain_copy, shared_folder
+
+from models.store import load_machine
+from service.pipeline.files import default_cache_dir
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from service.reports import write_report
+
+_ROOT = Path(__file__).resolve().parent.parent
+_FILE, _SPARE = "ps_voron_klipper_ringing", _ROOT / "examples" / "cura_ender3_gear24.gcode"
+_SHORT = _ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
+_LAYER = re.compile(rb"^;\s*(LAYER_CHANGE|LAYER:|layer num|CHANGE_LAYER)", re.I | re.M)
+_FILAMENT = re.compile(rb"^(?:G92|G0|G1)\b[^;\n]*\bE([-+.\d]+)", re.M)
+
+
+def child(source: Path, machine_name: str, tolerance_um: float, cache: Path) -> None:
+    """Run one job and print its figures as JSON."""
+    started_s = time.process_time()
+    machine = load_machine(machine_name)
+    with tempfile.TemporaryDirectory(prefix="stillpath-throughput-") as folder:
+        options = Options(tolerance_um=tolerance_um)
+        target = Path(folder) / "out.gcode"
+        result = compensate_file(source, target, machine, options, cache_dir=cache)
+        reported_s = time.process_time()
+        write_report(result, Path(folder))
+    ended_s = time.process_time()
+    figures = {
+        "print_s": result.original_time_s,
+        "cpu_s": ended_s - started_s,
+        "start_s": started_s,
+        "rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "stages": {s.stage: s.cpu_s for s in result.stages} | {"report": ended_s - reported_s},
+        "put_back": len(result.put_back),
+        "megabytes": result.written_bytes / 1e6,
+    }
+    print(json.dumps(figures))
+
+
+def longer(source: Path, target: Path, times: int) -> None:
+    """Write the file with the part from its first to its last layer change repeated."""
+    text = source.read_bytes()
+    marks = [match.start() for match in _LAYER.finditer(text)]
+    if len(marks) < 2:
+        sys.exit(f"{source}: no layer marks, so it cannot be made longer")
+    head, body, end = text[: marks[0]], text[marks[0] : marks[-1]], text[marks[-1] :]
+    filament = _FILAMENT.findall(head)
+    back = b"G92 E" + (filament[-1] if filament else b"0") + b"\n"
+    with target.open("wb") as out:
+        out.write(head)
+        for _ in range(times):
+            out.write(body)
+            out.write(back)
+        out.write(b"G92 E" + (_FILAMENT.findall(body) or [b"0"])[-1] + b"\n")
+        out.write(end)
+
+
+def run(source: Path, given: argparse.Namespace) -> dict[str, object]:
+    """Run a job in a process of its own."""
+    command = [
+        *(sys.executable, str(Path(__file__).resolve()), "--child", str(source)),
+        *("--machine", given.machine, "--tolerance-um", str(given.tolerance_um)),
+        *("--cache", str(given.cache)),
+    ]
+    environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"} | dict(os.environ)
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=False)
+    if done.returncode:
+        sys.exit(f"the job on {source} failed")
+    figures: dict[str, object] = json.loads(done.stdout)
+    return figures
+
+
+def show(title: str, figures: dict[str, object]) -> float:
+    """Print the figures of one job; return print seconds per CPU second."""
+    print_s, cpu_s = float(str(figures["print_s"])), float(str(figures["cpu_s"]))
+    print(f"\n{title}: {print_s:.0f} s of print, {float(str(figures['megabytes'])):.1f} MB written")
+    print(f"  {cpu_s:.2f} CPU s (start of the process, {figures['start_s']:.2f} s, apart):")
+    print(
+        f"  {print_s / cpu_s:.0f} print seconds per CPU second; pieces put back: "
+        f"{figures['put_back']}; peak RSS {figures['rss_mb']:.0f} MB"
+    )
+    stages = figures["stages"]
+    assert isinstance(stages, dict)
+    known = sum(stages.values())
+    for name, seconds in {**stages, "other": cpu_s - known}.items():
+        print(f"    {name:14}{seconds:8.2f} s {100 * seconds / cpu_s:5.1f} %")
+    return print_s / cpu_s
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Speed and memory of the road.")
+    parser.add_argument("file", nargs="?", help=f"path, or corpus name (default {_FILE})")
+    parser.add_argument("--machine", default="ender3")
+    parser.add_argument("--tolerance-um", type=float, default=2.0)
+    parser.add_argument("--times", type=int, default=10, help="length of the long file; 1: none")
+    parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
+    parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
+    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.child:
+        child(given.child, given.machine, given.tolerance_um, given.cache)
+        return
+    shared = shared_folder(given.shared)
+    name = given.file or (_FILE if shared else str(_SPARE))
+    with tempfile.TemporaryDirectory(prefix="stillpath-throughput-") as folder:
+        source = plain_copy(find_input(name, shared), Path(folder))
+        run(_SHORT, given)
+        once = run(source, given)
+        rate = show(f"{source.stem} on {given.machine}, {given.tolerance_um:g} um", once)
+        rss = float(str(once["rss_mb"]))
+        checks = {f"{rate:.0f} >= 1000 per CPU s": rate >= 1000, "RSS <= 400 MB": rss <= 400}
+        if given.times > 1:
+            long = Path(folder) / "long.gcode"
+            longer(source, long, given.times)
+            many = run(long, given)
+            show(f"{given.times} times its layers", many)
+            more = float(str(many["rss_mb"])) - rss
+            checks[f"{more:+.1f} MB for {given.times} times the length <= 20 MB"] = more <= 20
+    print()
+    for text, good in checks.items():
+        print(f"{'PASS' if good else 'MISS'}  {text}")
+
+
+if __name__ == "__main__":
+    main()
