@@ -306,6 +306,14 @@ class Interpreter:
         """Do with Python's number reader what the kernel does with its own."""
         mask = 0
         words = split_line(text).words
+        for word in words:
+            if word[1:] in ("NAN", "INF", "INFINITY") and word[0] in _NEEDED.get(name, ""):
+                # Klipper would skip such a word; whoever wrote it meant a coordinate.
+                raise GcodeError(
+                    f"{word[0]} is {word[1:]}, not a number; write a decimal number",
+                    line=int(self._i[lex.I_LINE]),
+                    text=text,
+                )
         for letter in _NEEDED.get(name, ""):
             if letter in words:
                 value = self._number(words[letter], letter, text)
