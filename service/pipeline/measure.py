@@ -21,7 +21,7 @@ from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, MotionMeter, Tally
 from simulation.response import PlantStream
 
-__all__ = ["Measurement", "MotionSamples"]
+__all__ = ["Measurement", "MotionSamples", "part_of"]
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,8 @@ class MotionSamples:
 
     Attributes
     ----------
-    path_mm : ndarray, shape (2, n)
+    path_mm, executed_mm : ndarray, shape (2, n)
+        X and Y as planned, and as the firmware executes them.
     z_mm : ndarray, shape (n,)
     extruding : ndarray of bool, shape (n,)
     line : ndarray of int64, shape (n,)
@@ -46,6 +47,7 @@ class MotionSamples:
     """
 
     path_mm: Array
+    executed_mm: Array
     z_mm: Array
     extruding: NDArray[np.bool_]
     line: NDArray[np.int64]
@@ -80,50 +82,44 @@ class Measurement:
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = {name: _Bins() for name in self._names}
-        self._views = _Views([n for n in self._names if n != "shaper"])
+        self._views = _Views(self._names)
         self._fresh = True
 
-    def add(self, samples: MotionSamples, command_mm: Array | None = None) -> None:
-        """Add planned motion; `command_mm` (2, n) is what is executed, by default the plan."""
-        if len(samples) == 0:
-            return
-        if self._fresh:
-            self._streams = {name: PlantStream(self._plants) for name in self._names}
-            self._fresh = False
-        executed = samples.path_mm if command_mm is None else command_mm
-        done: dict[str, ContourErrors] = {}
-        for name, command in (("before", samples.path_mm), ("after", executed)):
-            if name in self._streams:
-                done[name] = self._measure(name, samples, command)
-        self._views.add(samples, done)
-        for shaped, at in self._shaper.push(samples):
-            self._measure("shaper", at, shaped)
+    def add(self, samples: MotionSamples) -> None:
+        """Add motion."""
+        if len(samples):
+            self._measure(self._shaper.push(samples))
 
     def jump(self) -> None:
         """Say that the position is lost: the machine stands still when motion goes on."""
-        for shaped, at in self._shaper.flush():
-            self._measure("shaper", at, shaped)
+        self._measure(self._shaper.flush())
         self._fresh = True
 
     def finish(self) -> None:
         """Say that the motion has ended."""
-        if self._fresh and not self._streams:
-            return
-        for shaped, at in self._shaper.flush():
-            self._measure("shaper", at, shaped)
-        done = {}
-        for name, meter in self._meters.items():
-            done[name] = meter.flush()
-            self._track[name].add(done[name], self._dt_s)
-        self._views.add(None, {k: v for k, v in done.items() if k != "shaper"})
+        self._measure(self._shaper.flush())
+        self._note(None, {name: meter.flush() for name, meter in self._meters.items()})
 
-    def _measure(self, name: str, samples: MotionSamples, command: Array) -> ContourErrors:
-        y = self._streams[name].push(command)
-        errors = self._meters[name].push(
-            samples.path_mm, y, samples.extruding, samples.layer, samples.feature
-        )
-        self._track[name].add(errors, self._dt_s)
-        return errors
+    def _measure(self, shaped: tuple[Array, MotionSamples] | None) -> None:
+        if shaped is None:
+            return
+        command, samples = shaped
+        if self._fresh:
+            self._streams = {name: PlantStream(self._plants) for name in self._names}
+            self._fresh = False
+        commands = {"before": samples.path_mm, "after": samples.executed_mm, "shaper": command}
+        errors = {}
+        for name in self._names:
+            y = self._streams[name].push(commands[name])
+            errors[name] = self._meters[name].push(
+                samples.path_mm, y, samples.extruding, samples.layer, samples.feature
+            )
+        self._note(samples, errors)
+
+    def _note(self, samples: MotionSamples | None, errors: dict[str, ContourErrors]) -> None:
+        for name, found in errors.items():
+            self._track[name].add(found, self._dt_s)
+        self._views.add(samples, errors)
 
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""
@@ -189,25 +185,25 @@ class _ShaperStream:
         self._held: MotionSamples | None = None
         self._before: Array | None = None
 
-    def push(self, samples: MotionSamples) -> list[tuple[Array, MotionSamples]]:
+    def push(self, samples: MotionSamples) -> tuple[Array, MotionSamples] | None:
         """Return shaped commands and the samples they belong to, all but the last few."""
         held = samples if self._held is None else _join(self._held, samples)
         ready = len(held) - self._reach
         if ready <= 0:
             self._held = held
-            return []
+            return None
         out = self._shape(held, ready)
         self._before = held.path_mm[:, max(0, ready - self._reach) : ready].copy()
-        self._held = _part(held, ready, len(held))
-        return [out]
+        self._held = part_of(held, ready, len(held))
+        return out
 
-    def flush(self) -> list[tuple[Array, MotionSamples]]:
+    def flush(self) -> tuple[Array, MotionSamples] | None:
         """Return what is held, as if the machine stood still from now on."""
         if self._held is None:
-            return []
+            return None
         out = self._shape(self._held, len(self._held))
         self._held = self._before = None
-        return [out]
+        return out
 
     def _shape(self, held: MotionSamples, ready: int) -> tuple[Array, MotionSamples]:
         before = held.path_mm[:, :1] if self._before is None else self._before
@@ -216,7 +212,7 @@ class _ShaperStream:
         shaped = np.stack(
             [shape(row, self._dt_s, p) for row, p in zip(path, self._pulses, strict=True)]
         )
-        return shaped[:, first : first + ready], _part(held, 0, ready)
+        return shaped[:, first : first + ready], part_of(held, 0, ready)
 
 
 class _Bins:
@@ -280,7 +276,7 @@ class _Views:
             self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
         done = int(at[-1]) + 1
         self._from += done
-        self._waiting = _part(held, done, len(held))
+        self._waiting = part_of(held, done, len(held))
 
     def views(self) -> list[LayerView]:
         numbers = sorted(k for k, v in self._layers.items() if v.count > 1)
@@ -343,6 +339,7 @@ def _figures(contour: Tally, tracking: Tally) -> ErrorFigures:
 def _join(first: MotionSamples, second: MotionSamples) -> MotionSamples:
     return MotionSamples(
         np.hstack([first.path_mm, second.path_mm]),
+        np.hstack([first.executed_mm, second.executed_mm]),
         np.concatenate([first.z_mm, second.z_mm]),
         np.concatenate([first.extruding, second.extruding]),
         np.concatenate([first.line, second.line]),
@@ -351,9 +348,11 @@ def _join(first: MotionSamples, second: MotionSamples) -> MotionSamples:
     )
 
 
-def _part(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
+def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
+    """Return the samples start..stop - 1."""
     return MotionSamples(
         samples.path_mm[:, start:stop],
+        samples.executed_mm[:, start:stop],
         samples.z_mm[start:stop],
         samples.extruding[start:stop],
         samples.line[start:stop],

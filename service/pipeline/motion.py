@@ -170,6 +170,7 @@ class _Part:
         feeds = ((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)) & (travel[:, 3] > 0.0)
         return MotionSamples(
             path_mm=self.samples.xyz_mm[:2],
+            executed_mm=self.samples.xyz_mm[:2],
             z_mm=self.samples.xyz_mm[2],
             extruding=feeds[row],
             line=moves.line[row],

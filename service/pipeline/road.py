@@ -34,7 +34,7 @@ from service.pipeline.compensating import (
     deviation,
 )
 from service.pipeline.files import default_cache_dir, replacing
-from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.measure import Measurement, MotionSamples, part_of
 from service.pipeline.motion import plan_file, simulate_file
 from service.pipeline.options import Options
 from service.pipeline.progress import Progress, ProgressCallback
@@ -192,8 +192,9 @@ class _Job:
         with self._clock.stage("measure"):
             planned, position, row, extruding = as_executed(made, piece.phases, executed)
             last = len(row) - 1
-            samples = _samples(piece, row, planned, extruding)
-            self._measurement.add(_cut(samples, last), position[:2, :last])
+            samples = _samples(piece, row, planned, position, extruding)
+            # The last sample of an item is the first one of the next.
+            self._measurement.add(part_of(samples, 0, last))
         return text
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> bytes:
@@ -241,11 +242,11 @@ class _Job:
         t = DT_S * np.arange(max(n, 1))
         moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
         extruding = moving & (phases.direction[row, 3] > 0.0)
-        samples = _samples(passage, phases.move_index[row], position, extruding)
+        samples = _samples(passage, phases.move_index[row], position, position, extruding)
         self._sum.original_s += total_s
         self._sum.time_s += total_s
         self._sum.extruding_s += float(np.sum(duration[_feeding(phases)]))
-        self._measurement.add(_cut(samples, n))
+        self._measurement.add(part_of(samples, 0, n))
         self._observe(position[:2])
 
     def _observe(self, command: np.ndarray | None) -> None:
@@ -456,28 +457,21 @@ def _feeding(phases: Phases) -> np.ndarray:
 
 
 def _samples(
-    item: Piece | Passage, row: np.ndarray, position: np.ndarray, extruding: np.ndarray
+    item: Piece | Passage,
+    row: np.ndarray,
+    planned: np.ndarray,
+    executed: np.ndarray,
+    extruding: np.ndarray,
 ) -> MotionSamples:
     moves = item.moves
     return MotionSamples(
-        path_mm=position[:2],
-        z_mm=position[2],
+        path_mm=planned[:2],
+        executed_mm=executed[:2],
+        z_mm=planned[2],
         extruding=extruding,
         line=moves.line[row],
         layer=moves.layer[row],
         feature=moves.feature[row],
-    )
-
-
-def _cut(samples: MotionSamples, n: int) -> MotionSamples:
-    """First n samples: the last one of an item is the first one of the next."""
-    return MotionSamples(
-        samples.path_mm[:, :n],
-        samples.z_mm[:n],
-        samples.extruding[:n],
-        samples.line[:n],
-        samples.layer[:n],
-        samples.feature[:n],
     )
 
 
