@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.errors import GcodeError
 from gcode.firmware.klipper.planner import plan_moves
 from gcode.types import EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
 from models.machine import Klipper, Machine
@@ -21,6 +22,9 @@ from models.machine import Klipper, Machine
 __all__ = ["MIN_STREAM_ACCEL_MM_S2", "Passage", "Piece", "Splitter"]
 
 T = TypeVar("T", Moves, Events, Phases)
+
+LONGEST_MOVE_S = 3600.0
+"""A single move that takes longer is taken for a mistake."""
 
 MIN_STREAM_ACCEL_MM_S2 = 30_000.0
 """Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
@@ -137,6 +141,16 @@ class Splitter:
         climb = np.abs(travel[:, 2])
         steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * self._firmware.planner.max_z_accel_mm_s2
         raw |= xy & steep
+        path = np.where(length > 0.0, length, np.abs(travel[:, 3]))
+        lasts_s = path / moves.speed_mm_s
+        if np.any(lasts_s > LONGEST_MOVE_S):
+            row = int(np.argmax(lasts_s))
+            raise GcodeError(
+                f"the move takes {lasts_s[row] / 3600.0:.1f} h at {moves.speed_mm_s[row]:g} mm/s, "
+                f"more than {LONGEST_MOVE_S / 3600.0:g} h; check its F",
+                line=int(moves.line[row]),
+            )
+        raw |= xy & (lasts_s > self._longest_s)
         # Behind an object mark the firmware may jump: that travel runs as the slicer wrote it.
         marks = events.move_index[events.kind == EventKind.OBJECT]
         if self._after_mark:

@@ -84,16 +84,39 @@ class Measurement:
         self._track = {name: _Bins() for name in self._names}
         self._views = _Views(self._names)
         self._fresh = True
+        self._last: MotionSamples | None = None
 
     def add(self, samples: MotionSamples) -> None:
         """Add motion."""
         if len(samples):
+            self._last = part_of(samples, len(samples) - 1, len(samples))
             self._measure(self._shaper.push(samples))
+
+    def stand(self, samples: int) -> Array | None:
+        """Stand still; return the position for every sample, (2, n), if it is known."""
+        if self._last is None or samples == 0:
+            return None
+        last = self._last
+        rows = np.zeros(samples, dtype=np.int64)
+        position = last.path_mm[:, rows]
+        self.add(
+            MotionSamples(
+                path_mm=position,
+                executed_mm=position,
+                z_mm=last.z_mm[rows],
+                extruding=np.zeros(samples, dtype=bool),
+                line=last.line[rows],
+                layer=last.layer[rows],
+                feature=last.feature[rows],
+            )
+        )
+        return position
 
     def jump(self) -> None:
         """Say that the position is lost: the machine stands still when motion goes on."""
         self._measure(self._shaper.flush())
         self._fresh = True
+        self._last = None
 
     def finish(self) -> None:
         """Say that the motion has ended."""

@@ -45,6 +45,8 @@ from service.version import __version__
 __all__ = ["compensate_file", "plan_file", "simulate_file"]
 
 _BLOCK_BYTES = 1 << 17
+_CHUNK = 1 << 17
+_STANDING_S = 2.0
 _EXTRUDING_EXCESS_MM = 5e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
@@ -230,24 +232,38 @@ class _Job:
                 if part is None:
                     self._measurement.jump()
                     self._observe(None)
-                    continue
-                self._measure_passage(passage, *part)
+                elif isinstance(part, Phases):
+                    self._measure_passage(passage, part)
+                else:
+                    self._stand(part)
         return text
 
-    def _measure_passage(self, passage: Passage, phases: Phases, total_s: float) -> None:
-        n = round(total_s / DT_S)
-        position, row = sample_phases(phases, (0.0, DT_S, max(n, 1)))
+    def _measure_passage(self, passage: Passage, phases: Phases) -> None:
         moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
         duration = phases.accel_s + phases.cruise_s + phases.decel_s
-        t = DT_S * np.arange(max(n, 1))
-        moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
-        extruding = moving & (phases.direction[row, 3] > 0.0)
-        samples = _samples(passage, phases.move_index[row], position, position, extruding)
-        self._sum.original_s += total_s
-        self._sum.time_s += total_s
+        motion_s = _duration_s(phases)
+        self._sum.original_s += motion_s
+        self._sum.time_s += motion_s
         self._sum.extruding_s += float(np.sum(duration[_feeding(phases)]))
-        self._measurement.add(part_of(samples, 0, n))
-        self._observe(position[:2])
+        samples = max(round(motion_s / DT_S), 1)
+        for start in range(0, samples, _CHUNK):
+            n = min(_CHUNK, samples - start)
+            position, row = sample_phases(phases, (start * DT_S, DT_S, n))
+            t = DT_S * (start + np.arange(n))
+            moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
+            extruding = moving & (phases.direction[row, 3] > 0.0)
+            at = phases.move_index[row]
+            self._measurement.add(_samples(passage, at, position, position, extruding))
+            self._observe(position[:2])
+
+    def _stand(self, dwell_s: float) -> None:
+        """Let the machine stand where it is."""
+        self._sum.original_s += dwell_s
+        self._sum.time_s += dwell_s
+        # All vibration has died down after a while.
+        stood = self._measurement.stand(round(min(dwell_s, _STANDING_S) / DT_S))
+        if stood is not None:
+            self._observe(stood)
 
     def _observe(self, command: np.ndarray | None) -> None:
         if not self._changes:
@@ -404,31 +420,32 @@ class _Sums:
         self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
 
 
-def plan_passage(passage: Passage, machine: Machine) -> Iterator[tuple[Phases, float] | None]:
+def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float | None]:
     """Plan the moves of a passage between its stops.
 
     Yields
     ------
-    (phases, seconds)
-        A stretch of motion with the dwell behind it; phases start at time 0.
+    Phases
+        Motion from rest to rest, from time 0 on; `move_index` counts within the passage.
+    float
+        Seconds of standing.
     None
         The position becomes unknown here.
     """
     events = passage.events
-    stops = np.flatnonzero(events.kind >= EventKind.STOP)
+    stops = np.flatnonzero((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT))
     done = 0
     for k in [*stops.tolist(), None]:
         end = len(passage.moves) if k is None else int(events.move_index[k])
-        dwell = 0.0 if k is None else float(events.dwell_s[k])
-        if k is not None and events.kind[k] in (EventKind.OBJECT, EventKind.STAMP):
-            continue
         if end > done:
             rows = _move_rows(passage, done, end)
             phases = plan_moves(rows, passage.limits, machine.firmware)
             if len(phases):
-                shifted = phases.move_index - phases.move_index[0] + done
-                yield _renumbered(phases, shifted), _duration_s(phases) + dwell
+                numbers = phases.move_index - phases.move_index[0] + done
+                yield replace(phases, move_index=numbers)
             done = end
+        if k is not None and events.dwell_s[k] > 0.0:
+            yield float(events.dwell_s[k])
         if k is not None and events.kind[k] == EventKind.UNKNOWN:
             yield None
 
@@ -478,7 +495,3 @@ def _samples(
 def _move_rows(passage: Passage, first: int, last: int) -> Moves:
     moves = passage.moves
     return Moves(**{f.name: getattr(moves, f.name)[first:last] for f in fields(moves)})
-
-
-def _renumbered(phases: Phases, move_index: np.ndarray) -> Phases:
-    return replace(phases, move_index=move_index)
