@@ -76,7 +76,7 @@ def test_improves(machine: Machine) -> None:
     path, extruding, rests = strokes()
     plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
     u = made(machine, path[:, 0]).compensate(path, extruding, rests)
-    rms = [np.sqrt(np.mean(contour_error(response(plants, c), path, DT_S) ** 2)) for c in (path, u)]
+    rms = [np.sqrt(np.mean(contour_error(path, response(plants, c), DT_S) ** 2)) for c in (path, u)]
     assert rms[1] < 0.1 * rms[0]
 
 
@@ -112,7 +112,7 @@ def test_state_is_carried_between_pieces(machine: Machine) -> None:
     assert joined.shape == whole.shape
     answers = [response(plants, u) for u in (whole, joined)]
     tail = slice(int(rests[0, 1]), None)
-    errors = [contour_error(y, path, DT_S)[tail] for y in answers]
+    errors = [contour_error(path, y, DT_S)[tail] for y in answers]
     rms = [1e3 * np.sqrt(np.mean(e**2)) for e in errors]
     # One solution plans across the rest, the other not; both know the vibration they start with.
     assert abs(rms[1] - rms[0]) < 1.0
@@ -134,7 +134,7 @@ def test_forgetting_the_state_costs(machine: Machine) -> None:
         command = np.hstack([np.repeat(path[:, :cut:20], 20, axis=1)[:, :-1], u])
         plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
         reference = np.hstack([path[:, :cut][:, :-1], path[:, cut:]])
-        error = contour_error(response(plants, command), reference, DT_S)[cut + 20 :]
+        error = contour_error(reference, response(plants, command), DT_S)[cut + 20 :]
         rms.append(np.sqrt(np.mean(error**2)))
     assert rms[0] < 0.9 * rms[1]
 

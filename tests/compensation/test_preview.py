@@ -204,12 +204,12 @@ def test_figures_of_the_method() -> None:
     """METHOD 3, 45 Hz / .05: contour rms 1.2 um with n = 60, .3 with n = 100, tens without."""
     plant = one_mode()
     path, _ = reference_motion()
-    before = contour_error(response([plant, plant], path), path, DT_S)
+    before = contour_error(path, response([plant, plant], path), DT_S)
     rms = {0: 1e3 * np.sqrt(np.mean(before**2))}
     for n in (60, 100):
         design = PreviewDesign(members(1), n)
         u = np.stack([run(design, row)[: path.shape[1]] for row in path])
-        error = contour_error(response([plant, plant], u), path, DT_S)
+        error = contour_error(path, response([plant, plant], u), DT_S)
         rms[n] = 1e3 * np.sqrt(np.mean(error**2))
     assert rms[0] > 25
     assert rms[60] <= 1.5

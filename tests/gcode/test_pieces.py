@@ -1,0 +1,198 @@
+"""Cutting a file: nothing is lost, and pieces are what may be compensated."""
+
+from __future__ import annotations
+
+import gzip
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcode.pieces import Passage, Piece
+from gcode.types import EventKind
+from models.machine import AxisTravel, Machine
+from models.store import load_machine
+from tests.gcode.cutting import HEAD, cut, pieces_of
+from tests.gcode.prints import made_up_print, polygon
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return load_machine("ender3")
+
+
+def text_of(items: list[Piece | Passage]) -> bytes:
+    return b"".join(item.text for item in items)
+
+
+def check(items: list[Piece | Passage], data: bytes) -> None:
+    assert text_of(items) == data
+    offset = 0
+    for item in items:
+        assert item.text_offset == offset
+        offset += len(item.text)
+        moves, events = item.moves, item.events
+        lines = len(np.unique(moves.line)) + len(events)
+        assert lines == len(item.text.splitlines())
+        if len(events):
+            assert events.move_index.min() >= 0
+            assert events.move_index.max() <= len(moves)
+        if not isinstance(item, Piece):
+            continue
+        travel = moves.end_mm - moves.start_mm
+        xy = np.any(travel[:, :2] != 0, axis=1)
+        assert xy[0]
+        assert xy[-1]
+        assert np.all(moves.known[xy] & 3 == 3)
+        assert len(item.phases) == len(moves)
+        assert not np.any(events.kind >= EventKind.STOP)
+        p = item.phases
+        assert p.start_mm_s[0] == 0
+        assert p.end_mm_s[-1] == 0
+        assert (p.t_s + p.accel_s + p.cruise_s + p.decel_s)[-1] - p.t_s[0] <= 60 + 1e-6
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    seed=st.integers(0, 10**6), wild=st.booleans(), chunk=st.sampled_from([1, 97, 4096, 1 << 17])
+)
+def test_nothing_is_lost(machine: Machine, seed: int, wild: bool, chunk: int) -> None:
+    data = made_up_print(seed, chapters=1, wild=wild)
+    items = cut(data, machine, chunk=chunk)
+    check(items, data)
+    whole = cut(data, machine)
+    kinds = [[(type(i), i.text) for i in x if isinstance(i, Piece)] for x in (items, whole)]
+    assert kinds[0] == kinds[1]
+
+
+@pytest.mark.parametrize("ending", [b"\n", b"\r\n", b""])
+def test_line_ends(machine: Machine, ending: bytes) -> None:
+    text = (HEAD + "G1 X80 E1\nG1 X80 Y80 E1 ; last").encode().replace(b"\n", ending or b"\n")
+    data = text + ending
+    check(cut(data, machine), data)
+
+
+def test_method_none(machine: Machine) -> None:
+    data = made_up_print(4)
+    items = cut(data, machine, compensate=False)
+    assert text_of(items) == data
+    assert not any(isinstance(item, Piece) for item in items)
+
+
+def test_object_marks(machine: Machine) -> None:
+    """A mark ends a piece, and the travel behind it is not ours."""
+    text = HEAD + (
+        "G1 X80 E1\nEXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b\nG1 E-1\n"
+        "G1 X20 Y20 F9000\nG1 E1\nG1 X40 Y20 E1\nG1 X40 Y40 E1\n"
+    )
+    items = cut(text.encode(), machine)
+    check(items, text.encode())
+    pieces = [item.text for item in items if isinstance(item, Piece)]
+    assert pieces[1] == b"G1 X80 E1\n"
+    assert pieces[2] == b"G1 X40 Y20 E1\nG1 X40 Y40 E1\n"
+    assert len(pieces) == 3
+
+
+@pytest.mark.parametrize(
+    "barrier", ["G28", "SOME_MACRO", "T1", "PAUSE", "BED_MESH_CALIBRATE", "G4 P5", "M400"]
+)
+def test_barriers(machine: Machine, barrier: str) -> None:
+    text = HEAD + f"G1 X80 E1\n{barrier}\nG1 X20\nG1 Y20\nG1 X30\nG1 Y30\n"
+    items = cut(text.encode(), machine)
+    check(items, text.encode())
+    for item in items:
+        assert not (isinstance(item, Piece) and barrier.encode() in item.text)
+    known = barrier in ("G28", "G4 P5", "M400")  # this machine says where it homes
+    last = items[-1]
+    assert isinstance(last, Piece)
+    # Behind an unknown position X and Y must both be named before a move is ours.
+    first_line = last.text.split(b"\n", 1)[0]
+    assert first_line == (b"G1 X20" if known else b"G1 X30")
+
+
+def test_positions_unknown_at_the_start(machine: Machine) -> None:
+    data = b"G1 X20\nG1 Y20\nG1 X50\nG1 Y50\n"
+    pieces = pieces_of(data, machine)
+    assert [p.text for p in pieces] == [b"G1 X50\nG1 Y50\n"]
+
+
+def test_relative_moves_keep_unknown(machine: Machine) -> None:
+    assert pieces_of(b"G91\nG1 X20 Y20\nG1 X5\n", machine) == []
+
+
+def test_long_runs_are_cut_at_rests(machine: Machine) -> None:
+    lines = [*HEAD.splitlines(), "G1 X120 Y100 F6000"]
+    for _ in range(40):
+        lines += [*polygon(60, 20), "G1 E-0.8 F2100", "G1 E0.8 F2100"]
+    data = ("\n".join(lines) + "\n").encode()
+    items = cut(data, machine)
+    check(items, data)
+    long = [item for item in items if isinstance(item, Piece)][1:]
+    assert len(long) > 1
+    for piece in long[:-1]:
+        assert len(piece.moves) > 10
+        following = next(i for i in items if i.text_offset > piece.text_offset)
+        assert following.text.startswith(b"G1 E")
+
+
+def test_vase_is_forced_to_stop(machine: Machine) -> None:
+    lines = [*HEAD.splitlines(), "G1 X120 Y100 F6000"]
+    for _ in range(40):
+        lines += polygon(60, 20)
+    data = ("\n".join(lines) + "\n").encode()
+    items = cut(data, machine)
+    check(items, data)
+    long = [item for item in items if isinstance(item, Piece)][1:]
+    assert len(long) > 1
+    # Cut in mid motion, but for that whole; each half is planned to stop (see `check`).
+    assert b"".join(piece.text for piece in long) in data
+
+
+def test_longest_is_kept(machine: Machine) -> None:
+    lines = [*HEAD.splitlines(), "G1 X120 Y100 F6000"]
+    for _ in range(4):
+        lines += polygon(30, 20)
+    items = cut("\n".join(lines).encode(), machine, longest_s=2.0)
+    assert text_of(items) == "\n".join(lines).encode()
+    for item in items:
+        if isinstance(item, Piece):
+            p = item.phases
+            assert (p.t_s + p.accel_s + p.cruise_s + p.decel_s)[-1] - p.t_s[0] <= 2 + 1e-6
+
+
+def test_one_move_longer_than_a_piece(machine: Machine) -> None:
+    text = HEAD + "G1 X20 F30\nG1 X40 F3000\nG1 X41\n"
+    items = cut(text.encode(), machine)
+    assert text_of(items) == text.encode()
+
+
+def test_states_around_items(machine: Machine) -> None:
+    text = HEAD + "M204 S900\nG1 X80 F1800 E1\nG91\nG1 X2\nM204 S700\nG28\nG1 X9\n"
+    items = cut(text.encode(), machine)
+    for before, after in pairwise(items):
+        assert before.modal_after == after.modal_before
+    assert items[-1].limits_before.accel_mm_s2 == 700
+    assert not items[-1].modal_after.absolute_xyz
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("folder", ["own", "third_party"])
+def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) -> None:
+    firmware = machine.firmware.model_copy(
+        update={
+            "extruder": machine.firmware.extruder.model_copy(
+                update={"max_extrude_cross_section_mm2": 1e3, "max_extrude_only_distance_mm": 1e4}
+            )
+        }
+    )
+    travel = {axis: AxisTravel(min_mm=-5000, max_mm=5000) for axis in ("x", "y", "z")}
+    wide = machine.model_copy(update={"firmware": firmware, "travel": travel})
+    skipped = ("hm_arcs", "hm_cnc", "hm_laser")  # what Klipper rejects
+    for path in sorted((shared_dir / "corpus" / folder).glob("*.gz")):
+        if path.name.startswith(skipped):
+            continue
+        data = b"".join(gzip.decompress(path.read_bytes()).splitlines(keepends=True)[:6000])
+        check(cut(data, wide), data)
