@@ -54,6 +54,7 @@ MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
 RATIO = {"ender3": 0.25, "voron-v0": 0.25, "voron-v24-250": 0.5, "annex-k3": 1.0}
 MEMBERS = {"ender3": 0.5, "voron-v0": 0.5, "voron-v24-250": 0.6, "annex-k3": 1.0}
 _TUNE_S = 120.0
+_REASONS = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,11 +311,13 @@ def print_notes(rows: list[Row]) -> None:
     print("\ntuned shapers:")
     for (file, machine), shaper in {(r.file, r.machine): r.shaper for r in rows}.items():
         print(f"  {file:26}{machine:14}{shaper}")
-    reasons = [(row, reason) for row in rows for reason in row.put_back_reasons]
-    if reasons:
+    if any(row.put_back for row in rows):
         print("\npieces put back:")
-    for row, reason in reasons:
-        print(f"  {row.file} {row.machine} {row.tolerance_um:g} um, {reason}")
+    for row in rows:
+        for reason in row.put_back_reasons[:_REASONS]:
+            print(f"  {row.file} {row.machine} {row.tolerance_um:g} um, {reason}")
+        if len(row.put_back_reasons) > _REASONS:
+            print(f"  ... and {len(row.put_back_reasons) - _REASONS} more")
     print()
 
 

@@ -55,6 +55,7 @@ _CONTOUR_EVERY, _MEMBER_EVERY = 20, 4
 _BLOCK = 200_000
 _READ_BYTES = 1 << 20
 _SAME_MM, _SAME_E_MM = 1e-4, 5e-3
+_LOST = 3
 _SHAPER_REACH_S = 0.15
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
 
@@ -389,17 +390,20 @@ def _match(original: Motion, written: Motion) -> tuple[tuple[Ints, Ints], tuple[
     ends_o = original.end_mm[original.phases.move_index[theirs[1]]]
     if len(ends_w) == len(ends_o) and bool(np.all(_same(ends_w, ends_o))):
         return theirs, ours
-    firsts, lasts = [], []
-    at = 0
+    pairs: list[tuple[int, int, int, int]] = []
+    at, first = 0, 0
     for k, place in enumerate(ends_o):
         row = _next_match(ends_w, place, at)
         if row is None:
-            line = int(original.line[original.phases.move_index[theirs[1][k]]])
-            raise ReadBackError(f"the written file never comes to {place} (line {line})")
-        firsts.append(int(ours[0][at]))
-        lasts.append(int(ours[1][row]))
-        at = row + 1
-    return theirs, (np.array(firsts), np.array(lasts))
+            # The written file does not rest here: this stretch and the next are one.
+            if k - first >= _LOST or k == len(ends_o) - 1:
+                line = int(original.line[original.phases.move_index[theirs[1][k]]])
+                raise ReadBackError(f"the written file never comes to {place} (line {line})")
+            continue
+        pairs.append((theirs[0][first], theirs[1][k], ours[0][at], ours[1][row]))
+        at, first = row + 1, k + 1
+    rows = np.array(pairs, dtype=np.int64).T
+    return (rows[0], rows[1]), (rows[2], rows[3])
 
 
 def _next_match(places: Array, wanted: Array, start: int) -> int | None:
