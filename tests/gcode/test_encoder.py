@@ -43,7 +43,7 @@ SPIKES = pytest.mark.xfail(
     reason="the one increment with which the command stops or starts at a rest breaks the "
     "acceleration limit on every rung, also on the gentlest: the piece is put back",
 )
-FAILING = ("hop", "hop and retraction", "wipe")
+FAILING = ("wipe",)
 CASES = [pytest.param(n, marks=SPIKES if n in FAILING else ()) for n in BODIES]
 
 
