@@ -39,10 +39,17 @@ LADDER = (
 
 REST_FUNCTIONS = 60
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
+EDGE_PRICES = (3.0, 12.0, 50.0, 200.0)
+"""Prices of the increments at the edges of rests, relative to others, tried in this order: dear
+edges make soft stops, and soft stops before a Z move take time."""
+EDGE_SAMPLES = 4
 WEIGHT_TRAVEL = 0.3
 WEIGHT_REST = 0.05
 ACCEL_RATIO = 2.0
 """The command may ask for at most this multiple of the planned path's own peak acceleration."""
+RMS_RATIO = 1.5
+"""The same for the rms acceleration, as long as that costs no functions."""
+GENTLE_RUNG = 3
 
 
 class PreviewFbf:
@@ -133,15 +140,21 @@ class PreviewFbf:
             weight[a:b] = WEIGHT_REST
         ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
         stops = np.concatenate([ends[:1], rests, ends[1:]])
-        ceiling = self._limits.accel_mm_s2
-        path_accel = _peak(np.diff(y_d_mm, 2)) / self._dt_s**2
-        accel_limit = min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
+        accel_limit = self.accel_limit_mm_s2(y_d_mm)
+        bend = np.diff(y_d_mm, 2) / self._dt_s**2
+        rms_limit = RMS_RATIO * float(np.sqrt(np.max(np.mean(bend**2, axis=1), initial=0.0)))
         return np.stack(
             [
-                self._ladder(axis, y_d_mm[i], weight, stops, accel_limit)
+                self._ladder(axis, y_d_mm[i], weight, stops, accel_limit, rms_limit)
                 for i, axis in enumerate(self._axes)
             ]
         )
+
+    def accel_limit_mm_s2(self, y_d_mm: NDArray[np.float64]) -> float:
+        """Acceleration that the command of a path (2, n) may ask for."""
+        ceiling = self._limits.accel_mm_s2
+        path_accel = _peak(np.diff(y_d_mm, 2)) / self._dt_s**2
+        return min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
 
     def _ladder(
         self,
@@ -150,15 +163,36 @@ class PreviewFbf:
         weight: NDArray[np.float64],
         stops: NDArray[np.int64],
         accel_limit: float,
+        rms_limit: float,
     ) -> NDArray[np.float64]:
         dt = self._dt_s
-        for rung in range(axis.rung, len(LADDER)):
-            command = axis.command(rung, path, weight, stops)
-            accel = _peak(np.diff(command, 2)) / dt**2
-            if accel <= accel_limit and _peak(np.diff(command)) / dt <= self._limits.velocity_mm_s:
-                # The next piece starts here, or one rung higher where there was room to spare.
-                axis.next_rung = max(0, rung - 1) if accel < 0.6 * accel_limit else rung
+        edges = stops[stops > 0]
+        rung, edge_price = axis.rung, EDGE_PRICES[0]
+        while rung < len(LADDER):
+            command = axis.command(rung, path, weight, stops, edge_price)
+            # The piece starts from a stand and ends in one.
+            standing = np.concatenate([command[:1], command, command[-1:]])
+            accels = np.abs(np.diff(standing, 2)) / dt**2
+            accel = _peak(accels)
+            fast = _peak(np.diff(command)) / dt > self._limits.velocity_mm_s
+            rms = float(np.sqrt(np.mean(accels**2)))
+            rough = rms > rms_limit and rung < GENTLE_RUNG
+            if accel <= accel_limit and not fast and not rough:
+                # The next piece starts here, or higher where there was room to spare.
+                roomy = accel < 0.6 * accel_limit and rms < 0.75 * rms_limit
+                axis.next_rung = max(0, rung - 1) if roomy else rung
                 return command
+            # Stopping and starting at a rest is a matter of its own price, not of the bandwidth.
+            hardest = int(np.argmax(accels))
+            dearer = [p for p in EDGE_PRICES if p > edge_price]
+            if (
+                accel > accel_limit
+                and dearer
+                and np.min(np.abs(edges - hardest), initial=len(path)) <= EDGE_SAMPLES
+            ):
+                edge_price = dearer[0]
+            else:
+                rung += 1
         raise DesignError(
             f"axis {axis.name}: even the gentlest design breaks the machine's command limits "
             f"({accel_limit:.0f} mm/s2, {self._limits.velocity_mm_s:.0f} mm/s)"
@@ -220,6 +254,7 @@ class _Axis:
         path: NDArray[np.float64],
         weight: NDArray[np.float64],
         stops: NDArray[np.int64],
+        edge_price: float,
     ) -> NDArray[np.float64]:
         design, resting_design = self.design(rung), self.design(rung, REST_FUNCTIONS)
         n, window, update = len(path), self.window, self.update
@@ -257,6 +292,7 @@ class _Axis:
                     padded[start : start + window],
                     weights[start : start + window],
                     stops[near] - start,
+                    edge_price,
                 )[:update]
                 u[start : start + update] = committed
                 z = _advanced(design, z, committed)

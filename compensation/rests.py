@@ -19,8 +19,6 @@ __all__ = ["EFFORT_PRICE", "solve_window"]
 
 EFFORT_PRICE = 0.5
 """Price of squared increments (mm/sample^2)^2 against squared error mm^2."""
-EDGE_PRICE = 3.0
-"""How much more the one increment costs with which the command stops or starts."""
 
 
 def solve_window(
@@ -29,6 +27,7 @@ def solve_window(
     path_mm: NDArray[np.float64],
     weight: NDArray[np.float64],
     rests: NDArray[np.int64],
+    edge_price: float,
 ) -> NDArray[np.float64]:
     """Command of one window that stands still over the given rests.
 
@@ -42,6 +41,8 @@ def solve_window(
         Planned positions and the weight of their errors.
     rests : ndarray of int64, shape (k, 2)
         Ranges [a, b) of samples, relative to the window, in which u(i) = u(i - 1) = path(i - 1).
+    edge_price : float
+        How much more the increments cost with which the command stops and starts.
 
     Returns
     -------
@@ -64,8 +65,8 @@ def solve_window(
     for k in edges:
         # The price of the untied functions keeps the matrix definite when a rest leaves few
         # samples; where the command stops or starts, acceleration costs more.
-        normal += EDGE_PRICE * price * np.outer(tied[k], tied[k])
-        right -= EDGE_PRICE * price * offset[k] * tied[k]
+        normal += edge_price * price * np.outer(tied[k], tied[k])
+        right -= edge_price * price * offset[k] * tied[k]
     first = 0
     for member, filtered in zip(design.members, design.filtered, strict=True):
         states = len(member.plant.b)

@@ -43,6 +43,7 @@ def fit_stretch(
     loose: float,
     tolerance_z: float,
     tolerance_e: float,
+    step: float,
     grid: float,
     dt_s: float,
     start_s: float,
@@ -68,7 +69,8 @@ def fit_stretch(
     small. That answer is direct e + sum of Re(weight x), x <- pole x + e, per axis; `ramp`,
     `ramp_state`, `tail` and `norm` are what it is for a triangular error
     (`gcode.segments.ErrorFilter`); `states` carries x and is updated in place.
-    Vertices in X and Y lie on multiples of `grid`. Returns the number of segments.
+    Vertices in X and Y lie on multiples of `grid`. A segment is cut short where the speed of an
+    axis would step by more than `step`, as far as one sample allows. Returns their number.
     """
     order = pole.shape[1]
     longest = ramp.shape[1] - 1
@@ -82,6 +84,7 @@ def fit_stretch(
     trial = np.empty((2, order), np.complex128)
     origin = begin.copy()
     origin_s = start_s
+    speed = np.zeros(2)
     k = first
     count = 0
     while k <= last:
@@ -94,6 +97,12 @@ def fit_stretch(
         while j <= last:
             span = j * dt_s - origin_s
             dx, dy = position[0, j] - origin[0], position[1, j] - origin[1]
+            if j > k:
+                # The speed may not step too far, neither into the segment nor into the stop.
+                if abs(dx / span - speed[0]) > step or abs(dy / span - speed[1]) > step:
+                    break
+                if j == last and max(abs(dx), abs(dy)) > step * span:
+                    break
             value[0] = cx * dx + cy * dy
             value[1] = cx * dy - cy * dx
             value[2] = position[2, j] - origin[2]
@@ -175,6 +184,7 @@ def fit_stretch(
                     states[axis, r] += shift * ramp_state[axis, samples, r]
         for i in range(4):
             origin[i] = position[i, last] if end == last else origin[i] + slope[i] * span
+        speed[:] = slope[:2]
         origin_s = end * dt_s
         out_t[count] = origin_s
         for i in range(4):

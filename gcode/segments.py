@@ -24,11 +24,12 @@ __all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
 
 ALONG_SHARE = 0.8
 LOOSE_MM = 0.3e-3
+FULL_GAIN = 5.0
 Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 1e-3
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
-END_EXCESS_MM = 3e-3
+END_EXCESS_MM = 1.5e-3
 _LONGEST = 64
 
 
@@ -65,6 +66,7 @@ class ErrorFilter:
 
     Notes
     -----
+    `share` is how much of the tolerance is used: all of it up to a resonance of `FULL_GAIN`.
     The answer to an error e is direct e + sum of Re(weight x) with x <- pole x + e. For a
     triangular error that rises over m samples and falls over m - 1, `ramp[:, m]` is the answer
     while it rises, `ramp_state[:, m]` the state at its peak, `tail[:, m]` weighs a state at the
@@ -89,6 +91,14 @@ class ErrorFilter:
             if len(form) or plant.order == 0:
                 self.direct[i] = plant.d
             self._triangles(i)
+        self.share = float(np.clip(FULL_GAIN / self._peak_gain(), 0.5, 1.0))
+
+    def _peak_gain(self) -> float:
+        """Largest answer of an axis to a sine below a quarter of the sampling rate."""
+        z = np.exp(1j * np.linspace(0.0, 0.5 * np.pi, 2001))[:, None]
+        pole, weight = self.pole[:, None], self.weight[:, None]
+        sums = weight / (z - pole) + weight.conj() / (z - pole.conj())
+        return float(np.max(np.abs(self.direct[:, None] + 0.5 * sums.sum(axis=2))))
 
     def _triangles(self, i: int) -> None:
         pole, weight, direct = self.pole[i], self.weight[i], self.direct[i]
@@ -122,6 +132,7 @@ def fit_segments(
     tolerance_mm: float,
     error_filter: ErrorFilter,
     *,
+    step_mm_s: float = np.inf,
     grid_mm: float = 1e-3,
     minimum_s: float = 0.5e-3,
 ) -> Segments:
@@ -137,6 +148,8 @@ def fit_segments(
         Largest distance in X Y between command and fit.
     error_filter : ErrorFilter
         The machine's answer to the error.
+    step_mm_s : float
+        Segments are cut short where the speed of an axis would step by more.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
     minimum_s : float
@@ -166,11 +179,12 @@ def fit_segments(
         n = fit_stretch(
             command_mm,
             direction,
-            ALONG_SHARE * tolerance_mm,
-            across_tolerance_mm(tolerance_mm),
+            ALONG_SHARE * error_filter.share * tolerance_mm,
+            error_filter.share * across_tolerance_mm(tolerance_mm),
             LOOSE_MM,
             Z_TOLERANCE_MM,
             E_TOLERANCE_MM,
+            step_mm_s,
             grid_mm,
             dt,
             start,

@@ -133,8 +133,8 @@ def build_timeline(
             first = int(np.ceil(now / dt_s - _GRID_EPS)) + 1
             # A sample just behind the end of the rest has no time to get anywhere.
             last = int(np.floor(end[i] / dt_s + 0.5)) + 1
-            if last > first:
-                rests.append((first, last))
+            # However short: the command must be on the path when the rest's own line comes.
+            rests.append((first, max(last, first + 1)))
             now = end[i]
         else:
             start[i] = now + lead_s

@@ -99,14 +99,16 @@ def compensate(
     method: Annotated[str, typer.Option(help=_METHODS)] = "fbf",
     basis: Annotated[str, typer.Option(help="Basis of fbf: ce-opt or bspline.")] = "ce-opt",
     tolerance_um: Annotated[
-        float, typer.Option(help="How far the written path may be from the computed one.")
-    ] = 5.0,
+        float | None,
+        typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
+    ] = None,
     report: ReportOption = None,
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
         raise _Refused("give either -o OUT or --in-place")
-    options = _options(method=method, basis=basis, tolerance_um=tolerance_um)
+    chosen = {"method": method, "basis": basis, "tolerance_um": tolerance_um}
+    options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
     target = _check_output(output or source)
     _check_folder(report)

@@ -18,7 +18,7 @@ from service.api.uploads import receive_upload
 from service.jobs.state import Job, JobState
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
-from service.pipeline.options import Options
+from service.pipeline.options import DEFAULT_TOLERANCE_UM, Options
 from service.settings import Settings
 
 __all__ = ["router"]
@@ -80,7 +80,7 @@ async def create_job(
             allow_inf_nan=False,
             description="How far the written path may be from the computed one.",
         ),
-    ] = 5.0,
+    ] = DEFAULT_TOLERANCE_UM,
     name: Annotated[
         str, Query(max_length=255, description="File name, for a raw body.")
     ] = "upload.gcode",

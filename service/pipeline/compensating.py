@@ -28,6 +28,7 @@ DT_S = 1e-3
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 _GRID_MM = 1e-3
+MIN_STEP_MM_S = 5.0
 
 
 class Unfit(ValueError):
@@ -124,8 +125,18 @@ class PieceCompensator:
         """Segments and moves; finer where a motor's speed would step too far."""
         limit = self._machine.command.speed_step_mm_s
         tolerance = self._tolerance_mm
+        # No step of speed larger than what the command itself asks for within a sample.
+        bend = np.diff(command[:2], 2)
+        step_mm_s = max(float(np.max(np.abs(bend), initial=0.0)) / timeline.dt_s, MIN_STEP_MM_S)
         for _ in range(3):
-            segments = fit_segments(timeline, command, tolerance, self._filter, grid_mm=_GRID_MM)
+            segments = fit_segments(
+                timeline,
+                command,
+                tolerance,
+                self._filter,
+                step_mm_s=step_mm_s,
+                grid_mm=_GRID_MM,
+            )
             encoded = self.encoder.encode(piece, timeline, segments)
             step = self._speed_step(encoded.phases)
             if step <= limit:

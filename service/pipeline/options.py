@@ -6,7 +6,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["Options"]
+__all__ = ["DEFAULT_TOLERANCE_UM", "Options"]
+
+DEFAULT_TOLERANCE_UM = 2.0
 
 
 class Options(BaseModel):
@@ -21,4 +23,4 @@ class Options(BaseModel):
         str, Field(pattern=r"^(fbf|zpetc|none|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$")
     ] = "fbf"
     basis: Literal["ce-opt", "bspline"] = "ce-opt"
-    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = 5.0
+    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

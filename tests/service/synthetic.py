@@ -47,7 +47,7 @@ def make_result(
         machine="ender3",
         machine_title="Creality Ender 3",
         machine_revision="e3f4ce4e15d5",
-        settings={"method": "fbf", "basis": "ce-opt", "tolerance_um": 5.0},
+        settings={"method": "fbf", "basis": "ce-opt", "tolerance_um": 2.0},
         source_name="gear <24 teeth> & hub.gcode",
         channels=[
             Channel(

@@ -75,7 +75,7 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
     job = until(client, where, over)
     assert job["state"] == "done"
     assert job["progress"] == 1.0
-    assert job["options"] == {"method": "fbf", "basis": "ce-opt", "tolerance_um": 5.0}
+    assert job["options"] == {"method": "fbf", "basis": "ce-opt", "tolerance_um": 2.0}
     result = client.get(job["links"]["result"])
     assert result.content == b"; compensated\nG1 X1\n"
     assert 'filename="gear.stillpath.gcode"' in result.headers["content-disposition"]

@@ -74,7 +74,7 @@ def test_compensate_writes_file_report_and_table(road, source, tmp_path, capsys)
     assert code == 0
     assert out.read_bytes() == b"; compensated\n" + TEXT
     assert sorted(path.name for path in report.iterdir()) == ["report.html", "report.json"]
-    assert (road.machine, road.options.method, road.options.tolerance_um) == ("ender3", "fbf", 5.0)
+    assert (road.machine, road.options.method, road.options.tolerance_um) == ("ender3", "fbf", 2.0)
     shown = capsys.readouterr().out
     assert "contour rms, extruding" in shown
     assert "put back" in shown

@@ -31,7 +31,7 @@ STREAM_CORNER_MM_S = 500.0
 
 _UNITS_PER_MM = 1e6
 _PASSES = 4
-_TIME_TOLERANCE_S = 10e-6
+_TIME_TOLERANCE_S = 2e-6
 
 
 @dataclass(frozen=True, slots=True)
