@@ -39,7 +39,7 @@ LADDER = (
 
 REST_FUNCTIONS = 60
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
-EDGE_PRICES = (3.0, 12.0, 50.0, 200.0)
+EDGE_PRICES = (3.0, 12.0, 50.0, 200.0, 1000.0)
 """Prices of the increments at the edges of rests, relative to others, tried in this order: dear
 edges make soft stops, and soft stops before a Z move take time."""
 EDGE_SAMPLES = 4
@@ -168,13 +168,15 @@ class PreviewFbf:
         dt = self._dt_s
         edges = stops[stops > 0]
         rung, edge_price = axis.rung, EDGE_PRICES[0]
+        accel = speed = 0.0
         while rung < len(LADDER):
             command = axis.command(rung, path, weight, stops, edge_price)
             # The piece starts from a stand and ends in one.
             standing = np.concatenate([command[:1], command, command[-1:]])
             accels = np.abs(np.diff(standing, 2)) / dt**2
             accel = _peak(accels)
-            fast = _peak(np.diff(command)) / dt > self._limits.velocity_mm_s
+            speed = _peak(np.diff(command)) / dt
+            fast = speed > self._limits.velocity_mm_s
             rms = float(np.sqrt(np.mean(accels**2)))
             rough = rms > rms_limit and rung < GENTLE_RUNG
             if accel <= accel_limit and not fast and not rough:
@@ -194,8 +196,9 @@ class PreviewFbf:
             else:
                 rung += 1
         raise DesignError(
-            f"axis {axis.name}: even the gentlest design breaks the machine's command limits "
-            f"({accel_limit:.0f} mm/s2, {self._limits.velocity_mm_s:.0f} mm/s)"
+            f"axis {axis.name}: even the gentlest design asks for {accel:.0f} mm/s2 and "
+            f"{speed:.0f} mm/s; allowed are {accel_limit:.0f} mm/s2 and "
+            f"{self._limits.velocity_mm_s:.0f} mm/s (command limits of the machine)"
         )
 
 

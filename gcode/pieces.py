@@ -132,6 +132,17 @@ class Splitter:
         held = self._text_offset + len(self._text)
         self._text += block.text[held - block.text_offset :]
 
+    def _barriers(self, events: Events) -> NDArray[np.bool_]:
+        """Mark the lines that end a piece: stops, and a G92 of more than E."""
+        found = events.kind >= EventKind.STOP
+        for k in np.flatnonzero(events.kind == EventKind.MODE):
+            first = int(events.byte_start[k]) - self._text_offset
+            line = self._text[first : int(events.byte_end[k]) - self._text_offset].upper()
+            if b"G92" in line:
+                code = line.split(b";", 1)[0]
+                found[k] |= any(axis in code for axis in (b"X", b"Y", b"Z")) or b"E" not in code
+        return found
+
     def _raw_moves(self, moves: Moves, events: Events) -> NDArray[np.bool_]:
         """Mark the moves of X or Y that must keep their lines."""
         travel = moves.end_mm - moves.start_mm
@@ -180,7 +191,7 @@ class Splitter:
             if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
                 yield self._take(int(moves.byte_start[head]))
                 continue
-            barriers = events.move_index[(events.kind >= EventKind.STOP)]
+            barriers = events.move_index[self._barriers(events)]
             stops = np.concatenate([barriers[barriers > 0], np.flatnonzero(self._raw), [count]])
             end = int(stops.min())
             closed = final or len(stops) > 1

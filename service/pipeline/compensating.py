@@ -111,6 +111,7 @@ class PieceCompensator:
             extruding = timeline.moving & feeds[timeline.row]
             command = timeline.position_mm.copy()
             command[:2] = self.compensator.compensate(command[:2], extruding, timeline.rests)
+            _retract_along(command, timeline, phases)
             self._check_travel(command)
             segments, encoded = self._fit(piece, timeline, command)
             change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
@@ -162,6 +163,26 @@ class PieceCompensator:
                     f"the command would take {axis} to {low if low < travel.min_mm else high:.3f} "
                     f"mm, outside {travel.min_mm:g} to {travel.max_mm:g} mm"
                 )
+
+
+def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Phases) -> None:
+    """Spread the filament that wipes pull back evenly over the command's path, in place.
+
+    Klipper limits such moves by E per mm of X Y. The command stands where the plan creeps and the
+    other way round; filament at the plan's times would then need impossible accelerations.
+    """
+    direction = phases.direction
+    wipes = (direction[:, 3] < 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    inside = wipes[timeline.row] & timeline.moving
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
+    last = command.shape[1] - 1
+    for first, end in edges.reshape(-1, 2):
+        span = slice(max(first - 1, 0), min(end, last) + 1)
+        step = np.sqrt(np.sum(np.diff(command[:2, span]) ** 2, axis=0))
+        way = np.concatenate([[0.0], np.cumsum(step)])
+        if way[-1] > 0.0:
+            e = command[3, span]
+            command[3, span] = e[0] + (e[-1] - e[0]) * way / way[-1]
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:

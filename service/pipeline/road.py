@@ -47,10 +47,10 @@ __all__ = ["compensate_file", "plan_file", "simulate_file"]
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
 _STANDING_S = 2.0
-_EXTRUDING_EXCESS_MM = 5e-3
+_EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
-_TIME_EXCESS_S = 1e-3
+_TIME_EXCESS_S = 20e-3
 _FILAMENT_MM = 1e-4
 
 

@@ -176,7 +176,17 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
     buffer, line_end = np.empty(n * 96 + 16, np.uint8), np.empty(n, np.int64)
     nothing = np.zeros(n + 1, bool)
     size = format_moves(
-        position, begin, nothing[:n], nothing, feedrate, extrude, speed, origin, buffer, line_end
+        position,
+        begin,
+        nothing[:n],
+        nothing,
+        feedrate,
+        extrude,
+        speed,
+        origin,
+        buffer,
+        line_end,
+        np.empty(n),
     )
     text = buffer[:size].tobytes()
     assert line_end[-1] == size

@@ -154,11 +154,6 @@ def test_absolute_filament(road: Road) -> None:
     check(road, text + "G1 Y50 E3 F3000\nM400\nG1 X20 Y20 E4\nG1 E3.2\n")
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="G92 E in mid motion under M82 lands where the stream's filament is not the file's: "
-    "later absolute E is off by what lies between (microns of filament, adding up)",
-)
 def test_g92_e_in_mid_motion(road: Road) -> None:
     text = HEAD + "M82\nG92 E0\nG1 X120 Y100 F6000\n"
     turn, e = [], 0.0
@@ -174,11 +169,6 @@ def test_g92_e_in_mid_motion(road: Road) -> None:
     assert differences(original, road(original), road.machine) == []
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="a move of no length (G1 X120 Y100 F6000 at X120 Y100) is written as it came in the "
-    "middle of the stream, where the command stands elsewhere: it jumps, the piece is put back",
-)
 def test_move_of_no_length_in_mid_motion(road: Road) -> None:
     check(road, HEAD + ROUND + ROUND + "M400\nG1 X10 F3000\n")
 

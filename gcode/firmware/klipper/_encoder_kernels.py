@@ -212,13 +212,14 @@ def format_moves(
     origin: NDArray[np.int64],
     buffer: NDArray[np.uint8],
     line_end: NDArray[np.int64],
+    extruded: NDArray[np.float64],
 ) -> int:
     """Write one G1 line per move of ours; moves with `fixed` set are left out.
 
     `position` (n, 4) and `begin` (4,) are in 1e-6 mm; `origin` (n, 3) is where the G-code's zero
     lies. `fresh[i]` says that the modal feedrate is not ours before move i. Extruder values are
     relative and rounded to 1e-5 mm so that the sum never drifts. `line_end[i]` is where the text
-    of move i ends.
+    of move i ends, `extruded[i]` the extruder's position [mm] behind it as written.
     """
     at = 0
     previous = begin.copy()
@@ -229,6 +230,7 @@ def format_moves(
             previous[:] = position[i]
             last_f = -1.0
             line_end[i] = at
+            extruded[i] = 1e-6 * position[i, 3] - 1e-5 * rounding * extrude_factor[i]
             continue
         if fresh[i]:
             last_f = -1.0
@@ -257,4 +259,5 @@ def format_moves(
         at += 1
         previous[:] = position[i]
         line_end[i] = at
+        extruded[i] = 1e-6 * position[i, 3] - 1e-5 * rounding * extrude_factor[i]
     return at

@@ -23,6 +23,11 @@ __all__ = ["KlipperWriter"]
 _BYTES_PER_LINE = 96
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?G[01](?![0-9])", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
+_SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
+_POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")
+_EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)")
+_E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)", re.IGNORECASE)
+_LEAST_GAP_MM = 1e-7
 _STOP = b"G4 P0 ; stand still\n"
 
 
@@ -97,7 +102,7 @@ class KlipperWriter:
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = self._modes(piece, index)
-        text, line_end = self._format(encoded, modes, index, events.kind)
+        text, line_end, extruded = self._format(encoded, modes, index, events.kind)
 
         rest_rows = np.flatnonzero(rows >= 0)
         stops: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
@@ -110,7 +115,8 @@ class KlipperWriter:
                 parts += [self._our_modes(modes.at(at - 1)), text[done:upto]]
                 done = upto
             if kind == 0:
-                parts.append(self._event(piece, what))
+                written = extruded[at - 1] if at else float(piece.moves.start_mm[0, 3])
+                parts.append(self._event(piece, what, float(written)))
             elif int(piece.moves.line[what]) != last_line:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what))
@@ -145,7 +151,7 @@ class KlipperWriter:
 
     def _format(
         self, encoded: Encoded, modes: _Modes, index: NDArray[np.int64], kinds: NDArray[np.int8]
-    ) -> tuple[bytes, NDArray[np.int64]]:
+    ) -> tuple[bytes, NDArray[np.int64], NDArray[np.float64]]:
         n = len(encoded.row)
         fresh = np.zeros(n + 1, dtype=bool)
         fresh[index[kinds == EventKind.MODE]] = True
@@ -153,7 +159,7 @@ class KlipperWriter:
         lengths = np.diff(np.append(modes.first, n))
         states = modes.states
         buffer = np.empty(n * _BYTES_PER_LINE + 16, np.uint8)
-        line_end = np.empty(n, np.int64)
+        line_end, extruded = np.empty(n, np.int64), np.empty(n)
         size = format_moves(
             encoded.position,
             encoded.begin,
@@ -165,26 +171,33 @@ class KlipperWriter:
             np.repeat([_integer_origin(m) for m in states], lengths, axis=0),
             buffer,
             line_end,
+            extruded,
         )
-        return buffer[:size].tobytes(), line_end
+        return buffer[:size].tobytes(), line_end, extruded
 
-    def _event(self, piece: Piece, k: int) -> bytes:
+    def _event(self, piece: Piece, k: int, extruded_mm: float) -> bytes:
+        """Text of event k of a piece; `extruded_mm` is where the extruder stands as written."""
         events = piece.events
         line = piece.line_text(int(events.byte_start[k]), int(events.byte_end[k]))
         if events.kind[k] == EventKind.LIMITS:
-            return b"; stillpath, held back: " + line
-        if events.kind[k] == EventKind.MODE and self._modal is not None:
-            state = piece.modal[int(events.modal_id[k])]
-            text = line.upper()
-            lead = b""
-            if b"G92" in text:
-                lead = self._file_modes(state)
-            # Only what the line itself says changes: our own modes differ from the file's.
-            if re.match(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)", text):
-                self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
-            elif re.match(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)", text):
-                self._modal = replace(self._modal, absolute_e=state.absolute_e)
-            return lead + line
+            return _held_back(line)
+        if events.kind[k] != EventKind.MODE or self._modal is None:
+            return line
+        state = piece.modal[int(events.modal_id[k])]
+        code = line.split(b";", 1)[0].upper()
+        if _MOVE.match(code):
+            # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
+            return _held_back(line) if re.search(rb"[XYZE]", code) else line
+        if _SET_POSITION.match(code) and state.absolute_e:
+            row = min(int(events.move_index[k]), len(piece.moves) - 1)
+            planned = float(piece.moves.start_mm[row, 3])
+            gap = (extruded_mm - planned) / state.extrude_factor
+            return self._file_modes(state) + _shifted_e(line, gap)
+        # Only what the line itself says changes: our own modes differ from the file's.
+        if _POSITIONING.match(code):
+            self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
+        elif _EXTRUSION.match(code):
+            self._modal = replace(self._modal, absolute_e=state.absolute_e)
         return line
 
     def _rest_line(self, piece: Piece, row: int) -> bytes:
@@ -279,6 +292,20 @@ class KlipperWriter:
                 f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
             ).encode()
         return text + b"".join(self._shaper_lines)
+
+
+def _held_back(line: bytes) -> bytes:
+    return b"; stillpath, held back: " + line
+
+
+def _shifted_e(line: bytes, gap_mm: float) -> bytes:
+    """Return a G92 line whose E is larger by `gap_mm`: the extruder is that far ahead."""
+    code, mark, comment = line.partition(b";")
+    word = _E_WORD.search(code)
+    if word is None or abs(gap_mm) < _LEAST_GAP_MM:
+        return line
+    value = f"E{float(word.group(1)) + gap_mm:.7f}".encode()
+    return code[: word.start()] + value + code[word.end() :] + mark + comment
 
 
 def _limits_line(limits: Limits) -> bytes:
