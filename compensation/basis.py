@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
 
 from compensation.base import DesignError
 
@@ -58,6 +57,8 @@ def bspline_basis(gram: NDArray[np.float64], n: int, degree: int = 3) -> NDArray
         Degree of the splines in v; the command itself is two degrees smoother.
     """
     window = len(gram)
+    from scipy.interpolate import BSpline  # half a second to import, seldom needed
+
     _check(n, window)
     if n <= degree:
         raise DesignError(f"n = {n} B-splines of degree {degree}: take at least {degree + 1}")

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from compensation._preview_kernels import advance_state, run_windows
 from compensation.base import DesignError
-from compensation.preview import LiftedPlant, PreviewDesign, lifted_plant
+from compensation.basis import ce_opt_basis
+from compensation.preview import LiftedPlant, PreviewDesign, lifted_gram, lifted_plant
 from compensation.rests import solve_window
 from models.machine import Machine
 from models.plants import DiscretePlant, plant_set
@@ -37,7 +38,7 @@ LADDER = (
 )
 """Designs from the most accurate to the gentlest."""
 
-REST_FUNCTIONS = 60
+REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
 EDGE_PRICES = (3.0, 12.0, 50.0, 200.0, 1000.0)
 """Prices of the increments at the edges of rests, relative to others, tried in this order: dear
@@ -213,6 +214,10 @@ class _Axis:
         self._basis = basis
         self._lifted: Sequence[LiftedPlant] = [lifted_plant(plant, 1.0, window, update)]
         self._designs: dict[tuple[int, float], PreviewDesign] = {}
+        # The optimal functions are nested: those for n are the first n of those for more.
+        self._nested = None
+        if basis == "ce-opt":
+            self._nested = ce_opt_basis(lifted_gram(self._lifted), max(r.n for r in LADDER))
         self._plants = [plant]
         self.reset(0.0)
 
@@ -220,7 +225,9 @@ class _Axis:
         step = LADDER[rung]
         n = max(4, round(min(step.n, most) * self.window / 300))
         if (n, step.price) not in self._designs:
-            self._designs[n, step.price] = PreviewDesign(self._lifted, n, self._basis, step.price)
+            self._designs[n, step.price] = PreviewDesign(
+                self._lifted, n, self._basis, step.price, self._nested
+            )
         return self._designs[n, step.price]
 
     def reset(self, position: float) -> None:

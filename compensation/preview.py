@@ -25,7 +25,7 @@ from compensation.base import DesignError
 from compensation.basis import BASES
 from models.plants import DiscretePlant
 
-__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "lifted_plant"]
+__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "lifted_gram", "lifted_plant"]
 
 MAX_SPECTRAL_RADIUS = 0.9
 MAX_CONDITION = 1e10
@@ -88,6 +88,15 @@ def lifted_plant(plant: DiscretePlant, weight: float, window: int, update: int) 
     )
 
 
+def lifted_gram(members: Sequence[LiftedPlant]) -> NDArray[np.float64]:
+    """Weighted sum of G_a' G_a over the members, shape (window, window)."""
+    window = len(members[0].from_state)
+    return sum(
+        (m.weight * (m.integrated.T @ m.integrated) for m in members),
+        np.zeros((window, window)),
+    )
+
+
 class PreviewDesign:
     """Constant gains of one axis for one basis and one number of functions.
 
@@ -103,6 +112,8 @@ class PreviewDesign:
         Price of squared increments (mm/sample^2)^2 against squared error mm^2. A small price
         bends the sharp cut-off at n into a slope: at equal accuracy the command's rms acceleration
         is a third lower (benchmarks/design.py).
+    psi : ndarray, shape (window, >= n), optional
+        Functions made before, most important first; the first n of them are used.
 
     Attributes
     ----------
@@ -129,16 +140,13 @@ class PreviewDesign:
         n: int,
         basis: str = "ce-opt",
         price: float = 0.0,
+        psi: NDArray[np.float64] | None = None,
     ) -> None:
         window = len(members[0].from_state)
         update = members[0].drive.shape[1]
         self.members, self.n, self.price = members, n, price
         self.window, self.update = window, update
-        gram = sum(
-            (m.weight * (m.integrated.T @ m.integrated) for m in members),
-            np.zeros((window, window)),
-        )
-        psi = BASES[basis](gram, n)
+        psi = BASES[basis](lifted_gram(members), n) if psi is None else psi[:, :n]
 
         # One QR of the stacked members: normal equations would lose half the digits.
         roots = [np.sqrt(m.weight) for m in members]

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dpotrf, dpotrs
 
+from compensation.base import DesignError
 from compensation.preview import PreviewDesign
 
 __all__ = ["EFFORT_PRICE", "solve_window"]
@@ -84,8 +85,11 @@ def solve_window(
         normal += weighted.T @ response
         right += error @ weighted
         first += states
-    factor = cho_factor(normal, lower=True, overwrite_a=True, check_finite=False)
-    coefficients = cho_solve(factor, right, check_finite=False)
+    # LAPACK itself: the wrappers' checks would take as long as the solution.
+    factor, flaw = dpotrf(normal, lower=1, overwrite_a=1)
+    if flaw:
+        raise DesignError(f"the window problem at a rest is singular (LAPACK dpotrf: {flaw})")
+    coefficients = dpotrs(factor, right, lower=1)[0]
     step = np.arange(1.0, window + 1.0)
     fixed = last + step * (last - previous) + np.cumsum(np.cumsum(offset))
     pins = [a - 1 for a, _ in spans if a > 0]
@@ -93,7 +97,7 @@ def solve_window(
         # Equality constraints by their multipliers: u(pin) = path(pin).
         reach_of = np.maximum(np.array(pins)[:, None] + 1.0 - np.arange(window), 0.0)
         through = reach_of @ tied
-        reach = cho_solve(factor, through.T, check_finite=False)
+        reach = dpotrs(factor, through.T, lower=1)[0]
         miss = through @ coefficients - (path_mm[pins] - fixed[pins])
         coefficients = coefficients - reach @ np.linalg.solve(through @ reach, miss)
     command = fixed + np.cumsum(np.cumsum(tied @ coefficients))
