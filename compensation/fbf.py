@@ -182,7 +182,7 @@ class PreviewFbf:
             rough = rms > rms_limit and rung < GENTLE_RUNG
             if accel <= accel_limit and not fast and not rough:
                 # The next piece starts here, or higher where there was room to spare.
-                roomy = accel < 0.6 * accel_limit and rms < 0.75 * rms_limit
+                roomy = accel < 0.5 * accel_limit and rms < 0.6 * rms_limit
                 axis.next_rung = max(0, rung - 1) if roomy else rung
                 return command
             # Stopping and starting at a rest is a matter of its own price, not of the bandwidth.
