@@ -25,8 +25,8 @@ __all__ = ["Measurement", "MotionSamples", "part_of"]
 
 Array = NDArray[np.float64]
 
-STRIDE = 5
-"""Contour errors are measured at every fifth sample: they change over tens of samples."""
+STRIDE = 6
+"""Contour errors are measured at every sixth sample: they change over tens of samples."""
 _LAYERS_SHOWN = 24
 _POINTS_PER_LAYER = 2500
 _TRACK_BINS = 400
