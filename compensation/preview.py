@@ -110,8 +110,8 @@ class PreviewDesign:
         A key of `compensation.basis.BASES`.
     price : float
         Price of squared increments (mm/sample^2)^2 against squared error mm^2. A small price
-        bends the sharp cut-off at n into a slope: at equal accuracy the command's rms acceleration
-        is a third lower (benchmarks/design.py).
+        bends the sharp cut-off at n into a slope, which asks for less acceleration at the same
+        accuracy.
     psi : ndarray, shape (window, >= n), optional
         Functions made before, most important first; the first n of them are used.
 
