@@ -7,15 +7,14 @@ file, and the input as it was.
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
 
 from service.environment import prepare_environment
+from service.interruption import Interrupted
 
 __all__ = ["app", "main", "run"]
 
@@ -48,7 +47,6 @@ def main() -> NoReturn:
 
 def run(arguments: list[str]) -> int:
     """Run one command and return its exit code; every failure is one line on stderr."""
-    signal.signal(signal.SIGTERM, _terminate)
     try:
         code = typer.main.get_command(app).main(
             args=arguments, prog_name="stillpath", standalone_mode=False
@@ -58,6 +56,8 @@ def run(arguments: list[str]) -> int:
         return _fail("interrupted; nothing was written", _INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted; nothing was written", _INTERRUPTED)
+    except Interrupted as interruption:
+        return _fail("interrupted; nothing was written", interruption.exit_code)
     except typer.TyperException as error:
         return _fail(f"{error.format_message()} (stillpath COMMAND --help lists the options)", 2)
     except _Refused as error:
@@ -302,8 +302,3 @@ def _fail(message: str, code: int) -> int:
 
 class _Refused(Exception):
     """The request cannot be met as it was put."""
-
-
-def _terminate(number: int, _: FrameType | None) -> NoReturn:
-    # As an exception, so that temporary files are removed on the way out.
-    raise SystemExit(128 + number)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+
+from service.interruption import interruptible
 
 if TYPE_CHECKING:
     from service.pipeline.progress import Progress
@@ -22,12 +24,17 @@ _PLAIN_EVERY_S = 5.0
 
 @contextmanager
 def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
-    """Yield a progress callback: a bar on a terminal, now and then a plain line elsewhere."""
-    if sys.stderr.isatty():
-        with _bar(title) as callback:
-            yield callback
-    else:
-        yield _plain_lines(title)
+    """Yield a progress callback: a bar on a terminal, now and then a plain line elsewhere.
+
+    It raises `Interrupted` when the process was asked to stop.
+    """
+    with interruptible() as check, _shown(title) as show:
+
+        def tell(progress: Progress) -> None:
+            check()
+            show(progress)
+
+        yield tell
 
 
 def print_result(result: Result, console: Console | None = None) -> None:
@@ -61,6 +68,10 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def _shown(title: str) -> AbstractContextManager[Callable[[Progress], None]]:
+    return _bar(title) if sys.stderr.isatty() else nullcontext(_plain_lines(title))
 
 
 @contextmanager

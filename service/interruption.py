@@ -1,0 +1,44 @@
+"""Ctrl-C and SIGTERM as an exception that neither gets lost nor breaks anything.
+
+What a signal handler raises vanishes, or leaves half-made objects, when the signal arrives inside a
+callback from C or a compiler. The first signal is therefore only remembered, and raised when the
+work next says where it is; a second one is raised on the spot.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["Interrupted", "interruptible"]
+
+
+class Interrupted(BaseException):
+    """The process was asked to stop; no `Exception`, so that nobody handles it on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"signal {number}")
+        self.exit_code = 128 + number
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], None]]:
+    """Turn SIGINT and SIGTERM into `Interrupted`; yield a check to call now and then."""
+    received: list[int] = []
+
+    def check() -> None:
+        if received:
+            raise Interrupted(received[0])
+
+    def remember(number: int, _: FrameType | None) -> None:
+        check()
+        received.append(number)
+
+    before = {number: signal.signal(number, remember) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield check
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
