@@ -1,8 +1,10 @@
-"""Basis functions for the increments of a command over one preview window.
+"""Basis functions: what a command is composed of.
 
-The functions act on the second difference v of the command u, that is on its acceleration: the
-plant seen by them is G with two integrators in front (docs/method.md). A basis is a matrix Psi of
-shape (window, n) with orthonormal columns, so that the coefficients' norm is the effort.
+A basis is a matrix Psi of shape (m, n) with orthonormal columns, so that the coefficients' norm is
+the effort; n counts functions (the n + 1 of paper 003). In full preview they compose the command
+itself; in limited preview its second difference, where the plant is G with two integrators in
+front (docs/method.md). CE-Opt, robust and DCT functions are nested: those for n are the first n of
+those for more.
 """
 
 from __future__ import annotations
@@ -13,65 +15,233 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.base import DesignError
+from compensation.lifted import LiftedSet
 
-__all__ = ["BASES", "bspline_basis", "ce_opt_basis"]
+__all__ = [
+    "BASES",
+    "TOLERANCE",
+    "Basis",
+    "bspline_basis",
+    "bspline_functions",
+    "ce_opt_basis",
+    "dct_basis",
+    "robust_basis",
+    "robust_basis_for",
+    "robust_spectrum",
+]
 
-Basis = Callable[[NDArray[np.float64], int], NDArray[np.float64]]
+Array = NDArray[np.float64]
+Basis = Callable[[LiftedSet, int], Array]
+
+TOLERANCE = 1e-7
+"""Directions that the plants answer by less than this share of their best are left out of robust
+bases. A Gram matrix holds squares: it knows singular values to 1e-8 of the largest."""
 
 
-def ce_opt_basis(gram: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Control-effort-optimal basis: the n functions that need the least acceleration per output.
+def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
+    """Clamped uniform B-splines as they are written down, shape (samples, n).
+
+    Paper 003, F.2 and F.3: local, not negative, sum 1 at every sample.
+
+    Raises
+    ------
+    DesignError
+        If n is below degree + 1 or above the number of samples.
+    """
+    _check(n, samples)
+    if n <= degree:
+        raise DesignError(f"n = {n} B-splines of degree {degree}: take at least {degree + 1}")
+    from scipy.interpolate import BSpline  # half a second to import, seldom needed
+
+    inner = np.linspace(0.0, samples - 1.0, n - degree + 1)
+    knots = np.concatenate([np.full(degree, inner[0]), inner, np.full(degree, inner[-1])])
+    design = BSpline.design_matrix(np.arange(samples, dtype=float), knots, degree)
+    return np.asarray(design.toarray(), np.float64)
+
+
+def bspline_basis(samples: int, n: int, degree: int = 3) -> Array:
+    """B-splines (paper 003, F.2 and F.3), orthonormalised, shape (samples, n).
 
     Parameters
     ----------
-    gram : ndarray, shape (window, window)
-        G_a' G_a, with G_a the lifted plant from command increments to position; for a plant set
-        the weighted sum over its members.
+    samples : int
+        Length of the window.
+    n : int
+        Number of functions, at least ``degree + 1``.
+    degree : int
+        Degree of the splines; a command made of increments is two degrees smoother.
+    """
+    q, _ = np.linalg.qr(bspline_functions(samples, n, degree))
+    return np.ascontiguousarray(q, np.float64)
+
+
+def dct_basis(samples: int, n: int) -> Array:
+    """Cosines of the discrete cosine transform (paper 003, F.1), shape (samples, n)."""
+    _check(n, samples)
+    k, i = np.arange(samples)[:, None], np.arange(n)
+    angles = np.pi / (2 * samples) * ((2 * k + 1) * i)
+    functions: Array = np.sqrt(2.0 / samples) * np.cos(angles)
+    functions[:, 0] /= np.sqrt(2.0)
+    return functions
+
+
+def ce_opt_basis(gram: Array, n: int) -> Array:
+    """Control-effort-optimal basis: the n functions that need the least effort per output.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (m, m)
+        G' G; for a plant set `LiftedSet.gram`.
     n : int
         Number of functions.
 
     Returns
     -------
-    ndarray, shape (window, n)
-        Leading eigenvectors of `gram`, which are the right singular vectors of G_a with the
-        largest singular values (dissertation of paper 003, equation 3.22).
+    ndarray, shape (m, n)
+        Leading eigenvectors of `gram`, which are the right singular vectors of G with the
+        largest singular values (paper 003, 3.22).
     """
     _check(n, len(gram))
     _, vectors = np.linalg.eigh(gram)
-    psi = vectors[:, ::-1][:, :n]
-    # Eigenvectors are free in sign; fix it so that the same model gives the same bytes.
-    sign = np.sign(psi[np.argmax(np.abs(psi), axis=0), np.arange(n)])
-    return np.ascontiguousarray(psi * sign)
+    return _signed(vectors[:, ::-1][:, :n])
 
 
-def bspline_basis(gram: NDArray[np.float64], n: int, degree: int = 3) -> NDArray[np.float64]:
-    """Clamped uniform B-splines over the window (paper 003, F.2 and F.3), orthonormalised.
+def robust_basis(
+    gram: Array, mean: Array, n: int, r: int | None = None, tolerance: float = TOLERANCE
+) -> Array:
+    """Best basis of ensemble least squares over a plant set.
+
+    With C = Psi Y and the best Y, sum_j l_j |I - G_j C|^2 = rows - trace((Psi'A Psi)^-1 Psi'B'B
+    Psi), which is least when Psi spans the top eigenvectors of the pair (B'B, A). For r = 0 this
+    is (4.22) of paper 003 with the nominal model (4.28): see docs/fbf.md.
 
     Parameters
     ----------
-    gram : ndarray, shape (window, window)
-        Only its size is used: these functions do not depend on the plant.
+    gram, mean : ndarray, shapes (m, m), (rows, m)
+        A and B of `LiftedSet`.
     n : int
-        Number of functions, at least ``degree + 1``.
-    degree : int
-        Degree of the splines in v; the command itself is two degrees smoother.
+        Number of functions, at most m - r.
+    r : int, optional
+        How many of the directions that the set answers least to leave out, as in (4.10). By
+        default those whose singular value is below `tolerance` times the largest.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+        Orthonormal and nested, the most robust functions first.
+
+    Raises
+    ------
+    DesignError
+        If n functions do not fit into what the set answers.
     """
-    window = len(gram)
-    from scipy.interpolate import BSpline  # half a second to import, seldom needed
-
-    _check(n, window)
-    if n <= degree:
-        raise DesignError(f"n = {n} B-splines of degree {degree}: take at least {degree + 1}")
-    inner = np.linspace(0.0, window - 1.0, n - degree + 1)
-    knots = np.concatenate([np.full(degree, inner[0]), inner, np.full(degree, inner[-1])])
-    design = BSpline.design_matrix(np.arange(window, dtype=float), knots, degree).toarray()
-    q, _ = np.linalg.qr(design)
-    return np.ascontiguousarray(q)
+    functions, _ = _robust(gram, mean, n, r, tolerance)
+    # Decoupled functions have sizes of 1 / sigma; orthonormal ones are what effort is counted in.
+    q, _ = np.linalg.qr(functions)
+    return _signed(q)
 
 
-BASES: dict[str, Basis] = {"ce-opt": ce_opt_basis, "bspline": bspline_basis}
+def robust_spectrum(
+    gram: Array, mean: Array, r: int | None = None, tolerance: float = TOLERANCE
+) -> Array:
+    """Return mu_1 >= mu_2 >= ... of the pair (B'B, A), shape (m - r,).
+
+    n functions reach J_e,r^2 = 1 - sum(mu_1 .. mu_n) / rows, and sqrt(1 - mu_i) are the singular
+    values of Delta_nom,s under the nominal model (4.28) of paper 003.
+    """
+    return _robust(gram, mean, 1, r, tolerance)[1]
+
+
+def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> Array:
+    """Robust basis for a given nominal model (paper 003, 4.22), as printed.
+
+    Parameters
+    ----------
+    nominal : ndarray, shape (m, m)
+        G_nom.
+    spread_gram : ndarray, shape (m, m)
+        Delta'Delta of (4.14), from `compensation.nominal.spread_gram`.
+    n : int
+        Number of functions, at most m - r.
+    r : int
+        How many of the smallest singular values of G_nom to leave out.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+        Psi_nom: G_nom Psi_nom has orthonormal columns; the most robust functions first.
+
+    Raises
+    ------
+    DesignError
+        If n is above m - r, or the singular values that are left in include a zero.
+    """
+    m = nominal.shape[1]
+    if not 1 <= n <= m - r:
+        raise DesignError(
+            f"n = {n} robust functions with r = {r} of {m} directions left out: "
+            f"1 <= n <= {m - r} needed"
+        )
+    _, sigma, wt = np.linalg.svd(nominal)
+    kept = sigma[: m - r]
+    if kept[-1] <= 1e-14 * kept[0]:
+        small = int(np.sum(sigma <= 1e-14 * sigma[0]))
+        raise DesignError(
+            f"r = {r}, but {small} singular values of the nominal model are zero: take r = {small}"
+        )
+    scaled = wt[: m - r].T / kept
+    _, xi = np.linalg.eigh(scaled.T @ spread_gram @ scaled)
+    return _signed(scaled @ xi[:, :n])
+
+
+def _robust(
+    gram: Array, mean: Array, n: int, r: int | None, tolerance: float
+) -> tuple[Array, Array]:
+    """A-orthonormal functions (m, n) and all mu."""
+    m = len(gram)
+    _check(n, m)
+    squared, w = np.linalg.eigh(gram)
+    squared, w = squared[::-1], w[:, ::-1]
+    answered = int(np.sum(squared > (tolerance * tolerance) * squared[0]))
+    kept = answered if r is None else m - r
+    if kept > answered:
+        raise DesignError(
+            f"r = {r}, but {m - answered} of {m} directions are answered by less than "
+            f"{tolerance:g} of the largest: take r = {m - answered} or leave it out"
+        )
+    if n > kept:
+        raise DesignError(
+            f"n = {n} robust functions, but the plant set answers {kept} of {m} directions (r = "
+            f"{m - kept}, tolerance {tolerance:g}): take at most {kept}"
+        )
+    scaled = w[:, :kept] / np.sqrt(squared[:kept])
+    seen = mean @ scaled
+    mu, vectors = np.linalg.eigh(seen.T @ seen)
+    return scaled @ vectors[:, ::-1][:, :n], mu[::-1]
+
+
+def _signed(functions: Array) -> Array:
+    # Eigenvectors are free in sign; fix it so that the same model gives the same bytes.
+    top = functions[np.argmax(np.abs(functions), axis=0), np.arange(functions.shape[1])]
+    return np.ascontiguousarray(functions * np.sign(top))
+
+
+def _per_input(members: LiftedSet, n: int, functions: Callable[[int, int], Array]) -> Array:
+    """Give every input of the set the same functions."""
+    inputs = len(members.gram) // members.samples
+    if n % inputs:
+        raise DesignError(f"n = {n} functions for {inputs} inputs: take a multiple of {inputs}")
+    return np.asarray(np.kron(np.eye(inputs), functions(members.samples, n // inputs)), np.float64)
 
 
 def _check(n: int, window: int) -> None:
     if not 1 <= n <= window:
         raise DesignError(f"n = {n} basis functions in a window of {window} samples: 1 <= n needed")
+
+
+BASES: dict[str, Basis] = {
+    "bspline": lambda members, n: _per_input(members, n, bspline_basis),
+    "dct": lambda members, n: _per_input(members, n, dct_basis),
+    "ce-opt": lambda members, n: ce_opt_basis(members.gram, n),
+    "robust": lambda members, n: robust_basis(members.gram, members.mean, n),
+}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from compensation._preview_kernels import advance_state, run_windows
 from compensation.base import DesignError
 from compensation.basis import ce_opt_basis
-from compensation.preview import LiftedPlant, PreviewDesign, lifted_gram, lifted_plant
+from compensation.preview import LiftedPlant, PreviewDesign, lifted_members, lifted_plant
 from compensation.rests import solve_window
 from models.machine import Machine
 from models.plants import DiscretePlant, plant_set
@@ -217,7 +217,7 @@ class _Axis:
         # The optimal functions are nested: those for n are the first n of those for more.
         self._nested = None
         if basis == "ce-opt":
-            self._nested = ce_opt_basis(lifted_gram(self._lifted), max(r.n for r in LADDER))
+            self._nested = ce_opt_basis(lifted_members(self._lifted).gram, max(r.n for r in LADDER))
         self._plants = [plant]
         self.reset(0.0)
 

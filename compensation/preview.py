@@ -23,9 +23,16 @@ from scipy.linalg import solve_triangular, toeplitz
 
 from compensation.base import DesignError
 from compensation.basis import BASES
+from compensation.lifted import LiftedSet, lifted_set
 from models.plants import DiscretePlant
 
-__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "lifted_gram", "lifted_plant"]
+__all__ = [
+    "MAX_CONDITION",
+    "MAX_SPECTRAL_RADIUS",
+    "PreviewDesign",
+    "lifted_members",
+    "lifted_plant",
+]
 
 MAX_SPECTRAL_RADIUS = 0.9
 MAX_CONDITION = 1e10
@@ -88,12 +95,10 @@ def lifted_plant(plant: DiscretePlant, weight: float, window: int, update: int) 
     )
 
 
-def lifted_gram(members: Sequence[LiftedPlant]) -> NDArray[np.float64]:
-    """Weighted sum of G_a' G_a over the members, shape (window, window)."""
-    window = len(members[0].from_state)
-    return sum(
-        (m.weight * (m.integrated.T @ m.integrated) for m in members),
-        np.zeros((window, window)),
+def lifted_members(members: Sequence[LiftedPlant]) -> LiftedSet:
+    """Return the members as one set, as bases are made for it."""
+    return lifted_set(
+        np.stack([m.integrated[:, 0] for m in members]), np.array([m.weight for m in members])
     )
 
 
@@ -146,7 +151,7 @@ class PreviewDesign:
         update = members[0].drive.shape[1]
         self.members, self.n, self.price = members, n, price
         self.window, self.update = window, update
-        psi = BASES[basis](lifted_gram(members), n) if psi is None else psi[:, :n]
+        psi = BASES[basis](lifted_members(members), n) if psi is None else psi[:, :n]
 
         # One QR of the stacked members: normal equations would lose half the digits.
         roots = [np.sqrt(m.weight) for m in members]

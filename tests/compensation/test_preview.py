@@ -11,7 +11,8 @@ from scipy.interpolate import BSpline
 from compensation._preview_kernels import advance_state, run_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, bspline_basis, ce_opt_basis
-from compensation.preview import PreviewDesign, lifted_plant
+from compensation.lifted import LiftedSet
+from compensation.preview import PreviewDesign, lifted_members, lifted_plant
 from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
 from models.store import load_machine
 from service.pipeline.reference_motion import reference_motion
@@ -51,8 +52,7 @@ def direct(design: PreviewDesign, plants: list[DiscretePlant], path: np.ndarray)
     """The same by solving every window with lstsq, simulating sample by sample."""
     window, update = design.window, design.update
     weights = np.sqrt([m.weight for m in design.members])
-    psi = BASES["ce-opt"](sum(m.weight * m.integrated.T @ m.integrated for m in design.members),
-                          design.n)  # fmt: skip
+    psi = BASES["ce-opt"](lifted_members(design.members), design.n)
     doubled = np.cumsum(np.cumsum(psi, axis=0), axis=0)
     filtered = np.concatenate([
         s * np.stack([answer(p, column) for column in doubled.T], axis=1)
@@ -125,11 +125,10 @@ def test_lifted_plant_is_the_simulation() -> None:
     np.testing.assert_allclose(after, advance_state(plant.a, plant.b, x, u), atol=1e-12)
 
 
-@pytest.mark.parametrize("basis", ["ce-opt", "bspline"])
+@pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("n", [4, 20, 45])
 def test_bases_are_orthonormal(basis: str, n: int) -> None:
-    g = members(1, 150, 75)[0].integrated
-    psi = BASES[basis](g.T @ g, n)
+    psi = BASES[basis](lifted_members(members(1, 150, 75)), n)
     assert psi.shape == (150, n)
     np.testing.assert_allclose(psi.T @ psi, np.eye(n), atol=1e-10)
 
@@ -143,7 +142,7 @@ def test_ce_opt_are_singular_vectors() -> None:
 
 
 def test_bsplines_span() -> None:
-    psi = bspline_basis(np.zeros((120, 120)), 14, 3)
+    psi = bspline_basis(120, 14, 3)
     knots = np.concatenate([[0.0] * 3, np.linspace(0, 119, 12), [119.0] * 3])
     design = BSpline.design_matrix(np.arange(120.0), knots, 3).toarray()
     np.testing.assert_allclose(psi @ (psi.T @ design), design, atol=1e-10)
@@ -176,8 +175,8 @@ def test_unstable_design_is_refused(window: int, update: int, n: int) -> None:
 
 
 def test_nearly_dependent_basis_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def twice(gram: np.ndarray, n: int) -> np.ndarray:
-        psi = ce_opt_basis(gram, n)
+    def twice(lifted: LiftedSet, n: int) -> np.ndarray:
+        psi = ce_opt_basis(lifted.gram, n)
         psi[:, -1] = psi[:, 0] * (1 + 1e-13)
         return psi
 
