@@ -9,9 +9,17 @@ from numpy.typing import NDArray
 
 from models.machine import Machine
 
-__all__ = ["COMPENSATORS", "Compensator", "DesignError", "Memoryless", "compensator"]
+__all__ = [
+    "COMPENSATORS",
+    "INVERSIONS",
+    "Compensator",
+    "DesignError",
+    "Memoryless",
+    "compensator",
+]
 
-COMPENSATORS = ("fbf", "zpetc", "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
+INVERSIONS = ("npz-ignore", "zmetc", "zpetc", "ebzpetc", "ts")
+COMPENSATORS = ("fbf", *INVERSIONS, "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
                 "shaper:3hump_ei")  # fmt: skip
 
 
@@ -98,10 +106,10 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         from compensation.fbf import PreviewFbf
 
         made = PreviewFbf(machine, dt_s, **settings)
-    elif name == "zpetc":
-        from compensation.zpetc import Zpetc
+    elif name in INVERSIONS:
+        from compensation.inverting import InversionCompensator
 
-        made = Zpetc(machine, dt_s, **settings)
+        made = InversionCompensator(machine, dt_s, kind=name, **settings)
     elif name.startswith("shaper:"):
         from compensation.shapers import ShaperCompensator
 

@@ -27,7 +27,10 @@ app = typer.Typer(
 )
 
 _INTERRUPTED = 130
-_METHODS = "fbf, zpetc, none, shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei"
+_METHODS = (
+    "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
+    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei"
+)
 
 Input = Annotated[Path, typer.Argument(metavar="IN", help="The sliced file.")]
 MachineOption = Annotated[

@@ -65,7 +65,8 @@ async def create_job(
         str,
         Query(
             pattern=_METHOD,
-            description="`fbf` (limited-preview filtered basis functions), `zpetc`, "
+            description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, "
+            "`zmetc`, `zpetc`, `ebzpetc`, `ts` (approximate inverses), "
             "`shaper:NAME` (zv, mzv, ei, 2hump_ei, 3hump_ei) or `none`.",
         ),
     ] = "fbf",

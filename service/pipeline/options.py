@@ -14,13 +14,18 @@ DEFAULT_TOLERANCE_UM = 2.0
 class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
-    `method` is `fbf`, `zpetc`, `none` or `shaper:NAME` with a firmware shaper's name.
+    `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
+    with a firmware shaper's name.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     method: Annotated[
-        str, Field(pattern=r"^(fbf|zpetc|none|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$")
+        str,
+        Field(
+            pattern=r"^(fbf|npz-ignore|zmetc|zpetc|ebzpetc|ts|none"
+            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$"
+        ),
     ] = "fbf"
     basis: Literal["ce-opt", "bspline"] = "ce-opt"
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

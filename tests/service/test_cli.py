@@ -204,10 +204,12 @@ def test_refusals(arguments, capsys):
 
 def test_every_method_that_is_offered_exists(capsys):
     assert run(["compensate", "--help"]) == 0
-    offered = set(re.findall(r"shaper:\w+|\bfbf\b|\bzpetc\b|\bnone\b", capsys.readouterr().out))
+    names = r"shaper:\w+|npz-ignore|\b(?:fbf|zmetc|zpetc|ebzpetc|ts|none)\b"
+    offered = set(re.findall(names, capsys.readouterr().out))
     pattern = Options.model_json_schema()["properties"]["method"]["pattern"]
     assert all(re.match(pattern, method) for method in offered)
-    assert {"fbf", "zpetc", "none", "shaper:ei"} <= offered
+    assert {"fbf", "npz-ignore", "zmetc", "zpetc", "ebzpetc", "ts", "none"} <= offered
+    assert "shaper:ei" in offered
 
 
 def test_help_and_version_are_quick_and_light():
