@@ -223,7 +223,7 @@ def invert(
     cancelled = zeros[np.abs(zeros) < cancel_below]
     for zero in kept[np.abs(kept - 1) < NEAR_CIRCLE]:
         raise DesignError(
-            f"{kind}: zero z = {zero:.6g} lies at 1: the plant does not answer slow motion, and "
+            f"{kind}: zero z = {_number(zero)} lies at 1: the plant does not answer slow motion, and "
             "every approximate inverse is scaled by that answer; use fbf, or check the model"
         )
     b = _polynomial(kept)
@@ -333,4 +333,8 @@ def _toeplitz_norm(h: Array) -> float:
 def _place(zero: complex, dt_s: float) -> str:
     """Name a zero on the unit circle for a message."""
     f_hz = abs(float(np.angle(zero))) / (2 * math.pi * dt_s)
-    return f"z = {zero:.6g} lies on the unit circle ({f_hz:.4g} Hz)"
+    return f"z = {_number(zero)} lies on the unit circle ({f_hz:.4g} Hz)"
+
+
+def _number(value: complex) -> str:
+    return f"{value:.6g}" if value.imag else f"{value.real:.6g}"
