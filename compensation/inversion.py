@@ -223,8 +223,8 @@ def invert(
     cancelled = zeros[np.abs(zeros) < cancel_below]
     for zero in kept[np.abs(kept - 1) < NEAR_CIRCLE]:
         raise DesignError(
-            f"{kind}: zero z = {_number(zero)} lies at 1: the plant does not answer slow motion, and "
-            "every approximate inverse is scaled by that answer; use fbf, or check the model"
+            f"{kind}: zero z = {_number(zero)} lies at 1: the plant does not answer slow motion, "
+            "by which every approximate inverse is scaled; use fbf, or check the model"
         )
     b = _polynomial(kept)
     x = KINDS[kind](kept, b, order, plant.dt_s)
