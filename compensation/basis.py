@@ -20,14 +20,17 @@ from compensation.lifted import LiftedSet
 __all__ = [
     "BASES",
     "TOLERANCE",
+    "ZERO",
     "Basis",
     "bspline_basis",
     "bspline_functions",
     "ce_opt_basis",
     "dct_basis",
+    "orthonormal",
     "robust_basis",
     "robust_basis_for",
-    "robust_spectrum",
+    "robust_functions",
+    "spread_functions",
 ]
 
 Array = NDArray[np.float64]
@@ -36,6 +39,8 @@ Basis = Callable[[LiftedSet, int], Array]
 TOLERANCE = 1e-7
 """Directions that the plants answer by less than this share of their best are left out of robust
 bases. A Gram matrix holds squares: it knows singular values to 1e-8 of the largest."""
+ZERO = 1e-13
+"""Singular values of a matrix below this share of the largest are zero but for rounding."""
 
 
 def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
@@ -71,8 +76,7 @@ def bspline_basis(samples: int, n: int, degree: int = 3) -> Array:
     degree : int
         Degree of the splines; a command made of increments is two degrees smoother.
     """
-    q, _ = np.linalg.qr(bspline_functions(samples, n, degree))
-    return np.ascontiguousarray(q, np.float64)
+    return orthonormal(bspline_functions(samples, n, degree))
 
 
 def dct_basis(samples: int, n: int) -> Array:
@@ -135,21 +139,48 @@ def robust_basis(
     DesignError
         If n functions do not fit into what the set answers.
     """
-    functions, _ = _robust(gram, mean, n, r, tolerance)
-    # Decoupled functions have sizes of 1 / sigma; orthonormal ones are what effort is counted in.
-    q, _ = np.linalg.qr(functions)
-    return _signed(q)
+    _check(n, len(gram))
+    functions, mu = robust_functions(gram, mean, r, tolerance)
+    if n > len(mu):
+        raise DesignError(
+            f"n = {n} robust functions, but the plant set answers {len(mu)} of {len(gram)} "
+            f"directions (tolerance {tolerance:g}): take at most {len(mu)}"
+        )
+    return orthonormal(functions[:, :n])
 
 
-def robust_spectrum(
+def robust_functions(
     gram: Array, mean: Array, r: int | None = None, tolerance: float = TOLERANCE
-) -> Array:
-    """Return mu_1 >= mu_2 >= ... of the pair (B'B, A), shape (m - r,).
+) -> tuple[Array, Array]:
+    """Order what a plant set answers by how much all of it agrees there.
 
-    n functions reach J_e,r^2 = 1 - sum(mu_1 .. mu_n) / rows, and sqrt(1 - mu_i) are the singular
-    values of Delta_nom,s under the nominal model (4.28) of paper 003.
+    Parameters
+    ----------
+    gram, mean, r, tolerance
+        As `robust_basis` takes them.
+
+    Returns
+    -------
+    functions : ndarray, shape (m, m - r)
+        Eigenvectors of the pair (B'B, A), the most robust first, decoupled: F'A F = I.
+    mu : ndarray, shape (m - r,)
+        Eigenvalues, falling. n functions reach J_e,r^2 = 1 - sum(mu_1 .. mu_n) / rows, and
+        sqrt(1 - mu_i) are the singular values of Delta_nom,s for the nominal model (4.28).
     """
-    return _robust(gram, mean, 1, r, tolerance)[1]
+    m = len(gram)
+    squared, w = np.linalg.eigh(gram)
+    squared, w = squared[::-1], w[:, ::-1]
+    answered = int(np.sum(squared > (tolerance * tolerance) * squared[0]))
+    kept = answered if r is None else m - r
+    if not 1 <= kept <= answered:
+        raise DesignError(
+            f"r = {r} of {m} directions left out, but {m - answered} are answered by less than "
+            f"{tolerance:g} of the largest: take {m - answered} to {m - 1}, or leave r out"
+        )
+    scaled = w[:, :kept] / np.sqrt(squared[:kept])
+    seen = mean @ scaled
+    mu, vectors = np.linalg.eigh(seen.T @ seen)
+    return scaled @ vectors[:, ::-1], mu[::-1]
 
 
 def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> Array:
@@ -157,67 +188,68 @@ def robust_basis_for(nominal: Array, spread_gram: Array, n: int, r: int = 0) -> 
 
     Parameters
     ----------
-    nominal : ndarray, shape (m, m)
-        G_nom.
-    spread_gram : ndarray, shape (m, m)
-        Delta'Delta of (4.14), from `compensation.nominal.spread_gram`.
+    nominal, spread_gram, r
+        As `spread_functions` takes them.
     n : int
         Number of functions, at most m - r.
-    r : int
-        How many of the smallest singular values of G_nom to leave out.
 
     Returns
     -------
     ndarray, shape (m, n)
         Psi_nom: G_nom Psi_nom has orthonormal columns; the most robust functions first.
+    """
+    functions, _ = spread_functions(nominal, spread_gram, r)
+    m, most = functions.shape
+    if not 1 <= n <= most:
+        raise DesignError(
+            f"n = {n} robust functions with r = {r} of {m} directions left out: "
+            f"1 <= n <= {most} needed"
+        )
+    return _signed(functions[:, :n])
+
+
+def spread_functions(nominal: Array, spread_gram: Array, r: int = 0) -> tuple[Array, Array]:
+    """Order what a nominal model answers by how much the plants differ from it there.
+
+    Parameters
+    ----------
+    nominal : ndarray, shape (rows, m)
+        G_nom.
+    spread_gram : ndarray, shape (m, m)
+        Delta'Delta of (4.14), from `compensation.nominal.spread_gram`.
+    r : int
+        How many of the smallest singular values of G_nom to leave out (4.10).
+
+    Returns
+    -------
+    functions : ndarray, shape (m, m - r)
+        W_nom S_nom^-1 W_Delta of (4.22), the most robust first.
+    singular_values : ndarray, shape (m - r,)
+        Of Delta_nom,s (4.11), rising.
 
     Raises
     ------
     DesignError
-        If n is above m - r, or the singular values that are left in include a zero.
+        If r is not in 0 .. m - 1, or the singular values that are left in include a zero.
     """
     m = nominal.shape[1]
-    if not 1 <= n <= m - r:
+    if not 0 <= r < m:
+        raise DesignError(f"r = {r} of {m} directions left out: 0 <= r < {m} needed")
+    _, sigma, wt = np.linalg.svd(nominal, full_matrices=False)
+    zeros = m - int(np.sum(sigma > ZERO * sigma[0]))
+    if zeros > r:
         raise DesignError(
-            f"n = {n} robust functions with r = {r} of {m} directions left out: "
-            f"1 <= n <= {m - r} needed"
+            f"r = {r}, but {zeros} singular values of the nominal model are zero: take r = {zeros}"
         )
-    _, sigma, wt = np.linalg.svd(nominal)
-    kept = sigma[: m - r]
-    if kept[-1] <= 1e-14 * kept[0]:
-        small = int(np.sum(sigma <= 1e-14 * sigma[0]))
-        raise DesignError(
-            f"r = {r}, but {small} singular values of the nominal model are zero: take r = {small}"
-        )
-    scaled = wt[: m - r].T / kept
-    _, xi = np.linalg.eigh(scaled.T @ spread_gram @ scaled)
-    return _signed(scaled @ xi[:, :n])
+    scaled = wt[: m - r].T / sigma[: m - r]
+    squares, xi = np.linalg.eigh(scaled.T @ spread_gram @ scaled)
+    return scaled @ xi, np.sqrt(np.maximum(squares, 0.0))
 
 
-def _robust(
-    gram: Array, mean: Array, n: int, r: int | None, tolerance: float
-) -> tuple[Array, Array]:
-    """A-orthonormal functions (m, n) and all mu."""
-    m = len(gram)
-    _check(n, m)
-    squared, w = np.linalg.eigh(gram)
-    squared, w = squared[::-1], w[:, ::-1]
-    answered = int(np.sum(squared > (tolerance * tolerance) * squared[0]))
-    kept = answered if r is None else m - r
-    if kept > answered:
-        raise DesignError(
-            f"r = {r}, but {m - answered} of {m} directions are answered by less than "
-            f"{tolerance:g} of the largest: take r = {m - answered} or leave it out"
-        )
-    if n > kept:
-        raise DesignError(
-            f"n = {n} robust functions, but the plant set answers {kept} of {m} directions (r = "
-            f"{m - kept}, tolerance {tolerance:g}): take at most {kept}"
-        )
-    scaled = w[:, :kept] / np.sqrt(squared[:kept])
-    seen = mean @ scaled
-    mu, vectors = np.linalg.eigh(seen.T @ seen)
-    return scaled @ vectors[:, ::-1][:, :n], mu[::-1]
+def orthonormal(functions: Array) -> Array:
+    """Return the functions orthonormalised in their order, signs fixed."""
+    q, _ = np.linalg.qr(functions)
+    return _signed(np.asarray(q, np.float64))
 
 
 def _signed(functions: Array) -> Array:

@@ -18,6 +18,7 @@ from models.plants import DiscretePlant
 
 __all__ = [
     "LiftedSet",
+    "checked_weights",
     "free_response",
     "integrated",
     "lift",
@@ -160,7 +161,7 @@ def lifted_set(markov: ArrayLike, weights: ArrayLike) -> LiftedSet:
         If the set is empty, or weights are negative or do not sum to 1.
     """
     h = np.asarray(markov, np.float64)
-    shares = _checked_weights(weights, len(h))
+    shares = checked_weights(weights, len(h))
     if h.ndim != 2 or h.shape[1] == 0:
         raise DesignError(f"Markov parameters of shape {h.shape}: give one row per plant, (l, m)")
     scaled = np.sqrt(shares)[:, None] * h
@@ -189,7 +190,7 @@ def lifted_set_of(
     DesignError
         As `lifted_set`, and if the shapes differ.
     """
-    shares = _checked_weights(weights, len(members))
+    shares = checked_weights(weights, len(members))
     shapes = sorted({member.shape for member in members})
     if len(shapes) != 1 or shapes[0][1] % inputs:
         raise DesignError(
@@ -205,7 +206,8 @@ def lifted_set_of(
     return LiftedSet(gram, mean, cols // inputs)
 
 
-def _checked_weights(weights: ArrayLike, members: int) -> Array:
+def checked_weights(weights: ArrayLike, members: int) -> Array:
+    """Return the weights of a set, shape (members,), or say what is wrong with them."""
     shares = np.asarray(weights, np.float64)
     if members == 0:
         raise DesignError("the set of plants is empty: give at least one")
