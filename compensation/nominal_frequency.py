@@ -125,7 +125,10 @@ class FrequencyNominal:
     def operator(self, samples: int) -> ToeplitzOperator:
         """Return G_r over a number of samples, as filtered basis functions take it.
 
-        With the part ahead of time: the lifted system may be non-causal, nothing is lost.
+        With the part ahead of time: the lifted system may be non-causal, nothing is lost. Take
+        `needed_delay` samples more than the path has, hold the path there and drop the commands
+        for them: a design that ends with its path spends huge ones on its last samples, where
+        those that G_r looks ahead to are missing.
         """
         markov = np.zeros(samples)
         used = min(samples, len(self.markov))

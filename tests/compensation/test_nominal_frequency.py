@@ -21,7 +21,7 @@ from compensation.nominal_frequency import (
     robust_response,
     sampled_responses,
 )
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
+from models.plants import DiscretePlant, Mode, ModesSpec, ZpkSpec, discretise, plant_set
 from models.store import load_machine
 
 DT = 1e-3
@@ -207,6 +207,28 @@ def test_it_makes_filtered_basis_functions_robust() -> None:
     plain = [error(lift(p, samples)) for p in members]
     assert all(value < min(plain) for value in robust.values())
     assert robust["sampled"] == min(robust.values())
+
+
+def test_a_design_must_run_on_past_its_path() -> None:
+    """Without the samples that G_r looks ahead, the last commands are huge (figure_i5.py)."""
+    spec = load_machine("taz6-x").axes["x"].nominal
+    members = [
+        discretise(ZpkSpec.model_validate(spec.scaled(s, s**-8).model_dump()), DT)
+        for s in np.linspace(0.94, 1.06, 7)
+    ]
+    made = robust_nominal(members)
+    rng = np.random.default_rng(3)
+    t = np.arange(500)
+    y_d = sum(np.sin(2 * np.pi * (f * t * DT + rng.uniform())) for f in range(5, 51, 3))
+    y_d *= np.minimum(1.0, np.minimum(t, 499 - t) / 50)
+
+    def largest(run_out: int) -> float:
+        length = len(y_d) + run_out
+        phi = bspline_functions(length, length // 5, 5)
+        u = FullPreview(made.operator(length), phi).command(np.pad(y_d, (0, run_out)))
+        return float(np.abs(u[: len(y_d)]).max())
+
+    assert largest(made.needed_delay()) < 0.3 * largest(0)
 
 
 def test_measured_responses_are_joined_to_a_model() -> None:
