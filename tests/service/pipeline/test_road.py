@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from compensation.base import INVERSIONS, DesignError
 from gcode.errors import GcodeError
 from gcode.interpreter import Interpreter
 from models.machine import AxisTravel, Machine
@@ -116,7 +117,8 @@ def test_method_none_returns_the_bytes(tmp_path: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"method": "shaper:mzv"}, {"method": "zpetc"}, {"basis": "bspline"}]
+    "options",
+    [{"method": "shaper:mzv"}, *({"method": name} for name in INVERSIONS), {"basis": "bspline"}],
 )
 def test_other_methods(tmp_path: Path, cache: Path, options: dict[str, str]) -> None:
     data = tagged(SMALL)
@@ -125,6 +127,15 @@ def test_other_methods(tmp_path: Path, cache: Path, options: dict[str, str]) -> 
     before, after = extruding(result, "before"), extruding(result, "after")
     assert after.contour_rms_um < 0.9 * before.contour_rms_um
     check_file(data, written, load_machine("ender3"))
+
+
+@pytest.mark.slow  # tunes the shaper of one more machine
+def test_a_machine_beyond_the_method_gets_the_reason_and_no_file(
+    tmp_path: Path, cache: Path
+) -> None:
+    with pytest.raises(DesignError, match=r"axis x: ebzpetc: .* use ts or fbf"):
+        compensate(SMALL, tmp_path, cache, "taz6-x", method="ebzpetc")
+    assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
 
 
 def test_same_bytes(tmp_path: Path, cache: Path) -> None:
