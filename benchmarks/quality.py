@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import sys
 import tempfile
@@ -64,7 +65,7 @@ class Task:
     file: Path
     machine: str
     tolerances_um: tuple[float, ...]
-    method: str
+    options: Options
     cache: Path
 
 
@@ -112,12 +113,16 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=list(MACHINES), help="names or .json")
     parser.add_argument("--tolerance-um", nargs="+", type=float, default=[2.0, 5.0])
     parser.add_argument("--method", default="fbf")
+    parser.add_argument("--basis", default="ce-opt")
+    parser.add_argument("--robust", default=None, help="default: the product's")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, help="write the rows here too")
     given = parser.parse_args()
 
+    chosen = {"method": given.method, "basis": given.basis}
+    options = Options(**chosen | ({} if given.robust is None else {"robust": given.robust}))
     shared = shared_folder(given.shared)
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -127,7 +132,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="stillpath-quality-") as folder:
         files = [plain_copy(find_input(name, shared), Path(folder)) for name in given.files]
         tasks = [
-            Task(file, machine, tuple(given.tolerance_um), given.method, given.cache)
+            Task(file, machine, tuple(given.tolerance_um), options, given.cache)
             for file in files
             for machine in given.machines
         ]
@@ -148,6 +153,7 @@ def main() -> None:
                 rows += found
     rows.sort(key=lambda r: (r.file, r.machine, r.tolerance_um))
     print_notes(rows)
+    print_means(rows)
     cpu_s = sum(row.cpu_s for row in rows)
     missed = sum(bool(row.missed) for row in rows)
     print(
@@ -193,7 +199,7 @@ def _case(
     began: float,
 ) -> Row:
     target = folder / "out.gcode"
-    options = Options(method=task.method, tolerance_um=tolerance_um)
+    options = task.options.model_copy(update={"tolerance_um": tolerance_um})
     result = compensate_file(task.file, target, machine, options, cache_dir=task.cache)
     written = read_motion(target, machine)
     original = read_motion(task.file, machine, forced_stops(own, written))
@@ -319,6 +325,23 @@ def print_notes(rows: list[Row]) -> None:
         if len(row.put_back_reasons) > _REASONS:
             print(f"  ... and {len(row.put_back_reasons) - _REASONS} more")
     print()
+
+
+def print_means(rows: list[Row]) -> None:
+    """Geometric means over printers of what each file shows, as the robustness limits ask."""
+    print("geometric means over the machines of (contour rms / best shaper's):")
+    for tolerance_um in sorted({row.tolerance_um for row in rows}):
+        some = [row for row in rows if row.tolerance_um == tolerance_um]
+        mean = {
+            name: math.exp(sum(math.log(getattr(row, name)) for row in some) / len(some))
+            for name in ("members_ratio", "ratio", "tracking_ratio")
+        }
+        print(
+            f"  {tolerance_um:g} um: members {mean['members_ratio']:.3f} (worst machine "
+            f"{max(row.members_ratio for row in some):.3f}), nominal {mean['ratio']:.3f}, "
+            f"tracking over uncompensated {mean['tracking_ratio']:.3f} "
+            f"(worst {max(row.tracking_ratio for row in some):.3f})"
+        )
 
 
 if __name__ == "__main__":

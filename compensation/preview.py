@@ -1,9 +1,9 @@
 """Limited-preview filtered basis functions on command increments, for one axis.
 
-A window of `window` samples starts with the plant state x and the last two commands u1, u2 known.
-The command continues in a straight line (u_free) plus the double running sum of v = Psi c; c
-minimises the error over the window, the first `update` samples are committed, and the window moves
-on (docs/method.md). Everything that does not depend on the path is folded into constant gains, so
+A window starts with the plant states x and the last two commands u1, u2 known. The command
+continues in a straight line (u_free) plus the double running sum of v = Psi c; c minimises the
+error over the window, the first `update` samples are committed, and the window moves on
+(docs/method.md). Everything that does not depend on the path is folded into constant gains, so
 that a window without a rest costs one matrix product:
 
     u_up = E z + S y_d        z = [x_1 .. x_l, u1, u2]
@@ -14,92 +14,20 @@ The design refuses itself when the recursion is unstable or the basis nearly dep
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular, toeplitz
+from scipy.linalg import solve_triangular
 
 from compensation.base import DesignError
 from compensation.basis import BASES
-from compensation.lifted import LiftedSet, lifted_set
-from models.plants import DiscretePlant
+from compensation.lifted_window import LiftedWindow
 
-__all__ = [
-    "MAX_CONDITION",
-    "MAX_SPECTRAL_RADIUS",
-    "PreviewDesign",
-    "lifted_members",
-    "lifted_plant",
-]
+__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign"]
+
+Array = NDArray[np.float64]
 
 MAX_SPECTRAL_RADIUS = 0.9
 MAX_CONDITION = 1e10
-
-
-@dataclass(frozen=True, slots=True)
-class LiftedPlant:
-    """One plant over one window.
-
-    Attributes
-    ----------
-    integrated : ndarray, shape (window, window)
-        From command increments v to position (lower-triangular Toeplitz).
-    from_state : ndarray, shape (window, states)
-        Free response to the plant state.
-    from_history : ndarray, shape (window, 2)
-        Response to u_free, as a function of (u1, u2).
-    advance : ndarray, shape (states, states)
-        State after `update` samples of no input.
-    drive : ndarray, shape (states, update)
-        State after `update` samples, from those samples of the command.
-    """
-
-    weight: float
-    plant: DiscretePlant
-    integrated: NDArray[np.float64]
-    from_state: NDArray[np.float64]
-    from_history: NDArray[np.float64]
-    advance: NDArray[np.float64]
-    drive: NDArray[np.float64]
-
-
-def lifted_plant(plant: DiscretePlant, weight: float, window: int, update: int) -> LiftedPlant:
-    """Lift a discrete plant over a window (first-order-hold model, D != 0 allowed)."""
-    states = len(plant.b)
-    markov = np.empty(window)
-    from_state = np.empty((window, states))
-    markov[0] = plant.d
-    response, row = plant.b.copy(), plant.c.copy()
-    from_state[0] = row
-    for k in range(1, window):
-        markov[k] = plant.c @ response
-        response = plant.a @ response
-        row = row @ plant.a
-        from_state[k] = row
-    drive = np.empty((states, update))
-    response = plant.b.copy()
-    for k in range(update - 1, -1, -1):
-        drive[:, k] = response
-        response = plant.a @ response
-    step = np.arange(1.0, window + 1.0)
-    return LiftedPlant(
-        weight=weight,
-        plant=plant,
-        integrated=toeplitz(np.cumsum(np.cumsum(markov)), np.zeros(window)),
-        from_state=from_state,
-        from_history=toeplitz(markov, np.zeros(window)) @ np.stack([step + 1.0, -step], axis=1),
-        advance=np.linalg.matrix_power(plant.a, update),
-        drive=drive,
-    )
-
-
-def lifted_members(members: Sequence[LiftedPlant]) -> LiftedSet:
-    """Return the members as one set, as bases are made for it."""
-    return lifted_set(
-        np.stack([m.integrated[:, 0] for m in members]), np.array([m.weight for m in members])
-    )
 
 
 class PreviewDesign:
@@ -107,8 +35,8 @@ class PreviewDesign:
 
     Parameters
     ----------
-    members : sequence of LiftedPlant
-        One plant, or a weighted set (ensemble least squares); weights sum to 1.
+    lifted : LiftedWindow
+        One plant, or a weighted set (ensemble least squares).
     n : int
         Number of basis functions; n / (2 window dt) is the cut-off frequency of the command.
     basis : str
@@ -122,12 +50,14 @@ class PreviewDesign:
 
     Attributes
     ----------
+    window, update : int
     command_gain, path_gain : ndarray
         E, shape (update, nz), and S, shape (update, window).
     state_gain, state_path_gain : ndarray
         F, shape (nz, nz), and H, shape (nz, window).
     basis : ndarray, shape (window, n)
         Psi scaled so that its filtered columns are orthonormal over the (weighted) members.
+    filtered : ndarray, shape (components, window, n)
     effort : ndarray, shape (n, n)
         Gram matrix of `basis`: the squared command acceleration of a coefficient vector.
     spectral_radius, condition : float
@@ -141,23 +71,18 @@ class PreviewDesign:
 
     def __init__(
         self,
-        members: Sequence[LiftedPlant],
+        lifted: LiftedWindow,
         n: int,
         basis: str = "ce-opt",
         price: float = 0.0,
-        psi: NDArray[np.float64] | None = None,
+        psi: Array | None = None,
     ) -> None:
-        window = len(members[0].from_state)
-        update = members[0].drive.shape[1]
-        self.members, self.n, self.price = members, n, price
-        self.window, self.update = window, update
-        psi = BASES[basis](lifted_members(members), n) if psi is None else psi[:, :n]
+        self.lifted, self.n, self.price = lifted, n, price
+        self.window, self.update = window, update = lifted.window, lifted.update
+        psi = BASES[basis](lifted.lifted_set(), n) if psi is None else psi[:, :n]
 
-        # One QR of the stacked members: normal equations would lose half the digits.
-        roots = [np.sqrt(m.weight) for m in members]
-        q, r = np.linalg.qr(
-            np.concatenate([s * (m.integrated @ psi) for s, m in zip(roots, members, strict=True)])
-        )
+        # One QR of the stacked components: normal equations would lose half the digits.
+        q, r = np.linalg.qr(np.concatenate(lifted.integrated @ psi))
         self.condition = float(np.linalg.cond(r))
         if not self.condition <= MAX_CONDITION:
             raise DesignError(
@@ -166,22 +91,14 @@ class PreviewDesign:
             )
         self.basis = np.ascontiguousarray(solve_triangular(r, psi.T, trans="T").T)
         self.effort = self.basis.T @ self.basis
-        self.filtered = [m.integrated @ self.basis for m in members]
+        self.filtered = q.reshape(-1, window, n)
 
-        shrink = np.linalg.inv(np.eye(n) + price * self.effort)
-        solve = [shrink @ (s * q[j * window : (j + 1) * window].T) for j, s in enumerate(roots)]
+        solve = np.linalg.solve(np.eye(n) + price * self.effort, q.T).reshape(n, -1, window)
         summed = np.cumsum(np.cumsum(self.basis, axis=0), axis=0)[:update]
         step = np.arange(1.0, update + 1.0)
-        free = np.stack([step + 1.0, -step], axis=1)
-        self.path_gain = np.ascontiguousarray(summed @ sum(solve[1:], solve[0]))
-        history = sum(
-            (k @ m.from_history for k, m in zip(solve, members, strict=True)), np.zeros((n, 2))
-        )
-        self.command_gain = np.concatenate(
-            [-summed @ (k @ m.from_state) for k, m in zip(solve, members, strict=True)]
-            + [free - summed @ history],
-            axis=1,
-        )
+        self.path_gain = summed @ np.einsum("nkw,k->nw", solve, lifted.target)
+        self.command_gain = -summed @ np.einsum("nkw,kwz->nz", solve, lifted.from_state)
+        self.command_gain[:, -2:] += np.stack([step + 1.0, -step], axis=1)
         self._condense()
         self.spectral_radius = float(np.max(np.abs(np.linalg.eigvals(self.state_gain))))
         if not self.spectral_radius <= MAX_SPECTRAL_RADIUS:
@@ -192,24 +109,16 @@ class PreviewDesign:
             )
 
     def _condense(self) -> None:
-        states = [len(m.plant.b) for m in self.members]
-        size = sum(states) + 2
-        f, h = np.zeros((size, size)), np.zeros((size, self.window))
-        row = 0
-        for member, count in zip(self.members, states, strict=True):
-            block = slice(row, row + count)
-            f[block, block] = member.advance
-            f[block] += member.drive @ self.command_gain
-            h[block] = member.drive @ self.path_gain
-            row += count
-        f[-2], h[-2] = self.command_gain[-1], self.path_gain[-1]
-        f[-1], h[-1] = self.command_gain[-2], self.path_gain[-2]
-        self.state_gain, self.state_path_gain = f, h
+        lifted = self.lifted
+        f = lifted.drive @ self.command_gain
+        f[:, :-2] += lifted.advance
+        # The last two commands, newest first.
+        self.state_gain = np.concatenate([f, self.command_gain[-1:-3:-1]])
+        self.state_path_gain = np.concatenate(
+            [lifted.drive @ self.path_gain, self.path_gain[-1:-3:-1]]
+        )
 
-    def rest_state(self, position_mm: float) -> NDArray[np.float64]:
-        """Vector z of an axis that stands at `position_mm`, shape (nz,)."""
-        parts = [
-            np.linalg.solve(np.eye(len(m.plant.b)) - m.plant.a, m.plant.b * position_mm)
-            for m in self.members
-        ]
-        return np.concatenate([*parts, np.full(2, position_mm)])
+    def advanced(self, z: Array, committed: Array) -> Array:
+        """State z after the `update` committed samples of a command."""
+        states = self.lifted.advance @ z[:-2] + self.lifted.drive @ committed
+        return np.concatenate([states, committed[-1:-3:-1]])

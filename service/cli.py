@@ -100,7 +100,15 @@ def compensate(
         bool, typer.Option("--in-place", help="Write over IN, as slicers ask of their scripts.")
     ] = False,
     method: Annotated[str, typer.Option(help=_METHODS)] = "fbf",
-    basis: Annotated[str, typer.Option(help="Basis of fbf: ce-opt or bspline.")] = "ce-opt",
+    basis: Annotated[
+        str, typer.Option(help="Basis of fbf: ce-opt, robust, bspline or dct.")
+    ] = "ce-opt",
+    robust: Annotated[
+        str,
+        typer.Option(
+            help="What fbf looks at: off (the nominal plant), ensemble or minimax (its set)."
+        ),
+    ] = "off",
     tolerance_um: Annotated[
         float | None,
         typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
@@ -110,7 +118,7 @@ def compensate(
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
         raise _Refused("give either -o OUT or --in-place")
-    chosen = {"method": method, "basis": basis, "tolerance_um": tolerance_um}
+    chosen = {"method": method, "basis": basis, "robust": robust, "tolerance_um": tolerance_um}
     options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
     target = _check_output(output or source)

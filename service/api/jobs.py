@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import uuid
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -18,7 +18,7 @@ from service.api.uploads import receive_upload
 from service.jobs.state import Job, JobState
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
-from service.pipeline.options import DEFAULT_TOLERANCE_UM, Options
+from service.pipeline.options import DEFAULT_TOLERANCE_UM, BasisName, Options, RobustMode
 from service.settings import Settings
 
 __all__ = ["router"]
@@ -70,9 +70,14 @@ async def create_job(
             "`shaper:NAME` (zv, mzv, ei, 2hump_ei, 3hump_ei) or `none`.",
         ),
     ] = "fbf",
-    basis: Annotated[
-        Literal["ce-opt", "bspline"], Query(description="Basis functions of `fbf`.")
-    ] = "ce-opt",
+    basis: Annotated[BasisName, Query(description="Basis functions of `fbf`.")] = "ce-opt",
+    robust: Annotated[
+        RobustMode,
+        Query(
+            description="What `fbf` is designed for: the nominal plant (`off`), or the machine's "
+            "plant set by least squares (`ensemble`) or for its worst member (`minimax`)."
+        ),
+    ] = "off",
     tolerance_um: Annotated[
         float,
         Query(
@@ -100,7 +105,7 @@ async def create_job(
             "Unknown machine",
             f"No machine is called {machine!r}. Known: {', '.join(builtin_machines())}.",
         )
-    options = Options(method=method, basis=basis, tolerance_um=tolerance_um)
+    options = Options(method=method, basis=basis, robust=robust, tolerance_um=tolerance_um)
     job_id = uuid.uuid4().hex
     incoming = store.incoming_dir / job_id
     try:

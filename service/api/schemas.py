@@ -35,7 +35,12 @@ class JobView(BaseModel):
                     "eta_s": 3.1,
                     "queue_position": None,
                     "machine": "ender3",
-                    "options": {"method": "fbf", "basis": "ce-opt", "tolerance_um": 2.0},
+                    "options": {
+                        "method": "fbf",
+                        "basis": "ce-opt",
+                        "robust": "off",
+                        "tolerance_um": 2.0,
+                    },
                     "source_name": "gear.gcode",
                     "source_bytes": 645932,
                     "created_at": "2025-01-31T12:00:00Z",

@@ -70,7 +70,7 @@ class PieceCompensator:
     def __init__(self, machine: Machine, options: Options, shaper: BestShaper) -> None:
         settings: dict[str, object] = {}
         if options.method == "fbf":
-            settings["basis"] = options.basis
+            settings.update(basis=options.basis, robust=options.robust)
         elif options.method == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine

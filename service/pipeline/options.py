@@ -6,16 +6,19 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["DEFAULT_TOLERANCE_UM", "Options"]
+__all__ = ["DEFAULT_TOLERANCE_UM", "BasisName", "Options", "RobustMode"]
 
 DEFAULT_TOLERANCE_UM = 2.0
+
+BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
+RobustMode = Literal["off", "ensemble", "minimax"]
 
 
 class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name.
+    with a firmware shaper's name. `basis` and `robust` are settings of `fbf`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -27,5 +30,6 @@ class Options(BaseModel):
             r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$"
         ),
     ] = "fbf"
-    basis: Literal["ce-opt", "bspline"] = "ce-opt"
+    basis: BasisName = "ce-opt"
+    robust: RobustMode = "off"
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

@@ -95,7 +95,7 @@ def test_impossible_limits(machine: Machine, command: CommandLimits) -> None:
     path, extruding, rests = strokes()
     fbf = made(machine.model_copy(update={"command": command}), path[:, 0])
     with pytest.raises(
-        DesignError, match=r"axis x: even the gentlest design .* mm/s2 and \d+ mm/s; allowed"
+        DesignError, match=r"axis x: even the gentlest design .* mm/s2, \d+ mm/s and .* mm; allowed"
     ):
         fbf.compensate(path, extruding, rests)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +14,8 @@ from compensation._preview_kernels import advance_state, run_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, bspline_basis, ce_opt_basis
 from compensation.lifted import LiftedSet
-from compensation.preview import PreviewDesign, lifted_members, lifted_plant
+from compensation.lifted_window import LiftedWindow, lifted_window
+from compensation.preview import PreviewDesign
 from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
 from models.store import load_machine
 from service.pipeline.reference_motion import reference_motion
@@ -27,9 +30,10 @@ def one_mode(f_hz: float = 45.0, zeta: float = 0.05) -> DiscretePlant:
     return discretise(ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),)), DT_S)
 
 
-def members(count: int, window: int = WINDOW, update: int = UPDATE) -> list:
+def members(count: int, window: int = WINDOW, update: int = UPDATE) -> LiftedWindow:
     f_hz = [45.0] if count == 1 else np.linspace(41.0, 49.0, count)
-    return [lifted_plant(one_mode(f), 1.0 / count, window, update) for f in f_hz]
+    plants = [one_mode(f) for f in f_hz]
+    return lifted_window(plants, np.full(count, 1.0 / count), window, update)
 
 
 def windows_of(path: np.ndarray, design: PreviewDesign) -> np.ndarray:
@@ -51,8 +55,8 @@ def run(design: PreviewDesign, path: np.ndarray) -> np.ndarray:
 def direct(design: PreviewDesign, plants: list[DiscretePlant], path: np.ndarray) -> np.ndarray:
     """The same by solving every window with lstsq, simulating sample by sample."""
     window, update = design.window, design.update
-    weights = np.sqrt([m.weight for m in design.members])
-    psi = BASES["ce-opt"](lifted_members(design.members), design.n)
+    weights = np.sqrt(design.lifted.weights)
+    psi = BASES["ce-opt"](design.lifted.lifted_set(), design.n)
     doubled = np.cumsum(np.cumsum(psi, axis=0), axis=0)
     filtered = np.concatenate([
         s * np.stack([answer(p, column) for column in doubled.T], axis=1)
@@ -90,13 +94,15 @@ def stroke(samples: int) -> np.ndarray:
     return 20 * (10 * x**3 - 15 * x**4 + 6 * x**5)
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, 2, 9])
 def test_recursion_is_the_window_solution(count: int) -> None:
     lifted = members(count)
     design = PreviewDesign(lifted, 60)
     path = np.concatenate([stroke(400), 20 - stroke(350)])
-    expected = direct(design, [m.plant for m in lifted], path)
-    np.testing.assert_allclose(run(design, path), expected, rtol=0, atol=1e-9 * 20)
+    expected = direct(design, list(lifted.plants), path)
+    # Nine members are told apart by fewer components, good to 1e-5 of the move.
+    atol = 1e-9 * 20 if count < 9 else 1e-4
+    np.testing.assert_allclose(run(design, path), expected, rtol=0, atol=atol)
 
 
 def test_price_is_a_ridge() -> None:
@@ -104,21 +110,20 @@ def test_price_is_a_ridge() -> None:
     lifted = members(1)
     free, priced = PreviewDesign(lifted, 60), PreviewDesign(lifted, 60, price=0.3)
     path = stroke(WINDOW)
-    m = lifted[0]
-    stacked = np.concatenate([m.integrated @ free.basis, np.sqrt(0.3) * free.basis])
+    stacked = np.concatenate([lifted.integrated[0] @ free.basis, np.sqrt(0.3) * free.basis])
     c = np.linalg.lstsq(stacked, np.append(path, np.zeros(WINDOW)), rcond=1e-14)[0]
     u = np.cumsum(np.cumsum(free.basis @ c))[:UPDATE]
     np.testing.assert_allclose(priced.path_gain @ path, u, atol=1e-8)
 
 
-def test_lifted_plant_is_the_simulation() -> None:
+def test_lifted_window_is_the_simulation() -> None:
     plant = one_mode()
-    lifted = lifted_plant(plant, 1.0, 40, 20)
+    lifted = lifted_window([plant], [1.0], 40, 20)
     rng = np.random.default_rng(1)
     v, x, (u1, u2) = rng.normal(size=40), rng.normal(size=plant.order), rng.normal(size=2)
     doubled = np.cumsum(np.cumsum(v))
     free = u1 + np.arange(1.0, 41.0) * (u1 - u2)
-    predicted = lifted.integrated @ v + lifted.from_state @ x + lifted.from_history @ [u1, u2]
+    predicted = lifted.integrated[0] @ v + lifted.from_state[0] @ [*x, u1, u2]
     np.testing.assert_allclose(predicted, answer(plant, free + doubled, x), atol=1e-9)
     u = rng.normal(size=20)
     after = lifted.advance @ x + lifted.drive @ u
@@ -128,13 +133,13 @@ def test_lifted_plant_is_the_simulation() -> None:
 @pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("n", [4, 20, 45])
 def test_bases_are_orthonormal(basis: str, n: int) -> None:
-    psi = BASES[basis](lifted_members(members(1, 150, 75)), n)
+    psi = BASES[basis](members(1, 150, 75).lifted_set(), n)
     assert psi.shape == (150, n)
     np.testing.assert_allclose(psi.T @ psi, np.eye(n), atol=1e-10)
 
 
 def test_ce_opt_are_singular_vectors() -> None:
-    g = members(1, 150, 75)[0].integrated
+    g = members(1, 150, 75).integrated[0]
     psi = ce_opt_basis(g.T @ g, 12)
     _, sigma, vt = np.linalg.svd(g)
     assert np.all(np.diff(sigma[:13]) < 0)
@@ -171,7 +176,7 @@ def test_unstable_design_is_refused(window: int, update: int, n: int) -> None:
     """Short windows, or n / window near 1, on a non-minimum-phase axis (METHOD 3)."""
     taz = plant_set(load_machine("taz6-x").axes["x"], DT_S).nominal
     with pytest.raises(DesignError, match=r"spectral radius \d+\.\d+, limit 0.9; take a longer"):
-        PreviewDesign([lifted_plant(taz, 1.0, window, update)], n)
+        PreviewDesign(lifted_window([taz], [1.0], window, update), n)
 
 
 def test_nearly_dependent_basis_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,8 +194,8 @@ def test_nearly_dependent_basis_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
 def test_no_drift(machine: str) -> None:
     """rho(F) < 1 is the stability test: the state of a standing machine fades."""
     plant = plant_set(load_machine(machine).axes["x"], DT_S).nominal
-    design = PreviewDesign([lifted_plant(plant, 1.0, WINDOW, UPDATE)], 60, price=0.03)
-    z = design.rest_state(100.0)
+    design = PreviewDesign(lifted_window([plant], [1.0], WINDOW, UPDATE), 60, price=0.03)
+    z = design.lifted.rest_state(100.0)
     u = np.empty(UPDATE * 400)
     views = np.full((400, WINDOW), 100.0)
     z[:-2] += 1.0
@@ -249,3 +254,57 @@ def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
     kept = x.copy()
     np.testing.assert_allclose(advance_state(a, b, x, u), expected, atol=1e-10)
     np.testing.assert_array_equal(x, kept)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ([0.5, 0.6], r"sum to 1 \(given: smallest 0.5, sum 1.1\)"),
+        ([1.5, -0.5], "positive"),
+        ([1.0], "2 plants but 1 weights"),
+    ],
+)
+def test_wrong_weights(weights: list[float], message: str) -> None:
+    with pytest.raises(DesignError, match=message):
+        lifted_window([one_mode(40.0), one_mode(50.0)], weights, 60, 30)
+
+
+def test_wrong_sets() -> None:
+    with pytest.raises(DesignError, match="set is empty"):
+        lifted_window([], [], 60, 30)
+    good = one_mode()
+    unstable = dataclasses.replace(good, a=1.2 * good.a)
+    with pytest.raises(DesignError, match=r"plant 1 of the set is unstable .* below 1"):
+        lifted_window([good, unstable], [0.5, 0.5], 60, 30)
+    with pytest.raises(DesignError, match="between 2 and the window's 60"):
+        lifted_window([good], [1.0], 60, 61)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(0, 2**31), st.integers(2, 8))
+def test_components_are_the_members(seed: int, count: int) -> None:
+    """The components' weighted errors add up to the members', up to what no command changes."""
+    rng = np.random.default_rng(seed)
+    plants = [
+        one_mode(f, z)
+        for f, z in zip(rng.uniform(30, 60, count), rng.uniform(0.02, 0.2, count), strict=True)
+    ]
+    weights = rng.dirichlet(np.full(count, 3.0))
+    lifted = lifted_window(plants, weights, 60, 30)
+    path, square = rng.normal(size=60), rng.uniform(0.1, 1.0, 60)
+    z = rng.normal(size=lifted.states)
+    free = z[-2] + np.arange(1.0, 61.0) * (z[-2] - z[-1])
+
+    def costs(v: np.ndarray) -> tuple[float, float]:
+        u = free + np.cumsum(np.cumsum(v))
+        row, members = 0, 0.0
+        for p, w in zip(plants, weights, strict=True):
+            y = answer(p, u, z[row : row + p.order])
+            members += w * square @ (path - y) ** 2
+            row += p.order
+        error = lifted.target[:, None] * path - lifted.from_state @ z - lifted.integrated @ v
+        return members, float(np.sum(error**2 @ square))
+
+    # The part that no command changes drops out of differences.
+    a, b = (costs(0.01 * rng.normal(size=60)) for _ in range(2))
+    assert a[0] - b[0] == pytest.approx(a[1] - b[1], rel=1e-3, abs=1e-3 * max(a[0], b[0]))

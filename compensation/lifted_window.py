@@ -1,0 +1,183 @@
+"""A plant, or a weighted set of plants, over one preview window.
+
+The members of a set answer almost alike. Their responses to command increments, as rows sqrt(l_j)
+h_j of one matrix, are therefore written in its leading right singular vectors: a few *components*
+whose squared errors add up to those of all members, whatever the weights of the samples. A set of
+ten costs about as much as five plants, and one plant is its own component.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, toeplitz
+
+from compensation.base import DesignError
+from compensation.lifted import LiftedSet, lifted_set
+from models.plants import DiscretePlant
+
+__all__ = ["LiftedWindow", "lifted_window"]
+
+Array = NDArray[np.float64]
+
+_TOLERANCE = 1e-5
+"""Components below this share of the largest are left out: of a move of 10 mm, .1 um."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiftedWindow:
+    """Plants lifted over a window, seen from the increments v of the command.
+
+    With z = [x_1 .. x_l, u1, u2] (states of all members, last two commands), component k of the
+    error over the window is
+
+        target[k] y_d - from_state[k] z - integrated[k] v
+
+    Attributes
+    ----------
+    plants : tuple of DiscretePlant
+    weights : ndarray, shape (l,)
+    update : int
+        Samples that are committed before the next window starts.
+    integrated : ndarray, shape (components, window, window)
+        Lower-triangular Toeplitz: increments to position.
+    target : ndarray, shape (components,)
+    from_state : ndarray, shape (components, window, nz)
+        Free response, the command going on in a straight line.
+    advance : ndarray, shape (nz - 2, nz - 2)
+        States after `update` samples without a command.
+    drive : ndarray, shape (nz - 2, update)
+        States after `update` samples, from those samples of the command.
+    """
+
+    plants: tuple[DiscretePlant, ...]
+    weights: Array
+    update: int
+    integrated: Array
+    target: Array
+    from_state: Array
+    advance: Array
+    drive: Array
+
+    @property
+    def window(self) -> int:
+        """Samples in the window."""
+        return int(self.integrated.shape[1])
+
+    @property
+    def states(self) -> int:
+        """Size nz of z."""
+        return int(self.from_state.shape[2])
+
+    def lifted_set(self) -> LiftedSet:
+        """Return what a basis needs to know: Gram matrix and mean of the integrated plants."""
+        markov = np.array([_integrated_markov(p, self.window) for p in self.plants])
+        return lifted_set(markov, self.weights)
+
+    def rest_state(self, position_mm: float) -> Array:
+        """Vector z of an axis that stands at `position_mm`."""
+        parts = [p.rest_state(position_mm) for p in self.plants]
+        return np.concatenate([*parts, np.full(2, position_mm)])
+
+
+def lifted_window(
+    plants: Sequence[DiscretePlant], weights: Sequence[float] | Array, window: int, update: int
+) -> LiftedWindow:
+    """Lift plants over a window (first-order-hold models, D != 0 allowed).
+
+    Parameters
+    ----------
+    plants : sequence of DiscretePlant
+    weights : sequence of float
+        Of the members, positive, sum 1.
+    window, update : int
+        Samples in the window and samples committed.
+
+    Raises
+    ------
+    DesignError
+        For an empty set, weights that do not fit, an unstable member, or update > window.
+    """
+    share = np.asarray(weights, float)
+    _check(plants, share, window, update)
+    roots = np.sqrt(share)
+    markov = np.array([_integrated_markov(p, window) for p in plants])
+    u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
+    count = int(np.sum(s > _TOLERANCE * s[0]))
+    # Singular vectors are free in sign; fix it so that the same model gives the same bytes.
+    sign = np.sign(vt[np.arange(len(s)), np.argmax(np.abs(vt), axis=1)])
+    mix = (u * sign)[:, :count].T * roots
+    components = (s * sign)[:count, None] * vt[:count]
+
+    zeros = np.zeros(window)
+    step = np.arange(1.0, window + 1.0)
+    straight = np.stack([step + 1.0, -step], axis=1)
+    history = [toeplitz(np.diff(m, 2, prepend=[0.0, 0.0]), zeros) @ straight for m in markov]
+    free = [_free_response(p, window) for p in plants]
+    return LiftedWindow(
+        plants=tuple(plants),
+        weights=share,
+        update=update,
+        integrated=np.array([toeplitz(c, zeros) for c in components]),
+        target=mix.sum(axis=1),
+        from_state=np.array(
+            [
+                np.concatenate(
+                    [
+                        *(m * f for m, f in zip(row, free, strict=True)),
+                        sum(m * h for m, h in zip(row, history, strict=True)),
+                    ],
+                    axis=1,
+                )
+                for row in mix
+            ]
+        ),
+        advance=block_diag(*(np.linalg.matrix_power(p.a, update) for p in plants)),
+        drive=np.concatenate([_drive(p, update) for p in plants]),
+    )
+
+
+def _integrated_markov(plant: DiscretePlant, window: int) -> Array:
+    return np.cumsum(np.cumsum(plant.impulse_response(window)))
+
+
+def _free_response(plant: DiscretePlant, window: int) -> Array:
+    rows = np.empty((window, plant.order))
+    row = plant.c
+    for k in range(window):
+        rows[k] = row
+        row = row @ plant.a
+    return rows
+
+
+def _drive(plant: DiscretePlant, update: int) -> Array:
+    columns = np.empty((plant.order, update))
+    column = plant.b
+    for k in range(update - 1, -1, -1):
+        columns[:, k] = column
+        column = plant.a @ column
+    return columns
+
+
+def _check(plants: Sequence[DiscretePlant], weights: Array, window: int, update: int) -> None:
+    if len(plants) == 0:
+        raise DesignError("the plant set is empty; give at least one plant")
+    if len(weights) != len(plants):
+        raise DesignError(f"{len(plants)} plants but {len(weights)} weights; one weight each")
+    if not (np.all(weights > 0) and abs(weights.sum() - 1.0) < 1e-9):
+        raise DesignError(
+            f"weights of a set must be positive and sum to 1 (given: smallest "
+            f"{weights.min():.4g}, sum {weights.sum():.6g}); leave out members of no weight"
+        )
+    if not 2 <= update <= window:
+        raise DesignError(f"update of {update} samples: between 2 and the window's {window} needed")
+    for j, plant in enumerate(plants):
+        radius = float(np.max(np.abs(plant.poles()), initial=0.0))
+        if not radius < 1.0:
+            raise DesignError(
+                f"plant {j} of the set is unstable (largest pole |z| = {radius:.6g}, below 1 "
+                "needed); a printer's axis is stable: fit the model again"
+            )

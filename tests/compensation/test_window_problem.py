@@ -1,0 +1,102 @@
+"""One window by itself: the unconstrained solution, pinned rests, and bounds, against scipy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import LinearConstraint, minimize
+
+from compensation.lifted_window import lifted_window
+from compensation.preview import PreviewDesign
+from compensation.window_problem import Bounds, solve_window
+from models.plants import Mode, ModesSpec, discretise
+
+DT_S = 1e-3
+WINDOW, UPDATE = 120, 60
+NO_RESTS = np.zeros((0, 2), np.int64)
+WIDE = Bounds(1e3, 1e3, -1e6, 1e6)
+
+
+@pytest.fixture(scope="module", params=[1, 5], ids=["one plant", "a set"])
+def design(request: pytest.FixtureRequest) -> PreviewDesign:
+    count = request.param
+    f_hz = [45.0] if count == 1 else np.linspace(40.0, 50.0, count)
+    plants = [discretise(ModesSpec(modes=(Mode(f_hz=f, zeta=0.05),)), DT_S) for f in f_hz]
+    lifted = lifted_window(plants, np.full(count, 1.0 / count), WINDOW, UPDATE)
+    return PreviewDesign(lifted, 24, price=0.1)
+
+
+def corner() -> np.ndarray:
+    k = np.arange(1.0, WINDOW + 1.0)
+    return np.minimum(0.1 * k, 5.0)
+
+
+def standing(design: PreviewDesign) -> np.ndarray:
+    return design.lifted.rest_state(0.0)
+
+
+def test_without_rests_it_is_the_recursion(design: PreviewDesign) -> None:
+    z = np.random.default_rng(3).normal(0, 1e-3, design.lifted.states)
+    alone = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
+    expected = design.command_gain @ z + design.path_gain @ corner()
+    np.testing.assert_allclose(alone[:UPDATE], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["accel", "speed", "travel"])
+def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> None:
+    z, path = standing(design), corner()
+    free = solve_window(design, z, path, np.ones(WINDOW), NO_RESTS, WIDE)
+    whole = np.concatenate([[0.0, 0.0], free])
+    accel, speed = np.abs(np.diff(whole, 2)).max(), np.abs(np.diff(whole)).max()
+    bounds = {
+        "accel": Bounds(0.7 * accel, 1e3, -1e6, 1e6),
+        "speed": Bounds(1e3, 0.95 * speed, -1e6, 1e6),
+        "travel": Bounds(1e3, 1e3, -1e6, 5.001),
+    }[kind]
+    assert not all(bounds.kept(np.diff(whole, 2), np.diff(whole), free))
+    bounded = solve_window(design, z, path, np.ones(WINDOW), NO_RESTS, bounds)
+    moved = np.concatenate([[0.0, 0.0], bounded])
+    assert all(bounds.kept(np.diff(moved, 2), np.diff(moved), bounded))
+
+    # The same quadratic programme by scipy, from the definition.
+    stacked = np.concatenate([*design.filtered, np.sqrt(design.price) * design.basis])
+    wanted = np.concatenate([*(t * path for t in design.lifted.target), np.zeros(WINDOW)])
+    first = np.cumsum(design.basis, axis=0)
+    rows, low, high = {
+        "accel": (design.basis, -bounds.accel, bounds.accel),
+        "speed": (first, -bounds.speed, bounds.speed),
+        "travel": (np.cumsum(first, axis=0), -np.inf, bounds.high_mm),
+    }[kind]
+
+    def cost(c: np.ndarray) -> tuple[float, np.ndarray]:
+        error = stacked @ c - wanted
+        return 0.5 * error @ error, stacked.T @ error
+
+    found = minimize(cost, np.zeros(design.n), jac=True, method="trust-constr",
+                     constraints=[LinearConstraint(rows, low, high)],
+                     options={"gtol": 1e-10, "xtol": 1e-12, "maxiter": 3000})  # fmt: skip
+    ours = np.linalg.lstsq(np.cumsum(first, axis=0), bounded, rcond=None)[0]
+    assert cost(ours)[0] <= cost(found.x)[0] * (1 + 1e-3) + 1e-9
+
+
+def test_rests_are_kept_within_bounds(design: PreviewDesign) -> None:
+    path = np.concatenate([0.05 * np.arange(1.0, 51.0), np.full(30, 2.5), np.linspace(2.5, 5, 40)])
+    rests = np.array([[50, 80]])
+    free = solve_window(design, standing(design), path, np.ones(WINDOW), rests, WIDE)
+    bend = np.diff(np.concatenate([[0.0, 0.0], free]), 2)
+    limit = 0.8 * np.abs(bend).max()
+    bounds = Bounds(limit, 1e3, -1e6, 1e6)
+    kept = solve_window(design, standing(design), path, np.ones(WINDOW), rests, bounds)
+    for command in (free, kept):
+        np.testing.assert_array_equal(command[49:80], path[49])
+    assert np.abs(np.diff(np.concatenate([[0.0, 0.0], kept]), 2)).max() <= limit * (1 + 1e-9)
+
+
+def test_impossible_bounds_are_left_to_the_caller(design: PreviewDesign) -> None:
+    """A window that starts at speed cannot stop at once; the free solution comes back."""
+    z = standing(design)
+    z[-1] = -0.1
+    tight = Bounds(1e-6, 1e3, -1e6, 1e-3)
+    free = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
+    found = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, tight)
+    np.testing.assert_array_equal(found, free)
