@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from compensation.base import DesignError
 from compensation.lifted import LiftedSet
+from compensation.operators import LiftedOperator
 
 __all__ = [
     "BASES",
@@ -25,6 +26,7 @@ __all__ = [
     "bspline_basis",
     "bspline_functions",
     "ce_opt_basis",
+    "ce_opt_basis_of",
     "dct_basis",
     "orthonormal",
     "robust_basis",
@@ -108,6 +110,22 @@ def ce_opt_basis(gram: Array, n: int) -> Array:
     _check(n, len(gram))
     _, vectors = np.linalg.eigh(gram)
     return _signed(vectors[:, ::-1][:, :n])
+
+
+def ce_opt_basis_of(plant: LiftedOperator, n: int) -> Array:
+    """`ce_opt_basis` of one plant by Lanczos steps, for paths too long for a Gram matrix.
+
+    Only products with G and G' are made: 600 functions of 10 000 samples take seconds and a tenth
+    of the memory. At most m - 1 functions; for more than some m / 5 the Gram matrix is faster.
+    """
+    m = plant.shape[1]
+    _check(n, m - 1)
+    from scipy.sparse.linalg import svds  # slow to import, seldom needed
+
+    # A start of our own makes the result repeatable.
+    start = np.cos(np.arange(m) ** 1.5)
+    _, sigma, vt = svds(plant.as_linear_operator(), k=n, v0=start)
+    return _signed(np.asarray(vt[np.argsort(-sigma)].T, np.float64))
 
 
 def robust_basis(

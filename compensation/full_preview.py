@@ -325,6 +325,9 @@ def _check_basis(basis: Array, cols: int) -> None:
         raise DesignError(f"{n} functions for {cols} input samples: take 1 to {cols}")
     if not np.isfinite(basis).all():
         raise DesignError("the basis holds values that are not finite")
+    gram = basis.T @ basis
+    if np.abs(gram - np.eye(n)).max() < 1e-6:
+        return  # orthonormal, as all bases of `compensation.basis` are
     sigma = svdvals(np.linalg.qr(basis, mode="r"))
     rank = int(np.sum(sigma > _DEPENDENT * sigma[0]))
     if rank < n:

@@ -12,6 +12,7 @@ from compensation.basis import (
     BASES,
     bspline_functions,
     ce_opt_basis,
+    ce_opt_basis_of,
     dct_basis,
     orthonormal,
     robust_basis,
@@ -101,6 +102,15 @@ def test_ce_opt_needs_least_effort() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         assert effort(orthonormal(rng.normal(size=(M, 10)))) > least
+
+
+def test_ce_opt_by_lanczos() -> None:
+    g = lift(markov(count=1)[0], M)
+    got = ce_opt_basis_of(g, 15)
+    np.testing.assert_allclose(got, ce_opt_basis(g.dense().T @ g.dense(), 15), atol=1e-7)
+    np.testing.assert_array_equal(got, ce_opt_basis_of(g, 15))
+    with pytest.raises(DesignError, match="n = 80 "):
+        ce_opt_basis_of(g, M)
 
 
 def test_robust_is_422_with_428() -> None:
