@@ -204,6 +204,20 @@ def test_several_axes(outputs: int) -> None:
     np.testing.assert_allclose(by_grams.command(y_d), phi @ gamma, atol=1e-6)
 
 
+def test_more_functions_than_outputs() -> None:
+    """Two inputs, one output: the shortest of many commands, and no error."""
+    rng = np.random.default_rng(5)
+    g = BlockOperator([[ToeplitzOperator([2.0, *rng.uniform(size=M - 1) * 0.5 ** np.arange(M - 1)]),
+                        ToeplitzOperator([1.0] + (M - 1) * [0.0])]])  # fmt: skip
+    phi = np.linalg.qr(rng.normal(size=(2 * M, M + 30)))[0]
+    y_d = rng.normal(size=M)
+    design = FullPreview(g, phi)
+    assert (design.report.rank, design.report.unique) == (M, False)
+    gamma = np.linalg.lstsq(g.dense() @ phi, y_d, rcond=None)[0]
+    np.testing.assert_allclose(design.coefficients(y_d), gamma, atol=1e-9)
+    np.testing.assert_allclose(g.apply(design.command(y_d)), y_d, atol=1e-9)
+
+
 def test_filter_states_restore_independence() -> None:
     """Appendix C: n = M with a zero at 2 is dependent; filter states of 1e-3 cure it."""
     plant, samples = first_order(2.0), 101
