@@ -113,10 +113,10 @@ def figures_2(seeds: int, quick: bool) -> Iterator[Row]:
         )
         u = effort[name].mean(axis=0)
         note = {
-            "DCT": f"seeds {u.min():.3g} to {u.max():.3g}: a = 1.1 alone makes the mean",
+            "DCT": f"seeds {u.min():.3g} to {u.max():.3g}: the zeros just beyond 1 make the mean",
             "B-splines": "the rank tolerance of 1e-12 decides; with none it is rounding noise, "
             f"{np.mean(unlimited):.0e}",
-            "CE-Opt": "the largest part comes from a = -1",
+            "CE-Opt": f"{len(places)} zeros at equal distances (the paper's are not printed)",
         }[name]
         yield f"table 3.1 {name}: u/y_d", f"{paper[name][1]:.3g}", plus_minus(u), note
 
