@@ -18,6 +18,7 @@ import json
 import math
 import os
 import tempfile
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -31,7 +32,14 @@ from service.pipeline.reference_motion import reference_motion
 from simulation.measures import Tally, contour_error, distance_to_path, tracking_error
 from simulation.response import response
 
-__all__ = ["FREQUENCIES_HZ", "BestShaper", "cached_shaper", "evaluate_shaper", "tune_shaper"]
+__all__ = [
+    "FREQUENCIES_HZ",
+    "BestShaper",
+    "cached_shaper",
+    "evaluate_shaper",
+    "tune_each",
+    "tune_shaper",
+]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -41,7 +49,7 @@ _VERSION = 1
 """Part of the cache's name; rises when the definition changes."""
 _COARSE = 4
 _COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
-_STARTS, _FINALISTS = 4, 6
+_STARTS, _FINALISTS, _FINALISTS_EACH = 4, 6, 2
 _REST_S = 0.12
 """Longer than the longest shaper, 3hump_ei at 20 Hz: 0.1 s."""
 
@@ -84,18 +92,7 @@ def tune_shaper(
     trial = _Trial(machine, y_d_mm, dt_s, extruding)
     finalists: list[tuple[float, str, int, int]] = []
     for kind in SHAPERS:
-        coarse = trial.points(_COARSE_POINTS)
-        fine = trial.points(_FINE_POINTS)
-        grid = range(0, len(FREQUENCIES_HZ), _COARSE)
-        rough = sorted((trial.rms(kind, i, j, coarse), i, j) for i in grid for j in grid)
-        starts: list[tuple[int, int]] = []
-        for _, i, j in rough:
-            if all(max(abs(i - a), abs(j - b)) > 2 * _COARSE for a, b in starts):
-                starts.append((i, j))
-            if len(starts) == _STARTS:
-                break
-        floors = {_descend(trial, kind, start, fine) for start in starts}
-        finalists += [(value, kind, i, j) for value, i, j in floors]
+        finalists += [(value, kind, i, j) for value, i, j in _floors(trial, kind)]
         trial.forget()
     _, i, j, kind = min(
         (*_descend(trial, kind, (i, j), trial.points(_FINAL_POINTS)), kind)
@@ -104,6 +101,27 @@ def tune_shaper(
     return evaluate_shaper(
         machine, y_d_mm, dt_s, extruding, kind, float(FREQUENCIES_HZ[i]), float(FREQUENCIES_HZ[j])
     )
+
+
+def tune_each(
+    machine: Machine,
+    y_d_mm: Array,
+    dt_s: float,
+    extruding: NDArray[np.bool_],
+    kinds: Iterable[str] = SHAPERS,
+) -> dict[str, BestShaper]:
+    """Find the best frequencies of every type of shaper by itself; see `tune_shaper`."""
+    trial = _Trial(machine, y_d_mm, dt_s, extruding)
+    best = {}
+    for kind in kinds:
+        _, i, j = min(
+            _descend(trial, kind, (i, j), trial.points(_FINAL_POINTS))
+            for _, i, j in sorted(_floors(trial, kind))[:_FINALISTS_EACH]
+        )
+        trial.forget()
+        fx_hz, fy_hz = float(FREQUENCIES_HZ[i]), float(FREQUENCIES_HZ[j])
+        best[kind] = evaluate_shaper(machine, y_d_mm, dt_s, extruding, kind, fx_hz, fy_hz)
+    return best
 
 
 def evaluate_shaper(
@@ -221,6 +239,20 @@ def _shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: I
         out += weight * (1 - part) * answer[np.clip(index - whole, 0, last)]
         out += weight * part * answer[np.clip(index - whole - 1, 0, last)]
     return out
+
+
+def _floors(trial: _Trial, kind: str) -> set[tuple[float, int, int]]:
+    """Return the floors of the deepest valleys of one type: rms on many points, frequencies."""
+    coarse, fine = trial.points(_COARSE_POINTS), trial.points(_FINE_POINTS)
+    grid = range(0, len(FREQUENCIES_HZ), _COARSE)
+    rough = sorted((trial.rms(kind, i, j, coarse), i, j) for i in grid for j in grid)
+    starts: list[tuple[int, int]] = []
+    for _, i, j in rough:
+        if all(max(abs(i - a), abs(j - b)) > 2 * _COARSE for a, b in starts):
+            starts.append((i, j))
+        if len(starts) == _STARTS:
+            break
+    return {_descend(trial, kind, start, fine) for start in starts}
 
 
 def _descend(
