@@ -44,7 +44,10 @@ class LiftedWindow:
         Samples that are committed before the next window starts.
     integrated : ndarray, shape (components, window, window)
         Lower-triangular Toeplitz: increments to position.
+    mix : ndarray, shape (components, l)
+        What each member's error counts in each component.
     target : ndarray, shape (components,)
+        Its sum over the members: the share of a path that all of them shall follow.
     from_state : ndarray, shape (components, window, nz)
         Free response, the command going on in a straight line.
     advance : ndarray, shape (nz - 2, nz - 2)
@@ -57,6 +60,7 @@ class LiftedWindow:
     weights: Array
     update: int
     integrated: Array
+    mix: Array
     target: Array
     from_state: Array
     advance: Array
@@ -122,6 +126,7 @@ def lifted_window(
         weights=share,
         update=update,
         integrated=np.array([toeplitz(c, zeros) for c in components]),
+        mix=mix,
         target=mix.sum(axis=1),
         from_state=np.array(
             [

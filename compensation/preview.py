@@ -53,8 +53,10 @@ class PreviewDesign:
     window, update : int
     command_gain, path_gain : ndarray
         E, shape (update, nz), and S, shape (update, window).
-    state_gain, state_path_gain : ndarray
-        F, shape (nz, nz), and H, shape (nz, window).
+    target_gain : ndarray, shape (components, update, window)
+        The same for targets of each component's own; weighted by `lifted.target` they sum to S.
+    state_gain, state_drive : ndarray
+        F, shape (nz, nz), and what z becomes by S y_d, shape (nz, update): H = state_drive S.
     basis : ndarray, shape (window, n)
         Psi scaled so that its filtered columns are orthonormal over the (weighted) members.
     filtered : ndarray, shape (components, window, n)
@@ -96,6 +98,7 @@ class PreviewDesign:
         solve = np.linalg.solve(np.eye(n) + price * self.effort, q.T).reshape(n, -1, window)
         summed = np.cumsum(np.cumsum(self.basis, axis=0), axis=0)[:update]
         step = np.arange(1.0, update + 1.0)
+        self.target_gain = np.einsum("un,nkw->kuw", summed, solve)
         self.path_gain = summed @ np.einsum("nkw,k->nw", solve, lifted.target)
         self.command_gain = -summed @ np.einsum("nkw,kwz->nz", solve, lifted.from_state)
         self.command_gain[:, -2:] += np.stack([step + 1.0, -step], axis=1)
@@ -110,15 +113,13 @@ class PreviewDesign:
 
     def _condense(self) -> None:
         lifted = self.lifted
-        f = lifted.drive @ self.command_gain
-        f[:, :-2] += lifted.advance
-        # The last two commands, newest first.
-        self.state_gain = np.concatenate([f, self.command_gain[-1:-3:-1]])
-        self.state_path_gain = np.concatenate(
-            [lifted.drive @ self.path_gain, self.path_gain[-1:-3:-1]]
-        )
+        # The last two commands, newest first, follow the members' states.
+        self.state_drive = np.concatenate([lifted.drive, np.eye(lifted.update)[-1:-3:-1]])
+        self.state_gain = self.state_drive @ self.command_gain
+        self.state_gain[:-2, :-2] += lifted.advance
 
     def advanced(self, z: Array, committed: Array) -> Array:
         """State z after the `update` committed samples of a command."""
-        states = self.lifted.advance @ z[:-2] + self.lifted.drive @ committed
-        return np.concatenate([states, committed[-1:-3:-1]])
+        following = self.state_drive @ committed
+        following[:-2] += self.lifted.advance @ z[:-2]
+        return np.asarray(following)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.modal import modal_form
 from models.plants import DiscretePlant
-from simulation._response_kernels import dense_response, modal_response
+from models.response_kernels import dense_response, modal_response
 
 __all__ = ["PlantStream", "response"]
 

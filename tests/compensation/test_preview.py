@@ -47,7 +47,8 @@ def run(design: PreviewDesign, path: np.ndarray) -> np.ndarray:
     views = windows_of(path, design)
     u = np.empty(len(views) * design.update)
     z = np.zeros(len(design.state_gain))
-    drives = views @ design.path_gain.T, views @ design.state_path_gain.T
+    driven = views @ design.path_gain.T
+    drives = driven, driven @ design.state_drive.T
     run_windows(design.command_gain, design.state_gain, *drives, z, 0, len(views), u)
     return u
 
@@ -199,8 +200,9 @@ def test_no_drift(machine: str) -> None:
     u = np.empty(UPDATE * 400)
     views = np.full((400, WINDOW), 100.0)
     z[:-2] += 1.0
-    run_windows(design.command_gain, design.state_gain, views @ design.path_gain.T,
-                views @ design.state_path_gain.T, z, 0, 400, u)  # fmt: skip
+    driven = views @ design.path_gain.T
+    run_windows(design.command_gain, design.state_gain, driven, driven @ design.state_drive.T,
+                z, 0, 400, u)  # fmt: skip
     np.testing.assert_allclose(u[-UPDATE:], 100.0, atol=1e-5)
 
 

@@ -26,6 +26,10 @@ def design(request: pytest.FixtureRequest) -> PreviewDesign:
     return PreviewDesign(lifted, 24, price=0.1)
 
 
+def solve(design: PreviewDesign, z: np.ndarray, path: np.ndarray, *rest: object) -> np.ndarray:
+    return solve_window(design, z, path, design.lifted.target[:, None] * path, *rest)
+
+
 def corner() -> np.ndarray:
     k = np.arange(1.0, WINDOW + 1.0)
     return np.minimum(0.1 * k, 5.0)
@@ -37,7 +41,7 @@ def standing(design: PreviewDesign) -> np.ndarray:
 
 def test_without_rests_it_is_the_recursion(design: PreviewDesign) -> None:
     z = np.random.default_rng(3).normal(0, 1e-3, design.lifted.states)
-    alone = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
+    alone = solve(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
     expected = design.command_gain @ z + design.path_gain @ corner()
     np.testing.assert_allclose(alone[:UPDATE], expected, atol=1e-7)
 
@@ -45,7 +49,7 @@ def test_without_rests_it_is_the_recursion(design: PreviewDesign) -> None:
 @pytest.mark.parametrize("kind", ["accel", "speed", "travel"])
 def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> None:
     z, path = standing(design), corner()
-    free = solve_window(design, z, path, np.ones(WINDOW), NO_RESTS, WIDE)
+    free = solve(design, z, path, np.ones(WINDOW), NO_RESTS, WIDE)
     whole = np.concatenate([[0.0, 0.0], free])
     accel, speed = np.abs(np.diff(whole, 2)).max(), np.abs(np.diff(whole)).max()
     bounds = {
@@ -54,7 +58,7 @@ def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> 
         "travel": Bounds(1e3, 1e3, -1e6, 5.001),
     }[kind]
     assert not all(bounds.kept(np.diff(whole, 2), np.diff(whole), free))
-    bounded = solve_window(design, z, path, np.ones(WINDOW), NO_RESTS, bounds)
+    bounded = solve(design, z, path, np.ones(WINDOW), NO_RESTS, bounds)
     moved = np.concatenate([[0.0, 0.0], bounded])
     assert all(bounds.kept(np.diff(moved, 2), np.diff(moved), bounded))
 
@@ -82,11 +86,11 @@ def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> 
 def test_rests_are_kept_within_bounds(design: PreviewDesign) -> None:
     path = np.concatenate([0.05 * np.arange(1.0, 51.0), np.full(30, 2.5), np.linspace(2.5, 5, 40)])
     rests = np.array([[50, 80]])
-    free = solve_window(design, standing(design), path, np.ones(WINDOW), rests, WIDE)
+    free = solve(design, standing(design), path, np.ones(WINDOW), rests, WIDE)
     bend = np.diff(np.concatenate([[0.0, 0.0], free]), 2)
     limit = 0.8 * np.abs(bend).max()
     bounds = Bounds(limit, 1e3, -1e6, 1e6)
-    kept = solve_window(design, standing(design), path, np.ones(WINDOW), rests, bounds)
+    kept = solve(design, standing(design), path, np.ones(WINDOW), rests, bounds)
     for command in (free, kept):
         np.testing.assert_array_equal(command[49:80], path[49])
     assert np.abs(np.diff(np.concatenate([[0.0, 0.0], kept]), 2)).max() <= limit * (1 + 1e-9)
@@ -97,6 +101,6 @@ def test_impossible_bounds_are_left_to_the_caller(design: PreviewDesign) -> None
     z = standing(design)
     z[-1] = -0.1
     tight = Bounds(1e-6, 1e3, -1e6, 1e-3)
-    free = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
-    found = solve_window(design, z, corner(), np.ones(WINDOW), NO_RESTS, tight)
+    free = solve(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
+    found = solve(design, z, corner(), np.ones(WINDOW), NO_RESTS, tight)
     np.testing.assert_array_equal(found, free)

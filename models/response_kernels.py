@@ -1,4 +1,7 @@
-"""Loops of the plant response; `simulation.response` gives them names and checks."""
+"""Loops of the plant response; `simulation.response` gives them names and checks.
+
+They lie here because a compensator too asks what its plants will do.
+"""
 
 from __future__ import annotations
 

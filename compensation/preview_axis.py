@@ -1,0 +1,308 @@
+"""One axis in limited preview: its designs, the state of its plants, and the command of a piece."""
+
+from __future__ import annotations
+
+from collections.abc import Set
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation._preview_kernels import advance_state, run_windows
+from compensation.basis import BASES
+from compensation.lifted_window import LiftedWindow, lifted_window
+from compensation.preview import PreviewDesign
+from compensation.window_problem import TRAVEL_SLACK_MM, Bounds, solve_window
+from models.plants import DiscretePlant
+from models.response_kernels import dense_response
+
+__all__ = [
+    "GENTLE_RUNG",
+    "LADDER",
+    "WEIGHT_REST",
+    "WEIGHT_TRAVEL",
+    "AxisCommand",
+    "AxisTask",
+    "Designs",
+    "PreviewAxis",
+    "Rung",
+    "changes",
+    "designs",
+]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Rung:
+    """One step of the ladder: number of functions (per 300 samples) and price of acceleration."""
+
+    n: int
+    price: float
+
+
+LADDER = (
+    *(Rung(90, price) for price in (0.03, 0.1, 0.3, 1.0)),
+    *(Rung(n, 3.0) for n in (75, 60, 45, 34, 26, 18)),
+)
+"""Designs from the most accurate to the gentlest."""
+GENTLE_RUNG = 3
+"""The last one with all functions: further down smoothness costs accuracy."""
+
+REST_FUNCTIONS = 64
+"""Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
+WEIGHT_TRAVEL = 0.3
+WEIGHT_REST = 0.05
+_NESTED = {"ce-opt", "robust", "dct"}
+"""Bases whose functions for n are the first n of those for more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisTask:
+    """What an axis shall do in one piece.
+
+    Attributes
+    ----------
+    path_mm : ndarray, shape (n,)
+        Planned positions; the command starts and ends on them.
+    weight : ndarray, shape (n,)
+        Weight of the errors in windows that hold a rest.
+    stops : ndarray of int64, shape (k, 2)
+        Ranges [a, b) of samples in which the command stands, those before and behind the piece
+        included.
+    bounds : Bounds
+    rms_limit_mm_s2 : float
+        Rms acceleration of the command that is still smooth.
+    """
+
+    path_mm: Array
+    weight: Array
+    stops: Ints
+    bounds: Bounds
+    rms_limit_mm_s2: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisCommand:
+    """Command of an axis for one piece, and the state in which it leaves the plants.
+
+    Attributes
+    ----------
+    position_mm : ndarray, shape (n,)
+    states : ndarray
+        Of all members, relative to the last position.
+    """
+
+    position_mm: Array
+    states: Array
+
+
+class Designs:
+    """The designs of an axis, made when first asked for."""
+
+    def __init__(self, lifted: LiftedWindow, basis: str) -> None:
+        self.lifted = lifted
+        self._basis = basis
+        self._made: dict[tuple[int, float], PreviewDesign] = {}
+        self._set = lifted.lifted_set()
+        self._functions: dict[int, Array] = {}
+
+    def design(self, rung: int, most: int = 300) -> PreviewDesign:
+        """Return the design of a rung, with at most so many functions per 300 samples."""
+        step = LADDER[rung]
+        n = self._scaled(min(step.n, most))
+        if (n, step.price) not in self._made:
+            psi = self._psi(n)
+            self._made[n, step.price] = PreviewDesign(self.lifted, n, self._basis, step.price, psi)
+        return self._made[n, step.price]
+
+    def _psi(self, n: int) -> Array:
+        size = self._scaled(max(rung.n for rung in LADDER)) if self._basis in _NESTED else n
+        if size not in self._functions:
+            self._functions[size] = BASES[self._basis](self._set, size)
+        return self._functions[size]
+
+    def _scaled(self, n: int) -> int:
+        return max(4, round(n * self.lifted.window / 300))
+
+
+@lru_cache(maxsize=32)
+def designs(
+    plants: tuple[DiscretePlant, ...],
+    weights: tuple[float, ...],
+    window: int,
+    update: int,
+    basis: str,
+) -> Designs:
+    """Designs of an axis, kept as long as the process works with this machine revision."""
+    return Designs(lifted_window(plants, weights, window, update), basis)
+
+
+class PreviewAxis:
+    """One axis: its designs and the state of its plants.
+
+    Attributes
+    ----------
+    rung, next_rung : int
+        Where the ladder starts for this piece, and for the next one once this is committed.
+    members : int
+        Plants that the designs look at.
+    """
+
+    def __init__(self, name: str, designs: Designs) -> None:
+        self.name, self._designs = name, designs
+        self.window, self.update = designs.lifted.window, designs.lifted.update
+        self._plants = designs.lifted.plants
+        self.members = len(self._plants)
+        self.rung = self.next_rung = 0
+        self.reset(0.0)
+
+    def reset(self, position: float) -> None:
+        """Take the axis to stand still at `position`."""
+        # States are kept relative to `origin`: the digits belong to the vibration.
+        self._origin = position
+        self._states = np.zeros(sum(p.order for p in self._plants))
+
+    def observe(self, command: Array) -> None:
+        """Let the axis follow a command that was not ours."""
+        if len(command) == 0:
+            return
+        origin = float(command[-1])
+        self._move_origin(origin)
+        self._states = self._advanced(self._states, command[:-1] - origin)
+
+    def commit(self, command: AxisCommand) -> None:
+        """Take a command as executed."""
+        self._origin, self._states = float(command.position_mm[-1]), command.states
+        self.rung = self.next_rung
+
+    def answer(self, member: int, command: Array) -> Array:
+        """Return what a member of the set does with the command of a piece."""
+        first = sum(p.order for p in self._plants[:member])
+        p = self._plants[member]
+        self._move_origin(float(command[0]))
+        state, y = self._states[first : first + p.order].copy(), np.empty_like(command)
+        dense_response(p.a, p.b, p.c, p.d, self._origin, state, command, y)
+        return y
+
+    def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
+        """Windows whose command leaves the bounds, and those before them."""
+        bend, step = changes(command)
+        slack = 1.0 + 1e-9
+        outside = command < bounds.low_mm - TRAVEL_SLACK_MM
+        outside |= command > bounds.high_mm + TRAVEL_SLACK_MM
+        outside |= np.abs(bend) > slack * bounds.accel
+        outside |= np.abs(step) > slack * bounds.speed
+        windows = np.unique(np.flatnonzero(outside) // self.update)
+        return {int(w) for w in windows} | {int(w) - 1 for w in windows if w > 0}
+
+    def command(
+        self, rung: int, task: AxisTask, careful: Set[int], targets_mm: Array | None = None
+    ) -> AxisCommand:
+        """Command of a piece; windows with rests and `careful` ones are solved one by one.
+
+        Parameters
+        ----------
+        rung : int
+            Index into `LADDER`.
+        task : AxisTask
+        careful : set of int
+            Windows in which the bounds are kept.
+        targets_mm : ndarray, shape (members, n), optional
+            What each member shall do; by default the path.
+        """
+        design = self._designs.design(rung)
+        resting_design = self._designs.design(rung, REST_FUNCTIONS)
+        path, stops = task.path_mm, task.stops
+        n, window, update = len(path), self.window, self.update
+        windows = -(-n // update)
+        self._move_origin(float(path[0]))
+        origin = self._origin
+        bounds = task.bounds.seen_from(origin)
+        padding = windows * update + window - n
+        padded = np.append(path - origin, np.full(padding, path[-1] - origin))
+        weights = np.append(task.weight, np.full(padding, WEIGHT_REST))
+        driven = _windows(padded, window, update) @ design.path_gain.T
+        targets = self._designs.lifted.target[:, None] * padded
+        if targets_mm is not None:
+            slid = self._designs.lifted.mix @ (targets_mm - path)
+            targets[:, :n] += slid
+            for component, gain in zip(slid, design.target_gain, strict=True):
+                behind = np.append(component, np.zeros(padding))
+                driven += _windows(behind, window, update) @ gain.T
+        state_driven = driven @ design.state_drive.T
+
+        u = np.empty(windows * update)
+        z = np.append(self._states, [0.0, 0.0])
+        starts = np.arange(windows) * update
+        apart = np.isin(np.arange(windows), list(careful))
+        for a, b in stops:
+            apart[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = True
+        last_states = z[:-2]
+        w = 0
+        while w < windows:
+            start = w * update
+            if w == windows - 1:
+                last_states = z[:-2].copy()
+            if apart[w]:
+                near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
+                span = slice(start, start + window)
+                committed = solve_window(
+                    resting_design if near.any() else design,
+                    z,
+                    padded[span],
+                    targets[:, span],
+                    weights[span],
+                    stops[near] - start,
+                    bounds,
+                )[:update]
+                u[start : start + update] = committed
+                z = design.advanced(z, committed)
+                w += 1
+            else:
+                end = w + int(np.argmax(np.append(apart[w:], True)))
+                gains = (design.command_gain, design.state_gain)
+                run_windows(*gains, driven, state_driven, z, w, end, u)
+                w = end
+        # The windows run on past the end of the path, where the command stands.
+        last = path[-1] - origin
+        u[n - 1] = last
+        states = self._advanced(last_states, u[(windows - 1) * update : n - 1])
+        # Off the rounding by which a bounded solution may miss the end of the travel.
+        position = _snapped(u[:n] + origin, task.bounds)
+        position[-1] = path[-1]
+        return AxisCommand(position, states - self._resting(last))
+
+    def _move_origin(self, origin: float) -> None:
+        self._states = self._states + self._resting(self._origin - origin)
+        self._origin = origin
+
+    def _resting(self, position: float) -> Array:
+        return np.concatenate([p.rest_state(position) for p in self._plants])
+
+    def _advanced(self, states: Array, command: Array) -> Array:
+        parts, row = [], 0
+        for plant in self._plants:
+            part = states[row : row + plant.order]
+            parts.append(advance_state(plant.a, plant.b, part, command))
+            row += plant.order
+        return np.concatenate(parts)
+
+
+def changes(command: Array) -> tuple[Array, Array]:
+    """Second and first differences at every sample; the command starts and ends standing."""
+    standing = np.concatenate([command[:1], command, command[-1:]])
+    return np.diff(standing, 2), np.diff(standing)[:-1]
+
+
+def _windows(samples: Array, window: int, update: int) -> Array:
+    views = np.lib.stride_tricks.sliding_window_view(samples, window)
+    return views[: len(samples) - window : update]
+
+
+def _snapped(position: Array, bounds: Bounds) -> Array:
+    for end in (bounds.low_mm, bounds.high_mm):
+        position = np.where(np.abs(position - end) <= TRAVEL_SLACK_MM, end, position)
+    return position
