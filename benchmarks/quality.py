@@ -115,6 +115,7 @@ def main() -> None:
     parser.add_argument("--method", default="fbf")
     parser.add_argument("--basis", default="ce-opt")
     parser.add_argument("--robust", default=None, help="default: the product's")
+    parser.add_argument("--along", type=float, default=None)
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -122,7 +123,8 @@ def main() -> None:
     given = parser.parse_args()
 
     chosen = {"method": given.method, "basis": given.basis}
-    options = Options(**chosen | ({} if given.robust is None else {"robust": given.robust}))
+    chosen |= {k: getattr(given, k) for k in ("robust", "along") if getattr(given, k) is not None}
+    options = Options(**chosen)
     shared = shared_folder(given.shared)
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

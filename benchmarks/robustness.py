@@ -28,7 +28,7 @@ from compensation.shapers import SHAPERS, shape, shaper_pulses
 from models.machine import Machine
 from models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
 from models.store import load_machine
-from service.pipeline.reference_motion import reference_motion
+from models.reference_motion import reference_motion
 from service.pipeline.yardstick import FREQUENCIES_HZ
 from simulation.measures import distance_to_path, tracking_error
 from simulation.response import response

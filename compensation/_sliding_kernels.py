@@ -1,4 +1,4 @@
-"""Loops of the sliding targets; `compensation.fbf` uses them, docs/method.md explains them."""
+"""Loops of the sliding targets; `compensation.sliding` uses them, docs/method.md explains them."""
 
 from __future__ import annotations
 
@@ -7,9 +7,30 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["move_targets"]
+__all__ = ["contour_square", "move_targets", "nearest_point"]
 
 Array = NDArray[np.float64]
+
+
+@kernel
+def nearest_point(path: Array, x: float, y: float, k: int, reach: int) -> tuple[float, float]:
+    """Nearest point of the path (2, n) within `reach` samples of sample k."""
+    n = path.shape[1]
+    bx, by = path[0, k], path[1, k]
+    nearest = (x - bx) ** 2 + (y - by) ** 2
+    for i in range(max(0, k - reach), min(n - 1, k + reach)):
+        dx, dy = path[0, i + 1] - path[0, i], path[1, i + 1] - path[1, i]
+        ex, ey = x - path[0, i], y - path[1, i]
+        size = dx * dx + dy * dy
+        if size > 0.0:
+            share = min(1.0, max(0.0, (ex * dx + ey * dy) / size))
+            ex -= share * dx
+            ey -= share * dy
+        squared = ex * ex + ey * ey
+        if squared < nearest:
+            nearest = squared
+            bx, by = x - ex, y - ey
+    return bx, by
 
 
 @kernel
@@ -40,27 +61,27 @@ def move_targets(
         1: to the new targets; up to 1.9: beyond them.
     targets : ndarray, shape (2, n)
     """
-    n = path.shape[1]
-    for k in range(n):
+    for k in range(path.shape[1]):
         px, py = path[0, k], path[1, k]
-        x, y = answer[0, k], answer[1, k]
         if extruding[k]:
-            nearest = np.inf
-            bx, by = px, py
-            for i in range(max(0, k - reach), min(n - 1, k + reach)):
-                dx, dy = path[0, i + 1] - path[0, i], path[1, i + 1] - path[1, i]
-                ex, ey = x - path[0, i], y - path[1, i]
-                size = dx * dx + dy * dy
-                if size > 0.0:
-                    share = min(1.0, max(0.0, (ex * dx + ey * dy) / size))
-                    ex -= share * dx
-                    ey -= share * dy
-                squared = ex * ex + ey * ey
-                if squared < nearest:
-                    nearest = squared
-                    bx, by = x - ex, y - ey
+            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach)
             tx, ty = bx + tau * (px - bx), by + tau * (py - by)
         else:
-            tx, ty = x + travel * (px - x), y + travel * (py - y)
+            tx = answer[0, k] + travel * (px - answer[0, k])
+            ty = answer[1, k] + travel * (py - answer[1, k])
         targets[0, k] += relaxation * (tx - targets[0, k])
         targets[1, k] += relaxation * (ty - targets[1, k])
+
+
+@kernel
+def contour_square(
+    path: Array, answer: Array, extruding: NDArray[np.bool_], reach: int, stride: int
+) -> float:
+    """Mean squared distance of an answer from the path while extruding, every `stride` samples."""
+    total, count = 0.0, 0
+    for k in range(0, path.shape[1], stride):
+        if extruding[k]:
+            bx, by = nearest_point(path, answer[0, k], answer[1, k], k, reach)
+            total += (answer[0, k] - bx) ** 2 + (answer[1, k] - by) ** 2
+            count += 1
+    return total / max(count, 1)

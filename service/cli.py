@@ -109,6 +109,13 @@ def compensate(
             help="What fbf looks at: off (the nominal plant), ensemble or minimax (its set)."
         ),
     ] = "off",
+    along: Annotated[
+        float | None,
+        typer.Option(
+            help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
+            "takes longer. [default: .1 with a set, else 1]"
+        ),
+    ] = None,
     tolerance_um: Annotated[
         float | None,
         typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
@@ -118,7 +125,13 @@ def compensate(
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
         raise _Refused("give either -o OUT or --in-place")
-    chosen = {"method": method, "basis": basis, "robust": robust, "tolerance_um": tolerance_um}
+    chosen = {
+        "method": method,
+        "basis": basis,
+        "robust": robust,
+        "along": along,
+        "tolerance_um": tolerance_um,
+    }
     options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
     target = _check_output(output or source)

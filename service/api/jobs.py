@@ -78,6 +78,16 @@ async def create_job(
             "plant set by least squares (`ensemble`) or for its worst member (`minimax`)."
         ),
     ] = "off",
+    along: Annotated[
+        float | None,
+        Query(
+            ge=0.01,
+            le=1,
+            allow_inf_nan=False,
+            description="Weight of errors along the path against those across it, for `fbf`; "
+            "less than 1 takes longer. By default .1 with a set, else 1.",
+        ),
+    ] = None,
     tolerance_um: Annotated[
         float,
         Query(
@@ -105,7 +115,9 @@ async def create_job(
             "Unknown machine",
             f"No machine is called {machine!r}. Known: {', '.join(builtin_machines())}.",
         )
-    options = Options(method=method, basis=basis, robust=robust, tolerance_um=tolerance_um)
+    options = Options(
+        method=method, basis=basis, robust=robust, along=along, tolerance_um=tolerance_um
+    )
     job_id = uuid.uuid4().hex
     incoming = store.incoming_dir / job_id
     try:

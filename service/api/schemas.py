@@ -39,6 +39,7 @@ class JobView(BaseModel):
                         "method": "fbf",
                         "basis": "ce-opt",
                         "robust": "off",
+                        "along": None,
                         "tolerance_um": 2.0,
                     },
                     "source_name": "gear.gcode",

@@ -63,15 +63,17 @@ class PieceCompensator:
     ----------
     machine : Machine
     options : Options
-    shaper : BestShaper
+    shaper : BestShaper, optional
         The tuned frequencies, for `shaper:NAME` of the same type.
     """
 
-    def __init__(self, machine: Machine, options: Options, shaper: BestShaper) -> None:
+    def __init__(
+        self, machine: Machine, options: Options, shaper: BestShaper | None = None
+    ) -> None:
         settings: dict[str, object] = {}
         if options.method == "fbf":
-            settings.update(basis=options.basis, robust=options.robust)
-        elif options.method == f"shaper:{shaper.type}":
+            settings.update(basis=options.basis, robust=options.robust, along=options.along)
+        elif shaper is not None and options.method == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine
         self._tolerance_mm = 1e-3 * options.tolerance_um

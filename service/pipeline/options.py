@@ -18,7 +18,8 @@ class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name. `basis` and `robust` are settings of `fbf`.
+    with a firmware shaper's name. `basis`, `robust` and `along` are settings of `fbf`: `along` is
+    the weight of the error along the path against that across it (None: as suits `robust`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -32,4 +33,5 @@ class Options(BaseModel):
     ] = "fbf"
     basis: BasisName = "ce-opt"
     robust: RobustMode = "off"
+    along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

@@ -110,17 +110,22 @@ class _Job:
         self._progress = progress
         self._began = time.monotonic()
         self._clock = StageClock()
+        self._changes = options.method != "none"
+        # A method that cannot be designed says so before the yardstick takes its seconds.
+        tuned_first = options.method.startswith("shaper:")
+        if self._changes and not tuned_first:
+            with self._clock.stage("design"):
+                self._work = PieceCompensator(machine, options)
         self._say("tuning the yardstick", 0.0)
         with self._clock.stage("yardstick"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-        self._changes = options.method != "none"
+        if tuned_first:
+            self._work = PieceCompensator(machine, options, self._shaper)
         self._reader = Interpreter(machine)
         self._checker = Interpreter(machine)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._measurement = Measurement(machine, DT_S, self._shaper, compensated=True)
         if self._changes:
-            with self._clock.stage("design"):
-                self._work = PieceCompensator(machine, options, self._shaper)
             self._writer = KlipperWriter(machine, self._work.encoder.limits, self._stamp())
         self._sum = _Sums()
 
@@ -352,7 +357,7 @@ class _Job:
             machine=self._machine.name,
             machine_title=self._machine.title,
             machine_revision=self._machine.revision,
-            settings=dict(self._options.model_dump()),
+            settings=self._options.model_dump(exclude_none=True),
             source_name=self._source.name,
             channels=measured.channels(),
             best_shaper=shaper.label,

@@ -18,7 +18,7 @@ from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.preview import PreviewDesign
 from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
 from models.store import load_machine
-from service.pipeline.reference_motion import reference_motion
+from models.reference_motion import reference_motion
 from simulation.measures import contour_error
 from simulation.response import response
 

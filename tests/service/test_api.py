@@ -75,7 +75,13 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
     job = until(client, where, over)
     assert job["state"] == "done"
     assert job["progress"] == 1.0
-    assert job["options"] == {"method": "fbf", "basis": "ce-opt", "robust": "off", "tolerance_um": 2.0}
+    assert job["options"] == {
+        "method": "fbf",
+        "basis": "ce-opt",
+        "robust": "off",
+        "along": None,
+        "tolerance_um": 2.0,
+    }
     result = client.get(job["links"]["result"])
     assert result.content == b"; compensated\nG1 X1\n"
     assert 'filename="gear.stillpath.gcode"' in result.headers["content-disposition"]
@@ -114,6 +120,7 @@ def test_a_form_brings_the_same_bytes(client: TestClient):
         ("machine=ender3&method=shaper:best", ["method"]),
         ("machine=ender3&basis=fourier", ["basis"]),
         ("machine=ender3&robust=yes", ["robust"]),
+        ("machine=ender3&along=0", ["along"]),
         ("machine=ender3&tolerance_um=0", ["tolerance_um"]),
         ("machine=ender3&tolerance_um=nan", ["tolerance_um"]),
         ("machine=ender3&tolerance_um=wide", ["tolerance_um"]),

@@ -81,13 +81,25 @@ def test_compensate_writes_file_report_and_table(road, source, tmp_path, capsys)
 
 
 def test_options_reach_the_road(road, source, tmp_path):
-    chosen = ["--method", "shaper:2hump_ei", "--basis", "bspline", "--robust", "minimax", "--tolerance-um", "2"]
+    chosen = [
+        "--method",
+        "shaper:2hump_ei",
+        "--basis",
+        "bspline",
+        "--robust",
+        "minimax",
+        "--along",
+        ".1",
+        "--tolerance-um",
+        "2",
+    ]
     assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
     assert road.machine == "voron-v0"
     assert road.options.model_dump() == {
         "method": "shaper:2hump_ei",
         "basis": "bspline",
         "robust": "minimax",
+        "along": 0.1,
         "tolerance_um": 2.0,
     }
 

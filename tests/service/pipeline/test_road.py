@@ -18,7 +18,7 @@ from models.store import load_machine
 from service.pipeline.measure import STRIDE, Measurement, MotionSamples
 from service.pipeline.options import Options
 from service.pipeline.progress import Cancelled, Progress
-from service.pipeline.reference_motion import reference_motion
+from models.reference_motion import reference_motion
 from service.pipeline.result import ErrorFigures, Result
 from service.pipeline.road import compensate_file, plan_file
 from service.pipeline.yardstick import BestShaper

@@ -10,7 +10,7 @@ import pytest
 
 from models.store import load_machine
 from service.pipeline import yardstick
-from service.pipeline.reference_motion import reference_motion
+from models.reference_motion import reference_motion
 from service.pipeline.yardstick import (
     FREQUENCIES_HZ,
     BestShaper,

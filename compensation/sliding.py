@@ -1,0 +1,163 @@
+"""Targets that slide along the path, and the weights of a set that go with them.
+
+A print asks of every member of a plant set only that it be ON the path, not when. Each member
+therefore gets a target of its own: the point of the path nearest to what it does anyway, and from
+there a small way back towards its time. The error across the path then counts in full and the
+error along it with a small weight. Moving the targets (the exact minimum over the slack along the
+path) and filtering them (the exact minimum over the command) in turn is the majorise-minimise
+iteration for that weighted sum. Gains stay constant all the while; X and Y meet in the nearest
+point alone, and corners need no special case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation._sliding_kernels import contour_square, move_targets
+from compensation.lifted_window import lifted_window
+from compensation.preview_axis import (
+    WEIGHT_TRAVEL,
+    AxisCommand,
+    AxisTask,
+    Designs,
+    PreviewAxis,
+)
+from compensation.window_problem import Bounds
+from models.plants import DiscretePlant
+from models.reference_motion import reference_motion
+
+__all__ = ["balanced_weights", "slide"]
+
+Array = NDArray[np.float64]
+Choice = tuple[int, frozenset[int]]
+
+ROUNDS = 4
+RELAXATION = 1.6
+"""Beyond the new targets; 2 would be the edge of stability."""
+REACH_S = 0.008
+_BOUNDED_ROUNDS = 4
+_WEIGHT_ROUNDS = 8
+_WEIGHT_RUNG = 2
+_LEAST_SHARE = 0.05
+_NO_BOUNDS = Bounds(1e9, 1e9, -1e9, 1e9)
+
+
+def slide(
+    axes: Sequence[PreviewAxis],
+    commands: list[AxisCommand],
+    tasks: Sequence[AxisTask],
+    chosen: Sequence[Choice],
+    extruding: NDArray[np.bool_],
+    along: float,
+    dt_s: float,
+) -> list[AxisCommand]:
+    """Improve the commands of X and Y for all members by moving the members' targets.
+
+    Parameters
+    ----------
+    axes : PreviewAxis of X and of Y
+    commands, tasks : of the axes
+        The commands for the path itself, and what the axes shall do.
+    chosen : of the axes
+        Rung of the ladder, and windows that are solved within bounds.
+    extruding : ndarray of bool, shape (n,)
+    along : float
+        Weight of the error along the path against that across it.
+    dt_s : float
+
+    Returns
+    -------
+    list of AxisCommand
+        Within the bounds; those of the last round that keeps them.
+    """
+    path = np.stack([task.path_mm for task in tasks])
+    members = max(axis.members for axis in axes)
+    targets = np.repeat(path[None], members, axis=0)
+    tau = along / (1.0 + along)
+    reach = _reach(dt_s)
+    for _ in range(ROUNDS):
+        for j in range(members):
+            answer = _answer(axes, commands, j)
+            move_targets(path, answer, extruding, tau, WEIGHT_TRAVEL, reach, RELAXATION, targets[j])
+        moved = []
+        for i, (axis, task, (rung, careful)) in enumerate(zip(axes, tasks, chosen, strict=True)):
+            for _ in range(_BOUNDED_ROUNDS):
+                command = axis.command(rung, task, careful, targets[: axis.members, i])
+                outside = axis.windows_outside(task.bounds, command.position_mm)
+                if not outside:
+                    break
+                careful |= outside
+            else:
+                return commands
+            moved.append(command)
+        commands = moved
+    return commands
+
+
+@lru_cache(maxsize=32)
+def balanced_weights(
+    x: tuple[tuple[DiscretePlant, ...], tuple[float, ...]],
+    y: tuple[tuple[DiscretePlant, ...], tuple[float, ...]],
+    dt_s: float,
+    window: int,
+    update: int,
+    basis: str,
+    along: float,
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Weights of the members under which their contour errors e_j are more alike.
+
+    They minimise sum_j p_j e_j^4 on the reference motion, p_j the given weights: a fixed point of
+    l_j ~ p_j e_j^2. Least squares alone minimises sum_j p_j e_j^2, a true minimax the largest e_j
+    at the expense of all others.
+
+    Parameters
+    ----------
+    x, y : plants and given weights of either axis, equally many
+    dt_s, window, update, basis, along
+        Of the design that will use the weights.
+    """
+    path, extruding = reference_motion(dt_s)
+    n = path.shape[1]
+    stops = np.array([[-1, 1], [n, n + window]], dtype=np.int64)
+    tasks = [AxisTask(row, np.ones(n), stops, _NO_BOUNDS, np.inf) for row in path]
+    given = [np.array(weights) for _, weights in (x, y)]
+    found = [weights.copy() for weights in given]
+    for _ in range(_WEIGHT_ROUNDS):
+        axes = [
+            PreviewAxis(name, Designs(lifted_window(plants, weights, window, update), basis))
+            for name, (plants, _), weights in zip("xy", (x, y), found, strict=True)
+        ]
+        chosen: list[Choice] = [(_WEIGHT_RUNG, frozenset())] * 2
+        commands = [
+            axis.command(_WEIGHT_RUNG, task, frozenset())
+            for axis, task in zip(axes, tasks, strict=True)
+        ]
+        if along < 1.0:
+            commands = slide(axes, commands, tasks, chosen, extruding, along, dt_s)
+        squares = np.array(
+            [
+                contour_square(path, _answer(axes, commands, j), extruding, 2 * _reach(dt_s), 3)
+                for j in range(axes[0].members)
+            ]
+        )
+        for i, prior in enumerate(given):
+            wanted = prior * squares
+            # Half the way in the exponent: the errors answer the weights.
+            moved = np.sqrt(found[i] * wanted / wanted.sum())
+            moved = np.maximum(moved / moved.sum(), _LEAST_SHARE * prior)
+            found[i] = moved / moved.sum()
+    return tuple(found[0].tolist()), tuple(found[1].tolist())
+
+
+def _answer(axes: Sequence[PreviewAxis], commands: Sequence[AxisCommand], j: int) -> Array:
+    """Return what member j does; j of X goes with j of Y, an axis with fewer begins again."""
+    pairs = zip(axes, commands, strict=True)
+    return np.stack([axis.answer(j % axis.members, u.position_mm) for axis, u in pairs])
+
+
+def _reach(dt_s: float) -> int:
+    return max(1, round(REACH_S / dt_s))

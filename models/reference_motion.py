@@ -1,0 +1,117 @@
+"""A generated test path: what a shaper is tuned on when the print itself is not yet known.
+
+Squares, zigzags and circles at several speeds and accelerations, with the trapezoidal speed
+profile of a planner that takes every corner at 5 mm/s.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["reference_motion"]
+
+Array = NDArray[np.float64]
+
+_CORNER_MM_S = 5.0
+_TRAVEL_MM_S, _TRAVEL_MM_S2 = 200.0, 5000.0
+_FIGURES = (
+    # speed mm/s, acceleration mm/s2, size mm
+    (60.0, 1500.0, 20.0),
+    (100.0, 3000.0, 16.0),
+    (150.0, 5000.0, 24.0),
+    (250.0, 5000.0, 30.0),
+)
+_REST_S = 0.15
+
+
+def reference_motion(dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the path, shape (2, n) in mm, and where it extrudes, shape (n,).
+
+    About 25 s around the origin; it starts and ends at rest, and rests between the figures.
+    """
+    path, extruding = [np.zeros((2, 1))], [np.zeros(1, bool)]
+    here = np.zeros(2)
+    for speed, accel, size in _FIGURES:
+        for figure in (_square(size), _zigzag(size), _circle(size / 2), _circle(size / 6)):
+            away = np.stack([here, figure[:, 0]], axis=1)
+            for line, feeds, v, a in (
+                (away, False, _TRAVEL_MM_S, _TRAVEL_MM_S2),
+                (figure, True, speed, accel),
+            ):
+                samples = _drive(line, v, a, dt_s)
+                path.append(samples)
+                extruding.append(np.full(samples.shape[1], feeds))
+            here = figure[:, -1]
+        rest = round(_REST_S / dt_s)
+        path.append(np.repeat(here[:, None], rest, axis=1))
+        extruding.append(np.zeros(rest, bool))
+    return np.hstack(path), np.concatenate(extruding)
+
+
+def _square(size: float) -> Array:
+    corners = np.array([[0.0, 0, 1, 1, 0], [0, 1, 1, 0, 0]]) - 0.5
+    turned = math.radians(20.0)
+    turn = np.array([[math.cos(turned), -math.sin(turned)], [math.sin(turned), math.cos(turned)]])
+    return np.hstack([corners * size, turn @ corners * (0.8 * size)])
+
+
+def _zigzag(size: float) -> Array:
+    rows = np.arange(0.0, 8.0)
+    x = np.repeat(rows, 2) * 0.05 - 0.2
+    y = np.where(np.arange(len(x)) % 4 % 3 == 0, -0.4, 0.4)
+    return size * np.hstack([np.vstack([x, y]), np.vstack([y, x])[:, ::-1] * 0.7])
+
+
+def _circle(radius: float) -> Array:
+    angle = np.linspace(0, 2 * math.pi, 361)
+    return radius * np.vstack([np.cos(angle), np.sin(angle)])
+
+
+def _drive(line: Array, speed_mm_s: float, accel_mm_s2: float, dt_s: float) -> Array:
+    """Sample a polyline: speed trapezoids from corner to corner, 5 mm/s at sharp corners."""
+    step = np.diff(line, axis=1)
+    length = np.hypot(step[0], step[1])
+    keep = length > 1e-9
+    if not keep.any():
+        return np.zeros((2, 0))
+    step, length = step[:, keep], length[keep]
+    heading = step / length
+    turn = np.sum(heading[:, 1:] * heading[:, :-1], axis=0)
+    # Corners of a circle's polygon are no corners; they are taken at the speed that the
+    # centripetal acceleration allows.
+    gentle = turn > math.cos(math.radians(6.0))
+    swing = np.maximum(np.arccos(np.clip(turn, -1, 1)), 1e-9)
+    curve = np.sqrt(accel_mm_s2 * np.minimum(length[1:], length[:-1]) / swing)
+    limit = np.where(gentle, np.minimum(speed_mm_s, curve), _CORNER_MM_S)
+    corner = np.concatenate([[0.0], limit, [0.0]])
+    for order in (range(len(length)), range(len(length) - 1, -1, -1)):
+        forward = order.step == 1
+        for i in order:
+            a, b = (i, i + 1) if forward else (i + 1, i)
+            corner[b] = min(corner[b], math.sqrt(corner[a] ** 2 + 2 * accel_mm_s2 * length[i]))
+    start = line[:, 0]
+    times, along = [0.0], [0.0]
+    speeds = [0.0]
+    for i, size in enumerate(length):
+        v0, v1 = corner[i], corner[i + 1]
+        top = min(speed_mm_s, math.sqrt((v0 * v0 + v1 * v1) / 2 + accel_mm_s2 * float(size)))
+        up, down = (top * top - v0 * v0) / 2, (top * top - v1 * v1) / 2
+        cruise = max(float(size) - (up + down) / accel_mm_s2, 0.0)
+        for distance, v in ((up / accel_mm_s2, top), (cruise, top), (down / accel_mm_s2, v1)):
+            if distance > 1e-12:
+                times.append(times[-1] + 2 * distance / (speeds[-1] + v))
+                along.append(along[-1] + distance)
+                speeds.append(v)
+    # At least one sample beyond the end, so that the last one stands on it.
+    t = np.arange(1, math.ceil(times[-1] / dt_s) + 1) * dt_s
+    knot = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+    into = np.minimum(t, times[-1]) - np.array(times)[knot]
+    v = np.array(speeds)
+    rate = (v[knot + 1] - v[knot]) / np.diff(times)[knot]
+    s = np.array(along)[knot] + v[knot] * into + rate * into * into / 2
+    ends = np.concatenate([[0.0], np.cumsum(length)])
+    vertices = np.hstack([start[:, None], start[:, None] + np.cumsum(step, axis=1)])
+    return np.vstack([np.interp(s, ends, row) for row in vertices])
