@@ -45,9 +45,9 @@ ROBUST = ("off", "ensemble", "minimax")
 """The nominal plant; least squares over the set with its weights; with weights that balance the
 members' errors."""
 
-ACCEL_RATIO = 2.0
+ACCEL_RATIO = 1.6
 """The command may ask for at most this multiple of the planned path's own peak acceleration."""
-EDGE_RATIO = 1.2
+EDGE_RATIO = 1.35
 """And at most this multiple where it stops or starts, if possible."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""

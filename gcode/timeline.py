@@ -131,8 +131,8 @@ def build_timeline(
             start[i], end[i] = now, now + rest_s[i]
             row_start[rows] = now + scale * offset[:-1]
             first = int(np.ceil(now / dt_s - _GRID_EPS)) + 1
-            # A sample just behind the end of the rest has no time to get anywhere.
-            last = int(np.floor(end[i] / dt_s + 0.5)) + 1
+            # The first move after the rest gets a whole sample's time, or it would be a jerk.
+            last = int(np.ceil(end[i] / dt_s - _GRID_EPS)) + 1
             # However short: the command must be on the path when the rest's own line comes.
             rests.append((first, max(last, first + 1)))
             now = end[i]
