@@ -191,6 +191,30 @@ def simulate(
 
 
 @app.command()
+def design(
+    machine: MachineOption,
+    axis: Annotated[str, typer.Option(help="x or y.")],
+    basis: Annotated[str, typer.Option(help="ce-opt, robust, bspline or dct.")] = "ce-opt",
+    robust: Annotated[str, typer.Option(help="off, ensemble or minimax.")] = "off",
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
+    ] = None,
+) -> None:
+    """Look at the design for one axis: plant, metrics, ladder, and what errors of it cost."""
+    _check_folder(report)
+    found = _machine(machine)
+
+    from service.design.design import design_report
+    from service.design.page import write_design
+    from service.design.tables import print_design
+
+    made = design_report(found, axis, basis=basis, robust=robust)
+    if report is not None:
+        write_design(made, report)
+    print_design(made)
+
+
+@app.command()
 def machines(
     name: Annotated[str | None, typer.Argument(help="Show this one, as JSON.")] = None,
 ) -> None:

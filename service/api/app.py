@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from service.api import jobs, machines, problems
+from service.api import designs, jobs, machines, problems
 from service.api.guard import Guard
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
@@ -78,10 +78,12 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
         docs_url=None,
     )
     app.state.settings = settings
+    app.state.designs = designs.Designs()
     app.add_middleware(Guard, allow_remote=settings.allow_remote)
     problems.install(app)
     app.include_router(jobs.router)
     app.include_router(machines.router)
+    app.include_router(designs.router)
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:

@@ -1,0 +1,110 @@
+"""Routes of designs: what `stillpath design` shows, computed once and kept in the process."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Header, Request
+from starlette.concurrency import run_in_threadpool
+from starlette.responses import HTMLResponse, Response
+
+from models.machine import Machine
+from models.store import load_machine
+from service.api.machines import read_machine
+from service.api.problems import responses
+from service.design.figures import DesignReport
+from service.pipeline.options import BasisName, RobustMode
+
+__all__ = ["Designs", "router"]
+
+router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
+
+_Settings = tuple[Literal["x", "y"], BasisName, RobustMode]
+_KEPT = 64
+
+
+class Designs:
+    """Designs made by this process, the last ones kept.
+
+    A design takes seconds of computing, so that one is made at a time, in a thread, while the
+    service goes on answering; whoever asks for the same one meanwhile waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[str, _Settings], DesignReport] = OrderedDict()
+        self._turn = asyncio.Lock()
+
+    async def get(self, machine: Machine, settings: _Settings) -> DesignReport:
+        """Return the design of a machine's axis, made if nobody asked for it before."""
+        key = (machine.revision, settings)
+        if key not in self._kept:
+            async with self._turn:
+                if key not in self._kept:
+                    self._kept[key] = await run_in_threadpool(_made, machine, settings)
+                    if len(self._kept) > _KEPT:
+                        self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+
+async def _asked(
+    request: Request,
+    name: str,
+    axis: Literal["x", "y"],
+    basis: BasisName = "ce-opt",
+    robust: RobustMode = "off",
+) -> DesignReport:
+    read_machine(name)  # answers 404 for names that are not in the library
+    designs: Designs = request.app.state.designs
+    return await designs.get(load_machine(name), (axis, basis, robust))
+
+
+Asked = Annotated[DesignReport, Depends(_asked)]
+
+
+@router.get(
+    "/design",
+    response_model=DesignReport,
+    responses={200: {"content": {"text/html": {}}}, **responses(404, 422)},
+    summary="Look at the design for an axis",
+)
+async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") -> Response:
+    """Return the figures as JSON, or as a page if that is what `Accept` names first.
+
+    The first request for a machine, axis, basis and robust mode takes some ten seconds.
+    """
+    kinds = [part.split(";")[0].strip() for part in accept.split(",")]
+    first = next((k for k in kinds if k in ("text/html", "application/json", "*/*")), "*/*")
+    vary = {"Vary": "Accept"}
+    if first == "text/html":
+        return _page(found, vary)
+    return Response(found.model_dump_json(), media_type="application/json", headers=vary)
+
+
+@router.get(
+    "/design.html",
+    response_class=HTMLResponse,
+    responses=responses(404, 422),
+    summary="Look at the design for an axis, as a page",
+)
+async def read_design_page(found: Asked) -> HTMLResponse:
+    """Return one self-contained HTML page."""
+    return _page(found)
+
+
+# What is imported here takes a second, which the service's start need not wait for.
+
+
+def _made(machine: Machine, settings: _Settings) -> DesignReport:
+    from service.design.design import design_report
+
+    axis, basis, robust = settings
+    return design_report(machine, axis, basis=basis, robust=robust)
+
+
+def _page(found: DesignReport, headers: dict[str, str] | None = None) -> HTMLResponse:
+    from service.design.page import render_design
+
+    return HTMLResponse(render_design(found), headers=headers)
