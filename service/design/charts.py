@@ -67,7 +67,7 @@ def draw(chart: Chart, width: float, height: float) -> str:
         [(x, y) for x, y in zip(line.x, line.y, strict=True) if y is not None and _shown(y, chart)]
         for line in chart.lines
     ]
-    xs = [x for line in points for x, _ in line] or [0.0, 1.0]
+    xs = [x for line in chart.lines for x in line.x] or [0.0, 1.0]
     ys = [y for line in points for _, y in line] or [1.0]
     ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(0.0, max(ys), 5)
     low, high = (f(f(ticks), f(ys)) for f in (min, max))

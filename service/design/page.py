@@ -167,7 +167,8 @@ def _all_figures(report: DesignReport, summary: Summary) -> list[_Figure]:
         columns = [f"{y_title.split(',')[0]} {line.name}".strip() for line in lines]
         return _Figure(title, note, lines, columns, draw(chart, *_SMALL))
 
-    seen = "the nominal plant" if report.robust == "off" else "the weighted set"
+    alone = report.robust == "off" or len(report.plant.members) < 2
+    seen = "the nominal plant" if alone else "the weighted set"
     position, increments = (_nonzero(s) for s in (lifted.position, lifted.increments))
     out = [
         figure(
