@@ -79,7 +79,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
     first = next((k for k in kinds if k in ("text/html", "application/json", "*/*")), "*/*")
     vary = {"Vary": "Accept"}
     if first == "text/html":
-        return _page(found, vary)
+        return await run_in_threadpool(_page, found, vary)
     return Response(found.model_dump_json(), media_type="application/json", headers=vary)
 
 
@@ -91,7 +91,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
 )
 async def read_design_page(found: Asked) -> HTMLResponse:
     """Return one self-contained HTML page."""
-    return _page(found)
+    return await run_in_threadpool(_page, found)
 
 
 # What is imported here takes a second, which the service's start need not wait for.
