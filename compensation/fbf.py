@@ -115,6 +115,11 @@ class PreviewFbf:
             raise DesignError(f"no basis is called {basis!r}; there are {', '.join(BASES)}")
         if robust not in ROBUST:
             raise DesignError(f"no robust mode is called {robust!r}; there are {', '.join(ROBUST)}")
+        if basis == "robust" and robust == "off":
+            raise DesignError(
+                "the robust basis compares members of a set, but one plant is designed for (robust "
+                "off): choose robust ensemble or minimax, or the basis ce-opt"
+            )
         along = (1.0 if robust == "off" else SET_ALONG) if along is None else along
         if not 0.0 < along <= 1.0:
             raise DesignError(f"weight along the path is {along}; above 0 and at most 1 needed")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation._preview_kernels import advance_state, run_windows
-from compensation.basis import BASES
+from compensation.basis import BASES, robust_basis
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.preview import PreviewDesign
 from compensation.window_problem import TRAVEL_SLACK_MM, Bounds, solve_window
@@ -53,9 +53,11 @@ GENTLE_RUNG = 3
 
 REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
+ROBUST_CHOICE = 1.1
+"""The robust basis takes n of so many times n functions."""
 WEIGHT_TRAVEL = 0.3
 WEIGHT_REST = 0.05
-_NESTED = {"ce-opt", "robust", "dct"}
+_NESTED = {"ce-opt", "dct"}
 """Bases whose functions for n are the first n of those for more."""
 
 
@@ -121,8 +123,17 @@ class Designs:
     def _psi(self, n: int) -> Array:
         size = self._scaled(max(rung.n for rung in LADDER)) if self._basis in _NESTED else n
         if size not in self._functions:
-            self._functions[size] = BASES[self._basis](self._set, size)
+            self._functions[size] = self._made_for(size)
         return self._functions[size]
+
+    def _made_for(self, n: int) -> Array:
+        if self._basis != "robust":
+            return BASES[self._basis](self._set, n)
+        # Far above its modes a set agrees too, on hardly answering: choose among the directions
+        # that are answered best (4.10).
+        window = self.lifted.window
+        kept = min(window, round(ROBUST_CHOICE * n))
+        return robust_basis(self._set.gram, self._set.mean, n, window - kept)
 
     def _scaled(self, n: int) -> int:
         return max(4, round(n * self.lifted.window / 300))

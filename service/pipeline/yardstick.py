@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from compensation.shapers import SHAPERS, shape, shaper_pulses
 from models.machine import Machine
 from models.plants import DiscretePlant, discretise
-from service.pipeline.reference_motion import reference_motion
+from models.reference_motion import reference_motion
 from simulation.measures import Tally, contour_error, distance_to_path, tracking_error
 from simulation.response import response
 

@@ -17,8 +17,8 @@ from compensation.lifted import LiftedSet
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.preview import PreviewDesign
 from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
-from models.store import load_machine
 from models.reference_motion import reference_motion
+from models.store import load_machine
 from simulation.measures import contour_error
 from simulation.response import response
 

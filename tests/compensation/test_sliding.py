@@ -116,6 +116,19 @@ def test_unknown_settings(machine: Machine, setting: str, value: str) -> None:
         PreviewFbf(machine, DT_S, **{setting: value})  # type: ignore[arg-type]
 
 
+def test_a_robust_basis_needs_a_set(machine: Machine) -> None:
+    with pytest.raises(DesignError, match=r"robust off\): choose robust ensemble"):
+        PreviewFbf(machine, DT_S, basis="robust")
+
+
+@pytest.mark.parametrize("basis", ["robust", "dct", "bspline"])
+def test_every_basis_serves_sets(machine: Machine, motion, basis: str) -> None:
+    path, extruding = motion
+    _, plain = contours(machine, path, extruding, robust="ensemble", along=1.0)
+    _, other = contours(machine, path, extruding, robust="ensemble", along=1.0, basis=basis)
+    assert other.mean() < 1.5 * plain.mean()
+
+
 def nearest(path: np.ndarray, point: np.ndarray, k: int, reach: int) -> np.ndarray:
     best = path[:, k]
     for i in range(max(0, k - reach), min(path.shape[1] - 1, k + reach)):

@@ -6,6 +6,7 @@ Files go down the whole road here: what counts is the text that reaches the prin
 from __future__ import annotations
 
 import gzip
+import re
 from pathlib import Path
 
 import numpy as np
@@ -206,7 +207,7 @@ def test_shaper_of_the_machine_is_restored(road: Road, machine: Machine) -> None
     shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware})
-    lines = road(HEAD + ROUND + "G28\nG1 X5 Y5\n", known).splitlines()
+    lines = road(HEAD + ROUND + "G28\nM84\n", known).splitlines()
     calls = [k for k, line in enumerate(lines) if line.startswith(b"SET_INPUT_SHAPER")]
     assert len(calls) == 2
     assert b"SHAPER_TYPE_X=ei SHAPER_FREQ_X=51.5" in lines[calls[1]]
@@ -220,6 +221,28 @@ def test_shaper_of_the_file_is_restored(road: Road) -> None:
     written = road(HEAD.encode() + line + b"\n" + ROUND.encode() + b"G28\nG1 X5 Y5\n")
     assert written.count(line) == 2
     assert written.index(b"SHAPER_FREQ_X=0") < written.rindex(line) < written.rindex(b"G28")
+
+
+def test_rests_run_under_the_limits_of_the_file(road: Road, machine: Machine) -> None:
+    """What we did not write must not meet our limits: retractions, hops, and after an M204."""
+    rest = "G1 E-1 F2100\nG1 Z5.4 F600\nM204 S1500\nG1 Z5 F600\nG1 E1 F2100\n"
+    lines = road(tagged((HEAD + ROUND + rest + ROUND + "G4 P1\n").encode())).splitlines()
+    assert road.result is not None
+    assert road.result.put_back == []
+    accel, seen = 0.0, {}
+    for line in lines:
+        if found := re.match(rb"SET_VELOCITY_LIMIT .*ACCEL=(\d+)", line):
+            accel = float(found[1])
+        if b";#" in line and line.startswith((b"G1 E", b"G1 Z")):
+            seen[line.split(b" ;#")[0]] = accel
+        elif line.startswith(b"G1 X") and b";#" not in line:
+            assert accel == 300_000
+    assert seen == {
+        b"G1 E-1 F2100": 5000,
+        b"G1 Z5.4 F600": 5000,
+        b"G1 Z5 F600": 1500,
+        b"G1 E1 F2100": 1500,
+    }
 
 
 def test_stamps(road: Road, machine: Machine) -> None:

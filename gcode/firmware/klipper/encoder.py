@@ -53,7 +53,7 @@ class Encoded:
     row_start_s : ndarray, shape (rows of the piece,)
         When each original move begins on the timeline.
     rest_s : ndarray, shape (groups,)
-        How long each rest takes under the stream's limits.
+        How long each rest takes.
     phases : Phases
         The firmware's plan of the moves.
     """
@@ -91,8 +91,14 @@ class KlipperEncoder:
         )
 
     def rest_durations(self, piece: Piece, timeline_groups: Sequence[Group]) -> NDArray[np.float64]:
-        """First guess of the rests' durations: the piece's own moves under the stream's limits."""
-        phases = self._plan(piece.moves.start_mm, piece.moves.end_mm, piece.moves.speed_mm_s)
+        """First guess of the rests' durations: their own moves between stretches of the stream."""
+        rows = np.full(len(piece.moves), -1)
+        for group in timeline_groups:
+            if group.rest:
+                rows[group.first : group.last] = np.arange(group.first, group.last)
+        moves = piece.moves
+        limits = self._limits_of(piece, rows)
+        phases = self._plan(moves.start_mm, moves.end_mm, moves.speed_mm_s, *limits)
         return _group_durations(phases, timeline_groups)
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
@@ -108,7 +114,8 @@ class KlipperEncoder:
         start = np.concatenate([begin[None], position[:-1]])
         start_mm, end_mm = start / _UNITS_PER_MM, position / _UNITS_PER_MM
         ours = rows < 0
-        length, accel, limit, junction, stops = self._motion(start_mm, end_mm)
+        limits_id, limits = self._limits_of(piece, rows)
+        length, accel, limit, junction, stops = self._motion(start_mm, end_mm, limits_id, limits)
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 
         same = np.append(False, group[1:] == group[:-1])
@@ -130,7 +137,8 @@ class KlipperEncoder:
                 feedrate,
                 predicted,
             )
-            phases = self._plan(start_mm, end_mm, np.where(ours, feedrate / 60.0, speed))
+            chosen = np.where(ours, feedrate / 60.0, speed)
+            phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss))) < _TIME_TOLERANCE_S:
@@ -184,8 +192,22 @@ class KlipperEncoder:
             group[order],
         )
 
+    def _limits_of(
+        self, piece: Piece, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], list[Limits]]:
+        """Limits in force at every move: the stream's, or the file's own in a rest."""
+        own = rows >= 0
+        used, found = np.unique(piece.moves.limits_id[rows[own]], return_inverse=True)
+        limits_id = np.zeros(len(rows), np.int32)
+        limits_id[own] = 1 + found
+        return limits_id, [self.limits, *(piece.limits[i] for i in used)]
+
     def _motion(
-        self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
     ) -> tuple[
         NDArray[np.float64],
         NDArray[np.float64],
@@ -206,8 +228,9 @@ class KlipperEncoder:
         safe = np.where(length > 0.0, length, 1.0)
         climb = np.abs(travel[:, 2]) / safe
         ratio = travel[:, 3] / safe
-        accel = np.full(len(length), self.limits.accel_mm_s2)
-        limit = np.full(len(length), self._velocity)
+        accel = np.array([x.accel_mm_s2 for x in limits])[limits_id]
+        limit = np.array([x.velocity_mm_s for x in limits])[limits_id]
+        corner = np.array([x.square_corner_velocity_mm_s for x in limits])[limits_id]
         with np.errstate(divide="ignore"):
             accel = np.minimum(accel, planner.max_z_accel_mm_s2 / climb)
             limit = np.minimum(limit, planner.max_z_velocity_mm_s / climb)
@@ -223,6 +246,9 @@ class KlipperEncoder:
             tangent = np.sqrt((1.0 + cosine) / np.maximum(1.0 - cosine, 1e-12))
             reach = np.minimum(length[1:] * accel[1:], length[:-1] * accel[:-1])
             junction[1:] = np.minimum(junction[1:], np.sqrt(0.5 * reach * tangent))
+            half = np.sqrt(0.5 * (1.0 + cosine))
+            turn = np.sqrt((np.sqrt(2.0) - 1.0) * half / np.maximum(1.0 - half, 1e-12))
+            junction[1:] = np.minimum(junction[1:], turn * np.minimum(corner[1:], corner[:-1]))
         junction[0] = 0.0
         return length, accel, limit, junction, stops
 
@@ -231,6 +257,8 @@ class KlipperEncoder:
         start_mm: NDArray[np.float64],
         end_mm: NDArray[np.float64],
         speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
     ) -> Phases:
         n = len(speed_mm_s)
         zeros, none = np.zeros(n, np.int32), np.full(n, -1, np.int32)
@@ -239,7 +267,7 @@ class KlipperEncoder:
             start_mm=start_mm,
             end_mm=end_mm,
             speed_mm_s=speed_mm_s,
-            limits_id=zeros,
+            limits_id=limits_id,
             modal_id=zeros,
             known=np.full(n, 7, np.uint8),
             line=count + 1,
@@ -249,7 +277,7 @@ class KlipperEncoder:
             feature=none,
             object_id=none,
         )
-        return plan_moves(moves, [self.limits], self._firmware)
+        return plan_moves(moves, limits, self._firmware)
 
 
 def _group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:

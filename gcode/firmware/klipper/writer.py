@@ -57,6 +57,8 @@ class KlipperWriter:
     def __init__(self, machine: Machine, limits: Limits, stamp: str) -> None:
         self._shaper = machine.firmware.shaper
         self._limits = limits
+        self._limits_now = limits
+        """What the printer plans with, while streaming."""
         self._stamp = stamp
         self._streaming = False
         self._shaper_off = False
@@ -112,7 +114,7 @@ class KlipperWriter:
         for at, kind, what in sorted(stops):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._our_modes(modes.at(at - 1)), text[done:upto]]
+                parts += [self._ours(modes.at(at - 1)), text[done:upto]]
                 done = upto
             if kind == 0:
                 written = extruded[at - 1] if at else float(piece.moves.start_mm[0, 3])
@@ -121,7 +123,7 @@ class KlipperWriter:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what))
         if len(text) > done:
-            parts += [self._our_modes(modes.at(len(rows) - 1)), text[done:]]
+            parts += [self._ours(modes.at(len(rows) - 1)), text[done:]]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
@@ -205,15 +207,22 @@ class KlipperWriter:
         line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
         code = line.split(b";", 1)[0]
         state = piece.modal[int(moves.modal_id[row])]
-        lead = self._file_modes(state)
+        # The file's own moves run under its own limits.
+        lead = self._limits_to(piece.limits[int(moves.limits_id[row])]) + self._file_modes(state)
         if _MOVE.match(code) and not _FEED.search(code):
             lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
         return lead + line
 
-    def _our_modes(self, state: ModalState) -> bytes:
-        """Lines that make the printer read X Y Z as absolute and E as relative."""
+    def _limits_to(self, limits: Limits) -> bytes:
+        if limits == self._limits_now:
+            return b""
+        self._limits_now = limits
+        return _limits_line(limits)
+
+    def _ours(self, state: ModalState) -> bytes:
+        """Lines after which ours run under the stream's limits, X Y Z absolute and E relative."""
         assert self._modal is not None
-        text = b""
+        text = self._limits_to(self._limits)
         if not self._modal.absolute_xyz:
             text += b"G90\n"
         if self._modal.absolute_e:
@@ -245,6 +254,7 @@ class KlipperWriter:
                 parts.append(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n")
                 self._shaper_off = True
             parts.append(_limits_line(self._limits))
+            self._limits_now = self._limits
             self._streaming = True
         if self._modal is None:
             self._modal = piece.modal_before

@@ -14,11 +14,11 @@ from gcode.errors import GcodeError
 from gcode.interpreter import Interpreter
 from models.machine import AxisTravel, Machine
 from models.plants import plant_set
+from models.reference_motion import reference_motion
 from models.store import load_machine
 from service.pipeline.measure import STRIDE, Measurement, MotionSamples
 from service.pipeline.options import Options
 from service.pipeline.progress import Cancelled, Progress
-from models.reference_motion import reference_motion
 from service.pipeline.result import ErrorFigures, Result
 from service.pipeline.road import compensate_file, plan_file
 from service.pipeline.yardstick import BestShaper

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.reference_motion import reference_motion
 from models.store import load_machine
 from service.pipeline import yardstick
-from models.reference_motion import reference_motion
 from service.pipeline.yardstick import (
     FREQUENCIES_HZ,
     BestShaper,
