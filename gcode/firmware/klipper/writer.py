@@ -20,6 +20,8 @@ from models.machine import Machine
 
 __all__ = ["KlipperWriter"]
 
+IN_STREAM_MARK_MM_S = 5e-7
+"""Added to the square corner velocity while the file's own moves run inside a stream."""
 _BYTES_PER_LINE = 96
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?G[01](?![0-9])", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
@@ -207,8 +209,12 @@ class KlipperWriter:
         line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
         code = line.split(b";", 1)[0]
         state = piece.modal[int(moves.modal_id[row])]
-        # The file's own moves run under its own limits.
-        lead = self._limits_to(piece.limits[int(moves.limits_id[row])]) + self._file_modes(state)
+        # The file's own moves run under its own limits; the mark tells stillpath.cfg that a PAUSE
+        # here is in mid stream, with the shaper off.
+        own = piece.limits[int(moves.limits_id[row])]
+        corner = own.square_corner_velocity_mm_s + IN_STREAM_MARK_MM_S
+        lead = self._limits_to(replace(own, square_corner_velocity_mm_s=corner))
+        lead += self._file_modes(state)
         if _MOVE.match(code) and not _FEED.search(code):
             lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
         return lead + line
