@@ -45,8 +45,9 @@ ROBUST = ("off", "ensemble", "minimax")
 """The nominal plant; least squares over the set with its weights; with weights that balance the
 members' errors."""
 
-ACCEL_RATIO = 1.6
-"""The command may ask for at most this multiple of the planned path's own peak acceleration."""
+ACCEL_RATIO = 1.5
+"""An axis may ask for at most this multiple of the planned path's own peak acceleration; X and Y
+together then stay below twice of it."""
 EDGE_RATIO = 1.35
 """And at most this multiple where it stops or starts, if possible."""
 RMS_RATIO = 1.5
