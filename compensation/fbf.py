@@ -83,6 +83,7 @@ class PreviewFbf:
     ----------
     lifted : tuple of LiftedWindow
         What X and Y are designed for: plants and their weights.
+    along : float
     rungs : tuple of int
         Steps of `LADDER` that the last command took, X and Y.
 
@@ -126,7 +127,7 @@ class PreviewFbf:
             raise DesignError(f"weight along the path is {along}; above 0 and at most 1 needed")
         window, update = round(window_s / dt_s), round(update_s / dt_s)
         self._dt_s = dt_s
-        self._along = along
+        self.along = along
         self._limits = machine.command
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
         self._last: list[AxisCommand] = []
@@ -189,10 +190,10 @@ class PreviewFbf:
         found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
         self._last = [command for command, _, _ in found]
         self.rungs = tuple(rung for _, rung, _ in found)
-        if self._along < 1.0:
+        if self.along < 1.0:
             chosen = [(rung, careful) for _, rung, careful in found]
             self._last = slide(
-                self._axes, self._last, tasks, chosen, extruding, self._along, self._dt_s
+                self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
             )
         return np.stack([command.position_mm for command in self._last])
 

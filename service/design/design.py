@@ -61,7 +61,7 @@ def design_report(
     *,
     basis: str = "ce-opt",
     robust: str = "off",
-    along: float = 1.0,
+    along: float | None = None,
     dt_s: float = 1e-3,
     window_s: float = 0.3,
     update_s: float = 0.15,
@@ -77,7 +77,7 @@ def design_report(
     machine : Machine
     axis : str
         x or y.
-    basis, robust, along : str, str, float
+    basis, robust, along : str, str, float or None
         What `compensation.fbf.PreviewFbf` is told.
     dt_s, window_s, update_s : float
         Sampling time, preview window, and how much of it is committed.
@@ -145,7 +145,7 @@ def design_report(
             "axis": axis,
             "basis": basis,
             "robust": robust,
-            "along": along,
+            "along": designers[mode].along if mode in designers else along or 1.0,
             "sampling_s": dt_s,
             "window_s": window_s,
             "update_s": update_s,
