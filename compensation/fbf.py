@@ -45,11 +45,9 @@ ROBUST = ("off", "ensemble", "minimax")
 """The nominal plant; least squares over the set with its weights; with weights that balance the
 members' errors."""
 
-ACCEL_RATIO = 1.5
+ACCEL_RATIO = 1.4
 """An axis may ask for at most this multiple of the planned path's own peak acceleration; X and Y
 together then stay below twice of it."""
-EDGE_RATIO = 1.35
-"""And at most this multiple where it stops or starts, if possible."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""
 SET_ALONG = 0.1
@@ -211,7 +209,6 @@ class PreviewFbf:
             # The path itself may touch the ends of the travel, or be judged elsewhere.
             low_mm=min(travel.min_mm, float(path.min())),
             high_mm=max(travel.max_mm, float(path.max())),
-            edge_accel=EDGE_RATIO / ACCEL_RATIO * accel_limit * dt**2,
         )
 
     def _ladder(self, axis: PreviewAxis, task: AxisTask) -> tuple[AxisCommand, int, frozenset[int]]:

@@ -55,7 +55,7 @@ REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
 ROBUST_CHOICE = 1.1
 """The robust basis takes n of so many times n functions."""
-WEIGHT_TRAVEL = 0.3
+WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.05
 _NESTED = {"ce-opt", "dct"}
 """Bases whose functions for n are the first n of those for more."""

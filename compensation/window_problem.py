@@ -44,9 +44,6 @@ class Bounds:
     ----------
     accel, speed : float
         Largest second and first difference, mm/sample^2 and mm/sample.
-    edge_accel : float
-        The same where the command stops for a rest or starts after it, if that is possible: soft
-        stops, since there the speed itself is the step.
     low_mm, high_mm : float
         Travel.
     """
@@ -55,7 +52,6 @@ class Bounds:
     speed: float
     low_mm: float
     high_mm: float
-    edge_accel: float = np.inf
 
     def seen_from(self, origin_mm: float) -> Bounds:
         """Return the bounds for positions relative to an origin."""
@@ -126,13 +122,10 @@ def solve_window(
 
     found = free - pinned.T @ np.linalg.solve(pinned @ pinned.T, pinned @ free - values)
     command = fixed + through @ dtrtrs(factor, found, lower=1, trans=1)[0]
-    edges = [k for span in spans for k in span if 0 <= k < window]
-    limits = np.full(window, bounds.accel)
-    limits[edges] = min(bounds.accel, bounds.edge_accel)
-    broken = _broken(bounds, limits, z, command)
+    broken = _broken(bounds, z, command)
     while any(broken):
         # Only the kinds of bounds that are broken: most windows know one.
-        rows, low, high = _constraints(bounds, limits, z, tied, offset, through, fixed, broken)
+        rows, low, high = _constraints(bounds, z, tied, offset, through, fixed, broken)
         found, _, flag, _ = daqp.solve(
             np.eye(len(free)),
             -free,
@@ -144,9 +137,7 @@ def solve_window(
         if flag <= 0:
             break  # no command keeps them; the caller sees that and takes a gentler design
         command = fixed + through @ dtrtrs(factor, found, lower=1, trans=1)[0]
-        also = [
-            a and not b for a, b in zip(_broken(bounds, limits, z, command), broken, strict=True)
-        ]
+        also = [a and not b for a, b in zip(_broken(bounds, z, command), broken, strict=True)]
         if not any(also):
             break
         broken = [a or b for a, b in zip(broken, also, strict=True)]
@@ -196,17 +187,13 @@ def _normal_equations(
     return normal, right
 
 
-def _broken(bounds: Bounds, limits: Array, z: Array, command: Array) -> list[bool]:
+def _broken(bounds: Bounds, z: Array, command: Array) -> list[bool]:
     whole = np.concatenate([[z[-1], z[-2]], command])
-    increments = np.diff(whole, 2)
-    # Relative to each sample's own limit.
-    relative = increments * (bounds.accel / limits)
-    return [not kept for kept in bounds.kept(relative, np.diff(whole[1:]), command)]
+    return [not kept for kept in bounds.kept(np.diff(whole, 2), np.diff(whole[1:]), command)]
 
 
 def _constraints(
     bounds: Bounds,
-    limits: Array,
     z: Array,
     tied: Array,
     offset: Array,
@@ -216,21 +203,19 @@ def _constraints(
 ) -> tuple[Array, Array, Array]:
     """Rows, lower and upper ends of the bounds on the coefficients."""
     step = float(z[-2] - z[-1])
-    accel = (1.0 - _MARGIN) * limits
-    speed = np.full(len(tied), (1.0 - _MARGIN) * bounds.speed)
-    low, high = np.full(len(tied), bounds.low_mm), np.full(len(tied), bounds.high_mm)
+    accel, speed = (1.0 - _MARGIN) * bounds.accel, (1.0 - _MARGIN) * bounds.speed
     kinds = [
-        (tied, offset, -accel, accel, bounds.accel),
-        (np.cumsum(tied, axis=0), step + np.cumsum(offset), -speed, speed, bounds.speed),
-        (through, fixed, low, high, _TRAVEL_SCALE_MM),
+        (tied, offset, -accel, accel, accel),
+        (np.cumsum(tied, axis=0), step + np.cumsum(offset), -speed, speed, speed),
+        (through, fixed, bounds.low_mm, bounds.high_mm, _TRAVEL_SCALE_MM),
     ]
     rows, lows, highs = [], [], []
     for (functions, at, low, high, scale), wanted in zip(kinds, which, strict=True):
         if wanted:
             free = np.any(functions != 0.0, axis=1)  # increments in a rest are not
             rows.append(functions[free] / scale)
-            lows.append((low[free] - at[free]) / scale)
-            highs.append((high[free] - at[free]) / scale)
+            lows.append((low - at[free]) / scale)
+            highs.append((high - at[free]) / scale)
     return np.concatenate(rows), np.concatenate(lows), np.concatenate(highs)
 
 
