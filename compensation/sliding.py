@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from compensation._sliding_kernels import contour_square, move_targets
 from compensation.lifted_window import lifted_window
 from compensation.preview_axis import (
+    LADDER,
     WEIGHT_TRAVEL,
     AxisCommand,
     AxisTask,
@@ -39,7 +40,7 @@ ROUNDS = 4
 RELAXATION = 1.6
 """Beyond the new targets; 2 would be the edge of stability."""
 REACH_S = 0.008
-_BOUNDED_ROUNDS = 4
+_BOUNDED_ROUNDS = 12
 _WEIGHT_ROUNDS = 8
 _WEIGHT_RUNG = 2
 _LEAST_SHARE = 0.05
@@ -79,23 +80,37 @@ def slide(
     targets = np.repeat(path[None], members, axis=0)
     tau = along / (1.0 + along)
     reach = _reach(dt_s)
+    choice = list(chosen)
     for _ in range(ROUNDS):
         for j in range(members):
             answer = _answer(axes, commands, j)
             move_targets(path, answer, extruding, tau, WEIGHT_TRAVEL, reach, RELAXATION, targets[j])
         moved = []
-        for i, (axis, task, (rung, careful)) in enumerate(zip(axes, tasks, chosen, strict=True)):
-            for _ in range(_BOUNDED_ROUNDS):
-                command = axis.command(rung, task, careful, targets[: axis.members, i])
-                outside = axis.windows_outside(task.bounds, command.position_mm)
-                if not outside:
-                    break
-                careful |= outside
-            else:
+        for i, (axis, task) in enumerate(zip(axes, tasks, strict=True)):
+            wanted = targets[: axis.members, i]
+            command, choice[i] = _within_bounds(axis, task, choice[i], wanted)
+            if command is None:
                 return commands
             moved.append(command)
         commands = moved
     return commands
+
+
+def _within_bounds(
+    axis: PreviewAxis, task: AxisTask, choice: Choice, targets_mm: Array
+) -> tuple[AxisCommand | None, Choice]:
+    """Command for targets of the members' own, on the same rung or a gentler one."""
+    rung, careful = choice
+    for _ in range(_BOUNDED_ROUNDS):
+        command = axis.command(rung, task, careful, targets_mm)
+        outside = axis.windows_outside(task.bounds, command.position_mm)
+        if not outside:
+            return command, (rung, careful)
+        if outside <= careful:
+            rung, careful = min(rung + 1, len(LADDER) - 1), frozenset()
+        else:
+            careful |= outside
+    return None, choice
 
 
 @lru_cache(maxsize=32)
