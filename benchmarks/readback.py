@@ -307,7 +307,9 @@ class Aligned(Timed):
         since_s = np.maximum(t_s - self._begin_s[k], 0.0)
         wanted_s = self._from_s[k] + since_s
         moving = wanted_s < self._until_s[k]
+        # Just before the end; a sample may be nearer to it than that.
         wanted_s = np.where(moving, wanted_s, self._until_s[k] - 1e-9)
+        wanted_s = np.maximum.accumulate(wanted_s)
         phases, _ = _around(self._path, wanted_s)
         position, row = sample_phases(phases, wanted_s)
         return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
