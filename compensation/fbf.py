@@ -50,8 +50,8 @@ ACCEL_RATIO = 1.4
 together then stay below twice of it."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""
-SET_ALONG = 0.1
-"""Weight of the error along the path, for sets: .05 gains 2 % across and loses 3 % along."""
+SET_ALONG = 0.09
+"""Weight of the error along the path, for sets: half of it gains 2 % across, loses 3 % along."""
 _BOUNDED_SHARE = 0.2
 """Solve windows again within bounds if so few leave them; otherwise take a gentler design."""
 _BOUNDED_ROUNDS = 4
@@ -72,7 +72,7 @@ class PreviewFbf:
         One of `ROBUST`.
     along : float, optional
         Weight of the error along the path against that across it, above 0; 1: they count alike,
-        which is least squares to the path. Default: 1 for one plant, .1 for a set, at some three
+        which is least squares to the path. Default: 1 for one plant, .09 for a set, at some three
         times the time.
     window_s, update_s : float
         Preview window and how much of it is committed before the next one starts.
@@ -133,6 +133,8 @@ class PreviewFbf:
         sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
         chosen = _chosen(sets, robust, dt_s, window, update, basis, along)
         made = [designs(plants, weights, window, update, basis) for plants, weights in chosen]
+        for one in made:
+            one.check()
         self.lifted = tuple(one.lifted for one in made)
         self._axes = [PreviewAxis(axis, one) for axis, one in zip(("x", "y"), made, strict=True)]
 
@@ -177,9 +179,11 @@ class PreviewFbf:
         for a, b in rests:
             weight[a:b] = WEIGHT_REST
         ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
-        stops = np.concatenate([ends[:1], rests, ends[1:]])
+        stops = _merged(np.concatenate([ends[:1], rests, ends[1:]]))
         bend = np.diff(y_d_mm, 2) / self._dt_s**2
-        rms_limit = RMS_RATIO * float(np.sqrt(np.max(np.mean(bend**2, axis=1), initial=0.0)))
+        rms_limit = np.inf
+        if bend.shape[1]:
+            rms_limit = RMS_RATIO * float(np.sqrt(np.max(np.mean(bend**2, axis=1))))
         accel_limit = self.accel_limit_mm_s2(y_d_mm)
         tasks = [
             AxisTask(path, weight, stops, self._bounds(i, path, accel_limit), rms_limit)
@@ -219,7 +223,14 @@ class PreviewFbf:
         rounds = 0
         asked = ""
         while True:
-            found = axis.command(rung, task, careful)
+            try:
+                found = axis.command(rung, task, careful)
+            except DesignError:
+                # This design refuses itself; a gentler one may not.
+                if rung == last:
+                    raise
+                rung, careful, rounds = rung + 1, frozenset(), 0
+                continue
             command = found.position_mm
             bend, step = changes(command)
             rms = float(np.sqrt(np.mean(bend**2))) / dt**2
@@ -232,8 +243,9 @@ class PreviewFbf:
             if rms <= task.rms_limit_mm_s2 or rung >= GENTLE_RUNG:
                 if all(bounds.kept(bend, step, command)):
                     # The next piece starts here, or higher where there was room to spare.
-                    roomy = rms < 0.6 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
-                    axis.next_rung = max(0, rung - 1) if roomy else rung
+                    roomy = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
+                    if len(command) > axis.update:
+                        axis.next_rung = max(0, rung - 1) if roomy else rung
                     return found, rung, careful
                 concerned = axis.windows_outside(bounds, command)
                 few = len(careful | concerned) <= max(2, _BOUNDED_SHARE * len(bend) / axis.update)
@@ -249,6 +261,17 @@ class PreviewFbf:
             f"{bounds.accel / dt**2:.0f} mm/s2, {self._limits.velocity_mm_s:.0f} mm/s and "
             f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the machine)"
         )
+
+
+def _merged(stops: Ints) -> Ints:
+    """Return the stops in order, those that touch made one."""
+    spans: list[list[int]] = []
+    for a, b in sorted(map(tuple, stops.tolist())):
+        if spans and a <= spans[-1][1]:
+            spans[-1][1] = max(b, spans[-1][1])
+        else:
+            spans.append([a, b])
+    return np.array(spans, dtype=np.int64)
 
 
 def _chosen(

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation._preview_kernels import advance_state, run_windows
-from compensation.basis import BASES, robust_basis
+from compensation.base import DesignError
+from compensation.basis import BASES, ce_opt_basis, robust_basis
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.preview import PreviewDesign
 from compensation.window_problem import TRAVEL_SLACK_MM, Bounds, solve_window
@@ -120,6 +121,18 @@ class Designs:
             self._made[n, step.price] = PreviewDesign(self.lifted, n, self._basis, step.price, psi)
         return self._made[n, step.price]
 
+    def check(self) -> None:
+        """Raise the DesignError of the first rung if every rung refuses itself."""
+        refusals = []
+        for rung in range(len(LADDER)):
+            try:
+                self.design(rung)
+            except DesignError as error:
+                refusals.append(error)
+            else:
+                return
+        raise refusals[0]
+
     def _psi(self, n: int) -> Array:
         size = self._scaled(max(rung.n for rung in LADDER)) if self._basis in _NESTED else n
         if size not in self._functions:
@@ -127,6 +140,9 @@ class Designs:
         return self._functions[size]
 
     def _made_for(self, n: int) -> Array:
+        # Members that are alike leave nothing to choose.
+        if self._basis == "robust" and len(self.lifted.integrated) == 1:
+            return ce_opt_basis(self._set.gram, n)
         if self._basis != "robust":
             return BASES[self._basis](self._set, n)
         # Far above its modes a set agrees too, on hardly answering: choose among the directions
@@ -177,12 +193,12 @@ class PreviewAxis:
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Let the axis follow a command that was not ours."""
+        """Let the axis follow a command that was not ours, up to the sample behind its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])
         self._move_origin(origin)
-        self._states = self._advanced(self._states, command[:-1] - origin)
+        self._states = self._advanced(self._states, command - origin)
 
     def commit(self, command: AxisCommand) -> None:
         """Take a command as executed."""

@@ -78,13 +78,14 @@ def slide(
     path = np.stack([task.path_mm for task in tasks])
     members = max(axis.members for axis in axes)
     targets = np.repeat(path[None], members, axis=0)
-    tau = along / (1.0 + along)
     reach = _reach(dt_s)
     choice = list(chosen)
     for _ in range(ROUNDS):
         for j in range(members):
             answer = _answer(axes, commands, j)
-            move_targets(path, answer, extruding, tau, WEIGHT_TRAVEL, reach, RELAXATION, targets[j])
+            move_targets(
+                path, answer, extruding, along, WEIGHT_TRAVEL, reach, RELAXATION, targets[j]
+            )
         moved = []
         for i, (axis, task) in enumerate(zip(axes, tasks, strict=True)):
             wanted = targets[: axis.members, i]

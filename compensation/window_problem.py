@@ -120,7 +120,10 @@ def solve_window(
     rows, values = through[pins], path_mm[pins] - fixed[pins]
     pinned = np.ascontiguousarray(dtrtrs(factor, rows.T, lower=1)[0].T)
 
-    found = free - pinned.T @ np.linalg.solve(pinned @ pinned.T, pinned @ free - values)
+    try:
+        found = free - pinned.T @ np.linalg.solve(pinned @ pinned.T, pinned @ free - values)
+    except np.linalg.LinAlgError as error:
+        raise DesignError(f"rests contradict each other in a window: {error}") from error
     command = fixed + through @ dtrtrs(factor, found, lower=1, trans=1)[0]
     broken = _broken(bounds, z, command)
     while any(broken):

@@ -44,8 +44,8 @@ class Passage:
         Where they start in the file; `byte_start` and `byte_end` columns are absolute.
     limits, modal : lists
         The interpreter's tables.
-    limits_before : Limits
-        Planner limits in force before the first line.
+    limits_before, limits_after : Limits
+        Planner limits in force before the first line, and behind the last.
     modal_before, modal_after : ModalState
         Modes before the first and after the last line.
     """
@@ -57,6 +57,7 @@ class Passage:
     limits: list[Limits]
     modal: list[ModalState]
     limits_before: Limits
+    limits_after: Limits
     modal_before: ModalState
     modal_after: ModalState
 
@@ -248,6 +249,7 @@ class Splitter:
             modal=modal,
             limits_before=limits_before,
             modal_before=modal_before,
+            limits_after=limits[self._limits_id],
             modal_after=modal[self._modal_id],
         )
         self._text = self._text[len(text) :]

@@ -113,7 +113,7 @@ def compensate(
         float | None,
         typer.Option(
             help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
-            "takes longer. [default: .1 with a set, else 1]"
+            "takes longer. [default: .09 with a set, else 1]"
         ),
     ] = None,
     tolerance_um: Annotated[

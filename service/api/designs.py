@@ -10,10 +10,12 @@ from fastapi import APIRouter, Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, Response
 
+from compensation.base import DesignError
+from models.errors import ModelError
 from models.machine import Machine
 from models.store import load_machine
 from service.api.machines import read_machine
-from service.api.problems import responses
+from service.api.problems import Problem, responses
 from service.design.figures import DesignReport
 from service.pipeline.options import BasisName, RobustMode
 
@@ -58,7 +60,10 @@ async def _asked(
 ) -> DesignReport:
     read_machine(name)  # answers 404 for names that are not in the library
     designs: Designs = request.app.state.designs
-    return await designs.get(load_machine(name), (axis, basis, robust))
+    try:
+        return await designs.get(load_machine(name), (axis, basis, robust))
+    except (DesignError, ModelError) as error:
+        raise Problem(422, "No such design", str(error)) from error
 
 
 Asked = Annotated[DesignReport, Depends(_asked)]

@@ -85,7 +85,7 @@ async def create_job(
             le=1,
             allow_inf_nan=False,
             description="Weight of errors along the path against those across it, for `fbf`; "
-            "less than 1 takes longer. By default .1 with a set, else 1.",
+            "less than 1 takes longer. By default .09 with a set, else 1.",
         ),
     ] = None,
     tolerance_um: Annotated[

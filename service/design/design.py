@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from compensation.base import DesignError
 from compensation.basis import BASES, ZERO
-from compensation.fbf import LADDER, ROBUST, PreviewFbf, Rung
+from compensation.fbf import LADDER, ROBUST, PreviewFbf
 from compensation.lifted import LiftedSet, integrated, lift, lifted_set
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.metrics import (
@@ -26,7 +26,7 @@ from compensation.metrics import (
     robust_error_of_spread,
 )
 from compensation.nominal import two_step
-from compensation.preview import PreviewDesign
+from compensation.preview_axis import Designs, designs
 from compensation.shapers import SHAPERS
 from models.machine import Machine
 from models.plants import DiscretePlant, PlantSet, plant_set
@@ -281,21 +281,24 @@ def _ladder(
     every = None
     if len(plants.members) > 1:
         every = _increments(plants.members, plants.weights, window)
-    return tuple(_rung(rung, lifted, basis, dt_s, nominal, every) for rung in LADDER)
+    # The very designs that the product uses.
+    weights = tuple(lifted.weights.tolist())
+    table = designs(lifted.plants, weights, window, lifted.update, basis)
+    return tuple(_rung(k, table, dt_s, nominal, every) for k in range(len(LADDER)))
 
 
 def _rung(
-    rung: Rung,
-    lifted: LiftedWindow,
-    basis: str,
+    number: int,
+    table: Designs,
     dt_s: float,
     nominal: LiftedSet,
     every: LiftedSet | None,
 ) -> RungFigures:
+    rung, lifted = LADDER[number], table.lifted
     n = max(4, round(rung.n * lifted.window / 300))
     cutoff_hz = n / (2 * lifted.window * dt_s)
     try:
-        design = PreviewDesign(lifted, n, basis, rung.price)
+        design = table.design(number)
     except DesignError as error:
         return RungFigures(n=n, cutoff_hz=cutoff_hz, price=rung.price, refused=str(error))
     seen = np.einsum("k,kwn->nw", lifted.target, design.filtered)

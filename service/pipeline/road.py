@@ -178,6 +178,10 @@ class _Job:
         self._sum.moves += len(piece.moves)
         original_s = _duration_s(piece.phases)
         self._sum.original_s += original_s
+        if self._sum.jumped:
+            # Homed, say: the machine did not come here along the path.
+            self._work.compensator.reset(piece.phases.start_mm[0, :2])
+            self._sum.jumped = False
         writer, checker = copy.copy(self._writer), None
         try:
             with self._clock.stage("compensate"):

@@ -72,6 +72,30 @@ def test_rests_of_any_length(machine: Machine, rest: int) -> None:
     assert np.max(np.abs(u - path)) < 1.0
 
 
+@pytest.mark.parametrize(
+    "rests", [[[1, 40]], [[780, 1020]], [[300, 340], [340, 400]], [[300, 350], [340, 400]]]
+)
+def test_rests_that_touch(machine: Machine, rests: list[list[int]]) -> None:
+    """Each other, or the ends of the piece."""
+    path, extruding, _ = strokes()
+    for a, b in rests:
+        path[:, a:b] = path[:, a - 1 : a]
+    u = made(machine, path[:, 0]).compensate(path, extruding, np.array(rests, np.int64))
+    assert np.isfinite(u).all()
+    for a, b in rests:
+        np.testing.assert_allclose(u[:, a:b], u[:, a - 1 : a].repeat(b - a, axis=1), atol=1e-12)
+
+
+@pytest.mark.parametrize("samples", [1, 2, 3, 5, 40])
+def test_short_pieces(machine: Machine, samples: int) -> None:
+    path = np.array([[10.0], [20.0]]) + np.linspace(0, 0.001, samples) * np.array([[1.0], [0.5]])
+    fbf = made(machine, path[:, 0])
+    u = fbf.compensate(path, np.ones(samples, bool), NO_RESTS)
+    assert u.shape == path.shape
+    assert np.isfinite(u).all()
+    np.testing.assert_allclose(u[:, [0, -1]], path[:, [0, -1]], atol=1e-9)
+
+
 def test_improves(machine: Machine) -> None:
     path, extruding, rests = strokes()
     plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
@@ -107,7 +131,7 @@ def test_state_is_carried_between_pieces(machine: Machine) -> None:
     split = made(machine, path[:, 0])
     first = split.compensate(path[:, :cut], extruding[:cut], NO_RESTS)
     split.commit()
-    split.observe(np.hstack([first[:, -1:], path[:, cut : rests[0, 1]]]))
+    split.observe(np.hstack([first[:, -1:], path[:, cut : rests[0, 1] - 1]]))
     second = split.compensate(path[:, rests[0, 1] - 1 :], extruding[rests[0, 1] - 1 :], NO_RESTS)
     plants = [plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")]
     joined = np.hstack([first, path[:, cut : rests[0, 1] - 1], second])
@@ -152,7 +176,7 @@ def test_observe_is_the_plant(machine: Machine) -> None:
         begin = 0
         for end in cuts:
             fbf.observe(ringing[:, begin:end])
-            begin = end - 1
+            begin = end
         results.append(fbf.compensate(path, extruding, NO_RESTS))
     for other in results[1:]:
         np.testing.assert_allclose(other, results[0], atol=1e-9)

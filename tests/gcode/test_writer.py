@@ -218,7 +218,7 @@ def test_shaper_of_the_machine_is_restored(road: Road, machine: Machine) -> None
 
 def test_shaper_of_the_file_is_restored(road: Road) -> None:
     line = b"SET_INPUT_SHAPER SHAPER_TYPE=mzv SHAPER_FREQ_X=48 SHAPER_FREQ_Y=37"
-    written = road(HEAD.encode() + line + b"\n" + ROUND.encode() + b"G28\nG1 X5 Y5\n")
+    written = road(HEAD.encode() + line + b"\n" + ROUND.encode() + b"G28\nM84\n")
     assert written.count(line) == 2
     assert written.index(b"SHAPER_FREQ_X=0") < written.rindex(line) < written.rindex(b"G28")
 
@@ -243,6 +243,31 @@ def test_rests_run_under_the_limits_of_the_file(road: Road, machine: Machine) ->
         b"G1 Z5 F600": 1500,
         b"G1 E1 F2100": 1500,
     }
+
+
+def test_a_file_that_ends_in_a_stream_gives_the_printer_back(road: Road) -> None:
+    lines = road(HEAD + ROUND).splitlines()
+    limits = [line for line in lines if line.startswith(b"SET_VELOCITY_LIMIT")]
+    assert b"ACCEL=5000 " in limits[-1]
+    assert lines[-2] == b"; stillpath: stream off"
+    assert road.result is not None
+    assert any("shaper" in warning for warning in road.result.warnings)
+
+
+def test_after_homing_the_machine_stands_still(road: Road) -> None:
+    """A jump is no motion: what follows must not be compensated for it."""
+    result = road(HEAD + ROUND + "G28\n" + ROUND + "G28\n")
+    assert result.count(b"; stillpath: stream on") >= 2
+    assert road.result is not None
+    sliced, ours = (channel.extruding for channel in road.result.channels[:2])
+    assert ours.contour_max_um < 0.3 * sliced.contour_max_um
+
+
+@pytest.mark.parametrize("length", ["0.0005", "0.001", "0.02"])
+def test_hardly_a_move_between_two_rests(road: Road, length: str) -> None:
+    tiny = f"G1 E-1 F2100\nG1 X{120 + float(length):.4f} F6000\nG1 E1 F2100\nG1 X130 F6000\n"
+    written = road(HEAD + ROUND + tiny + "M400\nG1 X130.001\nM400\n")
+    assert b"stream on" in written
 
 
 def test_stamps(road: Road, machine: Machine) -> None:

@@ -69,6 +69,8 @@ class KlipperWriter:
         self._modal: ModalState | None = None
         """What the printer's modes are now, where they may differ from the file's."""
         self._file_feed_mm_min = 0.0
+        self._behind: tuple[Limits, ModalState] | None = None
+        """What the file had set behind the last piece."""
         self.shaper_unknown = False
 
     def header(self) -> bytes:
@@ -83,7 +85,7 @@ class KlipperWriter:
     def footer(self, ends_with_newline: bool) -> bytes:
         """Last lines of the file."""
         lead = b"" if ends_with_newline else b"\n"
-        return lead + self._off(None) + f"; Processed by stillpath {self._stamp}\n".encode()
+        return lead + self._end() + f"; Processed by stillpath {self._stamp}\n".encode()
 
     def passage(self, passage: Passage) -> bytes:
         """Text of lines that leave as they came."""
@@ -129,6 +131,7 @@ class KlipperWriter:
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
+        self._behind = (piece.limits_after, piece.modal_after)
         return b"".join(parts)
 
     def _event_places(self, piece: Piece, encoded: Encoded) -> NDArray[np.int64]:
@@ -266,33 +269,36 @@ class KlipperWriter:
             self._modal = piece.modal_before
         return b"".join(parts)
 
-    def _off(self, passage: Passage | None) -> bytes:
+    def _off(self, passage: Passage) -> bytes:
         """Lines that give the printer back to the file."""
         if not self._streaming:
-            return b"" if passage is None else self._shaper_on(passage)
-        parts: list[bytes] = []
-        if not self._at_rest and not (passage is not None and _extruder_only(passage, 0)):
-            parts.append(_STOP)
-        self._streaming = False
-        if passage is None:
-            return b"".join(parts)
-        parts.append(_limits_line(passage.limits_before))
-        state = passage.modal_before
-        parts.append(self._file_modes(state))
-        parts.append(_feed_line(self._file_feed_mm_min))
-        parts.append(b"; stillpath: stream off\n")
-        parts.append(self._shaper_on(passage))
-        self._modal = None
-        return b"".join(parts)
+            return self._shaper_before(passage)
+        stop = b"" if self._at_rest or _extruder_only(passage, 0) else _STOP
+        text = stop + self._stream_off(passage.limits_before, passage.modal_before)
+        return text + self._shaper_before(passage)
 
-    def _shaper_on(self, passage: Passage) -> bytes:
+    def _end(self) -> bytes:
+        """Lines that give the printer back at the end of the file."""
+        text = b""
+        if self._streaming and self._behind is not None:
+            text = (b"" if self._at_rest else _STOP) + self._stream_off(*self._behind)
+        return text + self._shaper_on()
+
+    def _stream_off(self, limits: Limits, state: ModalState) -> bytes:
+        self._streaming = False
+        text = _limits_line(limits) + self._file_modes(state)
+        self._modal = None
+        return text + _feed_line(self._file_feed_mm_min) + b"; stillpath: stream off\n"
+
+    def _shaper_before(self, passage: Passage) -> bytes:
         """Set the firmware's shaper again before lines that move X or Y on their own."""
-        if not self._shaper_off:
-            return b""
         travel = passage.moves.end_mm - passage.moves.start_mm
         moves_xy = bool(np.any(travel[:, :2] != 0.0))
         foreign = bool(np.any(passage.events.kind == EventKind.UNKNOWN))
-        if not (moves_xy or foreign):
+        return self._shaper_on() if moves_xy or foreign else b""
+
+    def _shaper_on(self) -> bytes:
+        if not self._shaper_off:
             return b""
         self._shaper_off = False
         if self._shaper is None and not self._shaper_lines:
