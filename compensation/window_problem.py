@@ -108,7 +108,6 @@ def solve_window(
     tied, offset = _tie_down(design.basis, last - previous, spans)
     normal, right = _normal_equations(design, z, targets_mm, weight, spans, tied, offset)
     fixed = last + np.arange(1.0, window + 1.0) * (last - previous) + _twice_summed(offset)
-    through = _twice_summed(tied)
     pins = [a - 1 for a, _ in spans if a > 0]
 
     # In the coordinates w = L' c, normal = L L', the cost is |w - free|^2: well conditioned even
@@ -117,18 +116,20 @@ def solve_window(
     if flaw:
         raise DesignError(f"the window problem at a rest is singular (LAPACK dpotrf: {flaw})")
     free = dtrtrs(factor, right, lower=1)[0]
-    rows, values = through[pins], path_mm[pins] - fixed[pins]
+    # Rows of the double running sum of `tied`, which as a whole would take longer than the rest.
+    reach = np.maximum(np.array(pins, float)[:, None] + 1.0 - np.arange(window), 0.0)
+    rows, values = reach @ tied, path_mm[pins] - fixed[pins]
     pinned = np.ascontiguousarray(dtrtrs(factor, rows.T, lower=1)[0].T)
 
     try:
         found = free - pinned.T @ np.linalg.solve(pinned @ pinned.T, pinned @ free - values)
     except np.linalg.LinAlgError as error:
         raise DesignError(f"rests contradict each other in a window: {error}") from error
-    command = fixed + through @ dtrtrs(factor, found, lower=1, trans=1)[0]
+    command = fixed + _twice_summed(tied @ dtrtrs(factor, found, lower=1, trans=1)[0])
     broken = _broken(bounds, z, command)
     while any(broken):
         # Only the kinds of bounds that are broken: most windows know one.
-        rows, low, high = _constraints(bounds, z, tied, offset, through, fixed, broken)
+        rows, low, high = _constraints(bounds, z, tied, offset, fixed, broken)
         found, _, flag, _ = daqp.solve(
             np.eye(len(free)),
             -free,
@@ -139,7 +140,7 @@ def solve_window(
         )
         if flag <= 0:
             break  # no command keeps them; the caller sees that and takes a gentler design
-        command = fixed + through @ dtrtrs(factor, found, lower=1, trans=1)[0]
+        command = fixed + _twice_summed(tied @ dtrtrs(factor, found, lower=1, trans=1)[0])
         also = [a and not b for a, b in zip(_broken(bounds, z, command), broken, strict=True)]
         if not any(also):
             break
@@ -200,7 +201,6 @@ def _constraints(
     z: Array,
     tied: Array,
     offset: Array,
-    through: Array,
     fixed: Array,
     which: list[bool],
 ) -> tuple[Array, Array, Array]:
@@ -208,13 +208,16 @@ def _constraints(
     step = float(z[-2] - z[-1])
     accel, speed = (1.0 - _MARGIN) * bounds.accel, (1.0 - _MARGIN) * bounds.speed
     kinds = [
-        (tied, offset, -accel, accel, accel),
-        (np.cumsum(tied, axis=0), step + np.cumsum(offset), -speed, speed, speed),
-        (through, fixed, bounds.low_mm, bounds.high_mm, _TRAVEL_SCALE_MM),
+        (offset, -accel, accel, accel),
+        (step + np.cumsum(offset), -speed, speed, speed),
+        (fixed, bounds.low_mm, bounds.high_mm, _TRAVEL_SCALE_MM),
     ]
     rows, lows, highs = [], [], []
-    for (functions, at, low, high, scale), wanted in zip(kinds, which, strict=True):
+    for times, ((at, low, high, scale), wanted) in enumerate(zip(kinds, which, strict=True)):
         if wanted:
+            functions = tied
+            for _ in range(times):
+                functions = np.cumsum(functions, axis=0)
             free = np.any(functions != 0.0, axis=1)  # increments in a rest are not
             rows.append(functions[free] / scale)
             lows.append((low - at[free]) / scale)
