@@ -114,7 +114,9 @@ def design_report(
         lifted = designers[mode].lifted[row]
     else:
         lifted = lifted_window(plants.members, plants.weights, window, round(update_s / dt_s))
-    ladder = _ladder(plants, lifted, basis, dt_s)
+    # What the product refuses as a whole, no rung of it can be used for.
+    whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
+    ladder = _ladder(plants, lifted, basis, dt_s, whole)
     names = [f"n {rung.n}, price {rung.price:g}" for rung in ladder]
 
     trial = Trial(machine, axis, dt_s, motion, errors_percent)
@@ -274,7 +276,7 @@ def _increments(members: Sequence[DiscretePlant], weights: Array, window: int) -
 
 
 def _ladder(
-    plants: PlantSet, lifted: LiftedWindow, basis: str, dt_s: float
+    plants: PlantSet, lifted: LiftedWindow, basis: str, dt_s: float, refused: str | None
 ) -> tuple[RungFigures, ...]:
     window = lifted.window
     nominal = _increments((plants.nominal,), np.ones(1), window)
@@ -284,7 +286,7 @@ def _ladder(
     # The very designs that the product uses.
     weights = tuple(lifted.weights.tolist())
     table = designs(lifted.plants, weights, window, lifted.update, basis)
-    return tuple(_rung(k, table, dt_s, nominal, every) for k in range(len(LADDER)))
+    return tuple(_rung(k, table, dt_s, nominal, every, refused) for k in range(len(LADDER)))
 
 
 def _rung(
@@ -293,6 +295,7 @@ def _rung(
     dt_s: float,
     nominal: LiftedSet,
     every: LiftedSet | None,
+    refused: str | None,
 ) -> RungFigures:
     rung, lifted = LADDER[number], table.lifted
     n = max(4, round(rung.n * lifted.window / 300))
@@ -301,6 +304,8 @@ def _rung(
         design = table.design(number)
     except DesignError as error:
         return RungFigures(n=n, cutoff_hz=cutoff_hz, price=rung.price, refused=str(error))
+    if refused is not None:
+        return RungFigures(n=n, cutoff_hz=cutoff_hz, price=rung.price, refused=refused)
     seen = np.einsum("k,kwn->nw", lifted.target, design.filtered)
     controller = design.basis @ np.linalg.solve(np.eye(n) + rung.price * design.effort, seen)
     return RungFigures(

@@ -114,6 +114,7 @@ class _Job:
         # A method that cannot be designed says so before the yardstick takes its seconds.
         tuned_first = options.method.startswith("shaper:")
         if self._changes and not tuned_first:
+            self._say("designing", 0.0)
             with self._clock.stage("design"):
                 self._work = PieceCompensator(machine, options)
         self._say("tuning the yardstick", 0.0)
