@@ -71,7 +71,7 @@ def lift(plant: DiscretePlant | ArrayLike, samples: int) -> ToeplitzOperator:
     if samples < 1:
         raise DesignError(f"{samples} samples: a lifted system needs at least one")
     if isinstance(plant, DiscretePlant):
-        _check_stable(plant, "the plant")
+        check_stable(plant, "the plant")
         return ToeplitzOperator(plant.impulse_response(samples))
     markov = np.zeros(samples)
     given = np.asarray(plant, np.float64)[:samples]
@@ -111,7 +111,7 @@ def time_varying(
             "per plant, the first 0, rising, and all below the number of samples"
         )
     for i, plant in enumerate(plants):
-        _check_stable(plant, f"plant {i} of the time-varying system")
+        check_stable(plant, f"plant {i} of the time-varying system")
     return TimeVaryingOperator(
         np.stack([p.a for p in plants]),
         np.stack([p.b for p in plants]),
@@ -225,7 +225,8 @@ def checked_weights(weights: ArrayLike, members: int) -> Array:
     return shares
 
 
-def _check_stable(plant: DiscretePlant, what: str) -> None:
+def check_stable(plant: DiscretePlant, what: str) -> None:
+    """Refuse a plant whose commands would not be bounded."""
     radius = float(np.abs(plant.poles()).max(initial=0.0))
     if radius >= 1:
         raise DesignError(

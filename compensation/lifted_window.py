@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, toeplitz
 
 from compensation.base import DesignError
-from compensation.lifted import LiftedSet, lifted_set
+from compensation.lifted import (
+    LiftedSet,
+    check_stable,
+    checked_weights,
+    free_response,
+    integrated,
+    lifted_set,
+)
 from models.plants import DiscretePlant
 
 __all__ = ["LiftedWindow", "lifted_window"]
@@ -78,7 +85,7 @@ class LiftedWindow:
 
     def lifted_set(self) -> LiftedSet:
         """Return what a basis needs to know: Gram matrix and mean of the integrated plants."""
-        markov = np.array([_integrated_markov(p, self.window) for p in self.plants])
+        markov = np.array([integrated(p.impulse_response(self.window)) for p in self.plants])
         return lifted_set(markov, self.weights)
 
     def rest_state(self, position_mm: float) -> Array:
@@ -105,10 +112,13 @@ def lifted_window(
     DesignError
         For an empty set, weights that do not fit, an unstable member, or update > window.
     """
-    share = np.asarray(weights, float)
-    _check(plants, share, window, update)
+    share = checked_weights(weights, len(plants))
+    if not 2 <= update <= window:
+        raise DesignError(f"update of {update} samples: between 2 and the window's {window} needed")
+    for j, plant in enumerate(plants):
+        check_stable(plant, f"plant {j} of the set")
     roots = np.sqrt(share)
-    markov = np.array([_integrated_markov(p, window) for p in plants])
+    markov = np.array([integrated(p.impulse_response(window)) for p in plants])
     u, s, vt = np.linalg.svd(roots[:, None] * markov, full_matrices=False)
     count = int(np.sum(s > _TOLERANCE * s[0]))
     # Singular vectors are free in sign; fix it so that the same model gives the same bytes.
@@ -120,7 +130,7 @@ def lifted_window(
     step = np.arange(1.0, window + 1.0)
     straight = np.stack([step + 1.0, -step], axis=1)
     history = [toeplitz(np.diff(m, 2, prepend=[0.0, 0.0]), zeros) @ straight for m in markov]
-    free = [_free_response(p, window) for p in plants]
+    free = [free_response(p, window) for p in plants]
     return LiftedWindow(
         plants=tuple(plants),
         weights=share,
@@ -145,19 +155,6 @@ def lifted_window(
     )
 
 
-def _integrated_markov(plant: DiscretePlant, window: int) -> Array:
-    return np.cumsum(np.cumsum(plant.impulse_response(window)))
-
-
-def _free_response(plant: DiscretePlant, window: int) -> Array:
-    rows = np.empty((window, plant.order))
-    row = plant.c
-    for k in range(window):
-        rows[k] = row
-        row = row @ plant.a
-    return rows
-
-
 def _drive(plant: DiscretePlant, update: int) -> Array:
     columns = np.empty((plant.order, update))
     column = plant.b
@@ -165,24 +162,3 @@ def _drive(plant: DiscretePlant, update: int) -> Array:
         columns[:, k] = column
         column = plant.a @ column
     return columns
-
-
-def _check(plants: Sequence[DiscretePlant], weights: Array, window: int, update: int) -> None:
-    if len(plants) == 0:
-        raise DesignError("the plant set is empty; give at least one plant")
-    if len(weights) != len(plants):
-        raise DesignError(f"{len(plants)} plants but {len(weights)} weights; one weight each")
-    if not (np.all(weights > 0) and abs(weights.sum() - 1.0) < 1e-9):
-        raise DesignError(
-            f"weights of a set must be positive and sum to 1 (given: smallest "
-            f"{weights.min():.4g}, sum {weights.sum():.6g}); leave out members of no weight"
-        )
-    if not 2 <= update <= window:
-        raise DesignError(f"update of {update} samples: between 2 and the window's {window} needed")
-    for j, plant in enumerate(plants):
-        radius = float(np.max(np.abs(plant.poles()), initial=0.0))
-        if not radius < 1.0:
-            raise DesignError(
-                f"plant {j} of the set is unstable (largest pole |z| = {radius:.6g}, below 1 "
-                "needed); a printer's axis is stable: fit the model again"
-            )

@@ -261,9 +261,9 @@ def test_twin_of_advance_state(seed: int, order: int, samples: int) -> None:
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ([0.5, 0.6], r"sum to 1 \(given: smallest 0.5, sum 1.1\)"),
-        ([1.5, -0.5], "positive"),
-        ([1.0], "2 plants but 1 weights"),
+        ([0.5, 0.6], r"sum to 1.1, must be 1"),
+        ([1.5, -0.5], "must not be negative"),
+        ([1.0], "for 2 plants: one for each"),
     ],
 )
 def test_wrong_weights(weights: list[float], message: str) -> None:
@@ -272,11 +272,11 @@ def test_wrong_weights(weights: list[float], message: str) -> None:
 
 
 def test_wrong_sets() -> None:
-    with pytest.raises(DesignError, match="set is empty"):
+    with pytest.raises(DesignError, match="set of plants is empty"):
         lifted_window([], [], 60, 30)
     good = one_mode()
     unstable = dataclasses.replace(good, a=1.2 * good.a)
-    with pytest.raises(DesignError, match=r"plant 1 of the set is unstable .* below 1"):
+    with pytest.raises(DesignError, match=r"plant 1 of the set is unstable: .* below 1"):
         lifted_window([good, unstable], [0.5, 0.5], 60, 30)
     with pytest.raises(DesignError, match="between 2 and the window's 60"):
         lifted_window([good], [1.0], 60, 61)
