@@ -33,12 +33,11 @@ _LAYER = re.compile(rb"^;\s*(LAYER_CHANGE|LAYER:|layer num|CHANGE_LAYER)", re.I 
 _FILAMENT = re.compile(rb"^(?:G92|G0|G1)\b[^;\n]*\bE([-+.\d]+)", re.M)
 
 
-def child(source: Path, machine_name: str, tolerance_um: float, cache: Path) -> None:
+def child(source: Path, machine_name: str, options: Options, cache: Path) -> None:
     """Run one job and print its figures as JSON."""
     started_s = time.process_time()
     machine = load_machine(machine_name)
     with tempfile.TemporaryDirectory(prefix="stillpath-throughput-") as folder:
-        options = Options(tolerance_um=tolerance_um)
         target = Path(folder) / "out.gcode"
         result = compensate_file(source, target, machine, options, cache_dir=cache)
         reported_s = time.process_time()
@@ -79,7 +78,7 @@ def run(source: Path, given: argparse.Namespace) -> dict[str, object]:
     command = [
         *(sys.executable, str(Path(__file__).resolve()), "--child", str(source)),
         *("--machine", given.machine, "--tolerance-um", str(given.tolerance_um)),
-        *("--cache", str(given.cache)),
+        *("--robust", given.robust, "--cache", str(given.cache)),
     ]
     environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"} | dict(os.environ)
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=False)
@@ -111,13 +110,15 @@ def main() -> None:
     parser.add_argument("file", nargs="?", help=f"path, or corpus name (default {_FILE})")
     parser.add_argument("--machine", default="ender3")
     parser.add_argument("--tolerance-um", type=float, default=2.0)
+    parser.add_argument("--robust", default="off", help="off, ensemble or minimax")
     parser.add_argument("--times", type=int, default=10, help="length of the long file; 1: none")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        child(given.child, given.machine, given.tolerance_um, given.cache)
+        options = Options(tolerance_um=given.tolerance_um, robust=given.robust)
+        child(given.child, given.machine, options, given.cache)
         return
     shared = shared_folder(given.shared)
     name = given.file or (_FILE if shared else str(_SPARE))

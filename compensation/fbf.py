@@ -51,7 +51,7 @@ together then stay below twice of it."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""
 SET_ALONG = 0.09
-"""Weight of the error along the path, for sets: half of it gains 2 % across, loses 3 % along."""
+"""Weight of the error along the path, for sets (what others give: docs/benchmarks.md)."""
 _BOUNDED_SHARE = 0.2
 """Solve windows again within bounds if so few leave them; otherwise take a gentler design."""
 _BOUNDED_ROUNDS = 4

@@ -99,8 +99,7 @@ def worst_case_weights(responses: ArrayLike, spectrum: ArrayLike) -> Array:
 def guarded_weights(plants: PlantSet) -> Array:
     """Half the set's own weights, half the worst-case weights for a path with corners.
 
-    The worst-case weights alone leave most members out, whatever these then do, and cost up to a
-    third of the mean (docs/benchmarks.md).
+    The worst-case weights alone leave most members out, whatever these then do.
     """
     f_hz = np.linspace(_LOWEST_HZ, min(_HIGHEST_HZ, 0.45 / plants.dt_s), _POINTS)
     responses = np.array([p.frequency_response(f_hz) for p in plants.members])
