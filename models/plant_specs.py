@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import ModelError
+from models.provenance import Provenance
 from models.roots import Roots, check_stable, dc_gain, normalise_dc, scaled_roots
 
 __all__ = [
@@ -294,11 +295,14 @@ class PlantSetSpec(_Document):
         Empty: the nominal plant alone.
     band_hz : (low, high), optional
         Where the model was measured; it is a guess outside.
+    provenance : Provenance, optional
+        How the plants were found.
     """
 
     nominal: PlantSpec
     members: tuple[WeightedMember, ...] | ParametricMembers = ()
     band_hz: tuple[Positive, Positive] | None = None
+    provenance: Provenance | None = None
 
     @model_validator(mode="after")
     def _members_usable(self) -> Self:

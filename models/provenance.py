@@ -1,0 +1,68 @@
+"""Where a model comes from and how far it can be trusted; stored beside the plants."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["MeasuredMode", "Provenance", "SourceFile"]
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class SourceFile(_Document):
+    """A file that was read: its name (no folder) and the SHA-256 of its bytes."""
+
+    name: str
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class MeasuredMode(_Document):
+    """A resonance with the standard deviations of its fit; None where the fit has none."""
+
+    f_hz: Positive
+    zeta: Finite
+    f_sd_hz: NonNegative | None = None
+    zeta_sd: NonNegative | None = None
+
+
+class Provenance(_Document):
+    """How the plants of an axis were found.
+
+    Attributes
+    ----------
+    kind : str
+        What was read. The phase is unknown for `spectrum`: the model is minimum phase by
+        convention.
+    residual : float, optional
+        Of the fit: NRMSE (0.01 is 1 %), or rms in dB for a spectrum.
+    delay_s, gain : float, optional
+        What the fit set aside: a delay that cannot be told from the start of the recording, and
+        the sensor's gain.
+    trust_below_hz : float, optional
+        Above, the model may be far off although it fits (phase unknown, or not measured).
+    """
+
+    kind: Literal[
+        "raw log", "spectrum", "frequency response", "recorded drive", "model file", "typed in"
+    ]
+    measured_on: date | None = None
+    sources: tuple[SourceFile, ...] = ()
+    residual: NonNegative | None = None
+    delay_s: Finite | None = None
+    gain: Positive | None = None
+    modes: tuple[MeasuredMode, ...] = ()
+    trust_below_hz: Positive | None = None
+
+    @property
+    def magnitude_only(self) -> bool:
+        """Whether the phase was not measured."""
+        return self.kind == "spectrum"
