@@ -69,7 +69,7 @@ def draw(chart: Chart, width: float, height: float) -> str:
     ]
     xs = [x for line in chart.lines for x in line.x] or [0.0, 1.0]
     ys = [y for line in points for _, y in line] or [1.0]
-    ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(0.0, max(ys), 5)
+    ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(min(0.0, *ys), max(0.0, *ys), 5)
     low, high = (f(f(ticks), f(ys)) for f in (min, max))
     x_ticks = _ticks(min(xs), max(xs), max(2, int((width - _LEFT - right) / 62)))
     x_ticks = [x for x in x_ticks if min(xs) <= x <= max(xs)]

@@ -6,14 +6,9 @@ hash of its style and forbids all else.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
-
-from jinja2 import Environment, StrictUndefined
 
 from compensation.basis import ZERO
 from compensation.preview import MAX_CONDITION, MAX_SPECTRAL_RADIUS
@@ -24,10 +19,11 @@ from service.design.figures import (
     RobustMetric,
 )
 from service.design.summary import Summary, modes_text, zero_text
-from service.pipeline.files import replacing
+from service.reports.pages import asset, rendered, write_texts
 
 __all__ = ["render_design", "write_design"]
 
+_PACKAGE = "service.design"
 _WIDE, _NARROW, _SMALL = (990.0, 400.0), (400.0, 420.0), (410.0, 280.0)
 _COUNTS = (1, 2, 5, 10, 18, 26, 34, 45, 60, 75, 90, 120, 150, 200, 250, 300)
 _STYLES = {
@@ -57,32 +53,26 @@ def write_design(report: DesignReport, directory: Path) -> None:
     OSError
         If the folder or a file cannot be written.
     """
-    directory.mkdir(parents=True, exist_ok=True)
-    for name, text in (
-        ("design.json", report.model_dump_json()),
-        ("design.html", render_design(report)),
-    ):
-        with replacing(directory / name) as path:
-            path.write_text(text, encoding="utf-8", newline="\n")
+    page = render_design(report)
+    write_texts(directory, {"design.json": report.model_dump_json(), "design.html": page})
 
 
 def render_design(report: DesignReport) -> str:
     """Return the design as one HTML page."""
-    style = _asset("service.reports", "report.css") + _asset(__package__, "design.css")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(
-        um=_um,
-        number=_number,
-        power=_power,
-        figures=_figures,
-        modes=modes_text,
-        zero=zero_text,
-    )
     summary = Summary(report)
     chart = _robustness_chart(report, summary)
-    return environment.from_string(_asset(__package__, "design.html.j2")).render(
+    return rendered(
+        _PACKAGE,
+        "design.html.j2",
+        asset("service.reports", "report.css") + asset(_PACKAGE, "design.css"),
+        {
+            "um": _um,
+            "number": _number,
+            "power": _power,
+            "figures": _figures,
+            "modes": modes_text,
+            "zero": zero_text,
+        },
         d=report,
         bare=summary.uncompensated,
         own=summary.own,
@@ -100,8 +90,6 @@ def render_design(report: DesignReport) -> str:
         counts=[n for n in _COUNTS if n <= report.lifted.samples],
         max_radius=MAX_SPECTRAL_RADIUS,
         max_condition=MAX_CONDITION,
-        style=style,
-        style_hash="sha256-" + base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
     )
 
 
@@ -258,8 +246,3 @@ def _figures(value: float | None) -> str:
     if value is None:
         return "–"
     return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:.1e}"
-
-
-def _asset(package: str | None, name: str) -> str:
-    assert package is not None
-    return resources.files(package).joinpath(name).read_text(encoding="utf-8")

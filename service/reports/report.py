@@ -7,23 +7,18 @@ name or a file name can never become code.
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import math
-import os
-import tempfile
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
 from service.pipeline.result import Channel, GroupFigures, Result
+from service.reports.pages import asset, content_hash, rendered, write_texts
 
 __all__ = ["render_report", "write_report"]
 
+_PACKAGE = "service.reports"
 _PUT_BACK_SHOWN = 100
 _FEATURES_SHOWN = 40
 _LEGEND_QUANTILE = 0.99
@@ -45,28 +40,27 @@ def write_report(result: Result, directory: Path) -> None:
     OSError
         If the folder or a file cannot be written.
     """
-    directory.mkdir(parents=True, exist_ok=True)
-    _replace(directory / "report.json", result.model_dump_json())
-    _replace(directory / "report.html", render_report(result))
+    page = render_report(result)
+    write_texts(directory, {"report.json": result.model_dump_json(), "report.html": page})
 
 
 def render_report(result: Result) -> str:
     """Return the report as one HTML page."""
-    style, script = _asset("report.css"), _asset("report.js")
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(
-        um=_um,
-        short=_short,
-        plain=_plain,
-        duration=_duration,
-        share=_share,
-        megabytes=_megabytes,
-        number=_number,
-    )
+    script = asset(_PACKAGE, "report.js")
     features = sorted(result.features, key=lambda group: -group.seconds)
-    return environment.from_string(_asset("report.html.j2")).render(
+    return rendered(
+        _PACKAGE,
+        "report.html.j2",
+        asset(_PACKAGE, "report.css"),
+        {
+            "um": _um,
+            "short": _short,
+            "plain": _plain,
+            "duration": _duration,
+            "share": _share,
+            "megabytes": _megabytes,
+            "number": _number,
+        },
         result=result,
         channels={channel.name: channel for channel in result.channels},
         headline=_headline(result.channels),
@@ -74,10 +68,8 @@ def render_report(result: Result) -> str:
         features=features[:_FEATURES_SHOWN],
         widest=_widest(features),
         put_back=result.put_back[:_PUT_BACK_SHOWN],
-        style=style,
         script=script,
-        style_hash=_hash(style),
-        script_hash=_hash(script),
+        script_hash=content_hash(script),
         data=_data(result),
     )
 
@@ -215,24 +207,3 @@ def _megabytes(size: int) -> str:
 def _number(value: float) -> str:
     # A thin no-break space between thousands, as SI writes them.
     return f"{value:,.0f}".replace(",", "\u202f")
-
-
-def _asset(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-
-def _hash(text: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def _replace(path: Path, text: str) -> None:
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    fresh = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        fresh.chmod(0o644)
-        fresh.replace(path)
-    except BaseException:
-        fresh.unlink(missing_ok=True)
-        raise
