@@ -1,0 +1,185 @@
+"""Turns an `IdentificationReport` into identification.html and identification.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from models.provenance import MeasuredMode
+from service.design.charts import Chart, Line, Mark, draw
+from service.identification.figures import AxisFigures, IdentificationReport
+from service.reports.pages import asset, rendered, write_texts
+
+__all__ = ["render_identification", "write_identification"]
+
+_PACKAGE = "service.identification"
+_WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 320.0), (480.0, 250.0)
+_MEASURED = ("before thin", "before thin d1", "before thin d2", "before thin d3", "before thin d5")
+_LARGEST_LABEL = 18
+
+
+def write_identification(report: IdentificationReport, directory: Path) -> None:
+    """Write identification.html and identification.json into a folder, each whole or not at all.
+
+    Parameters
+    ----------
+    report : IdentificationReport
+    directory : Path
+        Made if it does not exist.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file cannot be written.
+    """
+    page = render_identification(report)
+    texts = {"identification.json": report.model_dump_json(), "identification.html": page}
+    write_texts(directory, texts)
+
+
+def render_identification(report: IdentificationReport) -> str:
+    """Return the identification as one HTML page."""
+    return rendered(
+        _PACKAGE,
+        "identification.html.j2",
+        asset("service.reports", "report.css") + asset("service.design", "design.css"),
+        {"number": _number, "fit": _fit, "interval": _interval, "change": _change},
+        d=report,
+        axes=[_Axis(axis, _figures(axis)) for axis in report.axes],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Figure:
+    title: str
+    note: str
+    wide: str
+    narrow: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Axis:
+    """An axis with its drawings."""
+
+    a: AxisFigures
+    figures: Sequence[_Figure]
+
+
+def _figures(axis: AxisFigures) -> list[_Figure]:
+    if axis.spectra:
+        return [_spectrum(axis), _magnitude(axis)]
+    if axis.responses:
+        return [_magnitude(axis), _phase(axis), _coherence(axis), _residual(axis)]
+    return [_magnitude(axis)]
+
+
+def _magnitude(axis: AxisFigures) -> _Figure:
+    measured = [
+        Line(r.f_hz, r.magnitude, style, r.label[:_LARGEST_LABEL])
+        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
+    ]
+    members = [Line(m.f_hz, m.magnitude, "soft thin") for m in axis.members]
+    model = Line(axis.model.f_hz, axis.model.magnitude, "after main", "model")
+    note = "How much further the nozzle moves than it is told: 1 is rigid."
+    if members:
+        note += " Grey: members of the set."
+    marks = [Mark(mode.f_hz, f"{mode.f_hz:.1f} Hz") for mode in _apart(axis.modes)]
+    return _figure("Magnitude", note, "|G|", [*members, *measured, model], True, marks)
+
+
+def _phase(axis: AxisFigures) -> _Figure:
+    measured = [
+        Line(r.f_hz, r.phase_deg, style)
+        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
+    ]
+    model = Line(axis.model.f_hz, axis.model.phase_deg, "after main")
+    note = "Degrees; a delay of the recording is taken out."
+    return _figure("Phase", note, "phase, °", [*measured, model], False)
+
+
+def _coherence(axis: AxisFigures) -> _Figure:
+    lines = [
+        Line(r.f_hz, r.coherence, style)
+        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
+    ]
+    note = "How much of the measured motion follows the command; below 0.95 is not fitted."
+    return _figure("Coherence", note, "coherence", lines, False)
+
+
+def _residual(axis: AxisFigures) -> _Figure:
+    lines = [
+        Line(r.f_hz, [None if v is None else 100 * v for v in r.residual], style)
+        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
+    ]
+    note = "Measured against model: |H / G − 1|."
+    return _figure("What the model misses", note, "%", lines, True)
+
+
+def _spectrum(axis: AxisFigures) -> _Figure:
+    measured = [
+        Line(s.f_hz, s.measured, style, s.label[:_LARGEST_LABEL])
+        for s, style in zip(axis.spectra, _styles(len(axis.spectra)), strict=True)
+    ]
+    first = axis.spectra[0]
+    model = Line(first.f_hz, first.predicted, "after main", "model")
+    note = "Acceleration, as the printer's own test recorded it, and as the model predicts it."
+    return _figure("Power spectrum", note, "(mm/s²)²/Hz", [*measured, model], True)
+
+
+def _figure(
+    title: str,
+    note: str,
+    y_title: str,
+    lines: Sequence[Line],
+    log: bool,
+    marks: Sequence[Mark] = (),
+) -> _Figure:
+    chart = Chart(
+        about=f"{title} against frequency. {note}",
+        x_title="frequency, Hz",
+        y_title=y_title,
+        lines=lines,
+        log=log,
+        marks=marks,
+    )
+    wide = title in ("Magnitude", "Power spectrum")
+    return _Figure(title, note, draw(chart, *(_WIDE if wide else _SMALL)), draw(chart, *_NARROW))
+
+
+def _styles(count: int) -> list[str]:
+    return [_MEASURED[i % len(_MEASURED)] for i in range(count)]
+
+
+def _apart(modes: Sequence[MeasuredMode]) -> list[MeasuredMode]:
+    """Leave out modes whose names would be written over each other, and fillers."""
+    out: list[MeasuredMode] = []
+    for mode in sorted(modes, key=lambda m: m.zeta):
+        if mode.zeta < 0.4 and all(abs(mode.f_hz - other.f_hz) > 12.0 for other in out):
+            out.append(mode)
+    return sorted(out, key=lambda m: m.f_hz)
+
+
+def _number(value: float) -> str:
+    # A thin no-break space between thousands, as SI writes them.
+    return f"{value:,.0f}".replace(",", "\u202f")
+
+
+def _fit(axis: AxisFigures) -> str:
+    if axis.residual is None:
+        return "–"
+    return f"{axis.residual:.2f} dB" if axis.spectra else f"{100 * axis.residual:.2f} %"
+
+
+def _interval(value: float, deviation: float | None, digits: int) -> str:
+    """Return a value with its 95 % interval."""
+    text = f"{value:.{digits}f}"
+    return text if deviation is None else f"{text} ± {1.96 * deviation:.{digits}f}"
+
+
+def _change(mode: MeasuredMode, before: Sequence[MeasuredMode]) -> str:
+    """Tell how far the nearest mode of the former model was."""
+    if not before:
+        return "–"
+    near = min(before, key=lambda other: abs(other.f_hz - mode.f_hz))
+    return f"{near.f_hz:.1f} Hz ({100 * (mode.f_hz / near.f_hz - 1):+.1f} %)"
