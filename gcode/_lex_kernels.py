@@ -57,7 +57,8 @@ I_ERROR_AXIS = 18
 I_OFFSET = 19  # file offset of the buffer
 I_NEED = 20  # move rows that the line in hand needs
 I_ORIGIN_KNOWN = 21  # bit per axis: F_BASE holds in the machine's axes
-I_SIZE = 22
+I_KEPT = 22  # `gcode.types.KEPT` between the marks that forbid to change moves, else 0
+I_SIZE = 23
 
 # Columns of the integer rows.
 M_LIMITS, M_MODAL, M_KNOWN, M_LINE, M_START, M_STOP, M_LAYER, M_FEATURE, M_OBJECT = range(9)
@@ -223,7 +224,7 @@ def travel(f: Any, i: Any, mf: Any, mi: Any, named: int, trusted: bool) -> int:
     mf[n, 8] = f[F_SPEED]
     mi[n, M_LIMITS] = i[I_LIMITS_ID]
     mi[n, M_MODAL] = i[I_MODAL_ID]
-    mi[n, M_KNOWN] = known if trusted else 0
+    mi[n, M_KNOWN] = (known if trusted else 0) | i[I_KEPT]
     mi[n, M_LINE] = i[I_LINE]
     mi[n, M_START] = i[I_OFFSET] + i[I_POS]
     mi[n, M_STOP] = i[I_OFFSET] + i[I_END]

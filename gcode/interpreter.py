@@ -22,7 +22,7 @@ from gcode.errors import GcodeError
 from gcode.firmware.klipper.dialect import KERNEL_WORDS, classify, word_table
 from gcode.lexer import extended_parameters, split_line
 from gcode.markers import MarkKind, read_mark
-from gcode.types import EventKind, Events, Limits, ModalState, Moves, ProgramBlock
+from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from models.machine import Machine
 
 __all__ = ["Interpreter", "interpret_bytes"]
@@ -346,6 +346,9 @@ class Interpreter:
         value = 0
         if mark is not None and mark.kind == MarkKind.STAMP:
             return self._event(EventKind.STAMP)
+        if mark is not None and mark.kind in (MarkKind.OFF, MarkKind.ON):
+            i[lex.I_KEPT] = KEPT if mark.kind == MarkKind.OFF else 0
+            return self._event(EventKind.HARMLESS)
         if mark is not None and mark.kind == MarkKind.LAYER:
             style = text[at : at + 7]
             self._layer_style = self._layer_style or style

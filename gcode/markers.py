@@ -1,4 +1,4 @@
-"""Comments by which slicers mark layers, features and objects.
+"""Comments by which slicers mark layers, features and objects, and users what shall stay.
 
 Source: the output of PrusaSlicer, SuperSlicer, OrcaSlicer, BambuStudio, Creality Print, Cura,
 ideaMaker, KISSlicer and Kiri:Moto, 2021 to 2026.
@@ -21,6 +21,9 @@ class MarkKind(Enum):
     FEATURE = "feature"
     OBJECT = "object"
     STAMP = "stamp"
+    OFF = "off"
+    """From here on moves stay as they are."""
+    ON = "on"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +44,8 @@ _PATTERNS: tuple[tuple[re.Pattern[str], MarkKind], ...] = tuple(
     (re.compile(pattern), kind)
     for pattern, kind in (
         (r"; ?stillpath\b|; Processed by stillpath ", MarkKind.STAMP),
+        (r"; ?STILLPATH_OFF\s*$", MarkKind.OFF),
+        (r"; ?STILLPATH_ON\s*$", MarkKind.ON),
         (r";LAYER_CHANGE\s*$", MarkKind.LAYER),  # PrusaSlicer, SuperSlicer, Orca, Creality
         (r"; CHANGE_LAYER\s*$", MarkKind.LAYER),  # Bambu
         (r";LAYER:-?\d+", MarkKind.LAYER),  # Cura, ideaMaker

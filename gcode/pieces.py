@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.planner import plan_moves
-from gcode.types import EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
+from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
 from models.machine import Klipper, Machine
 
 __all__ = ["MIN_STREAM_ACCEL_MM_S2", "Passage", "Piece", "Splitter"]
@@ -148,7 +148,7 @@ class Splitter:
         """Mark the moves of X or Y that must keep their lines."""
         travel = moves.end_mm - moves.start_mm
         xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
-        raw = xy & ((moves.known & 3) != 3)
+        raw = xy & (((moves.known & 3) != 3) | ((moves.known & KEPT) != 0))
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
         climb = np.abs(travel[:, 2])
         steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * self._firmware.planner.max_z_accel_mm_s2

@@ -12,7 +12,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EventKind", "Events", "Limits", "ModalState", "Moves", "Phases", "ProgramBlock"]
+__all__ = ["KEPT", "EventKind", "Events", "Limits", "ModalState", "Moves", "Phases", "ProgramBlock"]
+
+KEPT = 8
+"""Bit of `Moves.known`: the file asks that the move stays as it is."""
 
 
 class EventKind(IntEnum):
@@ -74,7 +77,7 @@ class Moves:
     limits_id, modal_id : ndarray of int32, shape (n,)
         Rows of `ProgramBlock.limits` and `ProgramBlock.modal` in force for the move.
     known : ndarray of uint8, shape (n,)
-        Bit 0..2 set: the machine's x, y, z are known at both ends of the move.
+        Bit 0..2 set: the machine's x, y, z are known at both ends of the move; bit `KEPT`.
     line, byte_start, byte_end : ndarray of int64, shape (n,)
         Source line; `byte_end` is one past its newline. An arc's pieces share one line.
     layer, feature, object_id : ndarray of int32, shape (n,)

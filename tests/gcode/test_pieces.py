@@ -196,3 +196,25 @@ def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) ->
             continue
         data = b"".join(gzip.decompress(path.read_bytes()).splitlines(keepends=True)[:6000])
         check(cut(data, wide), data)
+
+
+def test_moves_between_off_and_on_stay_as_they_came(machine):
+    lines = [f"G1 X{60 + 5 * (k % 2)} Y{50 + k} E.1 F6000" for k in range(12)]
+    lines.insert(8, "; STILLPATH_ON")
+    lines.insert(4, ";STILLPATH_OFF")
+    data = (HEAD + "\n".join(lines) + "\n").encode()
+    for chunk in (7, 1 << 17):
+        items = cut(data, machine, chunk=chunk)
+        check(items, data)
+        ours = b"".join(item.text for item in items if isinstance(item, Piece))
+        changed = [k for k in range(12) if f"Y{50 + k} " in ours.decode()]
+        assert changed == [0, 1, 2, 3, 8, 9, 10, 11]
+
+
+def test_off_holds_until_the_end_and_through_homing(machine):
+    data = HEAD + "; STILLPATH_OFF\nG28\nG1 X60 Y50 F6000\nG1 X70\nG1 Y60\n"
+    assert [piece.text for piece in pieces_of(data, machine)] == pieces_of_head(machine)
+
+
+def pieces_of_head(machine: Machine) -> list[bytes]:
+    return [piece.text for piece in pieces_of(HEAD, machine)]
