@@ -1,0 +1,348 @@
+"""What every feedback design returns: coefficients, the blocks they make, and what to expect.
+
+A design hands its blocks (`models.diagrams`) and its add-on factor 1 - PQ to `judged`, which
+predicts the loop with it, checks every member of the plant set, and refuses what must not be
+loaded. The blocks read ym, u, v, r of `models.loops` and write c.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import DesignError
+from models.diagrams import Block, Diagram
+from models.disturbances import SensorSpec
+from models.loops import Loop
+
+__all__ = [
+    "CoefficientSet",
+    "Controller",
+    "Extreme",
+    "Prediction",
+    "Refusal",
+    "frequency_grid",
+    "judged",
+]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Values = float | int | tuple[float, ...] | tuple[tuple[float, ...], ...]
+Uncertainty = float | Callable[[Array], Array]
+"""Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""
+
+
+class Refusal(DesignError):
+    """A controller that must not be loaded.
+
+    Attributes
+    ----------
+    reason : str
+    f_hz : float or None
+        Where it is violated.
+    """
+
+    def __init__(
+        self,
+        reason: Literal["small gain", "unstable", "singular", "inverse"],
+        message: str,
+        f_hz: float | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.reason = reason
+        self.f_hz = f_hz
+
+
+@dataclass(frozen=True, slots=True)
+class CoefficientSet:
+    """Named numbers of one part of a controller.
+
+    Attributes
+    ----------
+    name : str
+        A C identifier.
+    kind : str
+        "fir" (taps of z^0, z^-1, ...), "sos" (rows b0 b1 b2 1 a1 a2), "lattice" (k1, k2 of each
+        section), "iir" (num, den in rising powers of z^-1), "predictor", "repetitive".
+    values : mapping of str to numbers
+    """
+
+    name: str
+    kind: Literal["fir", "sos", "lattice", "iir", "predictor", "repetitive"]
+    values: Mapping[str, Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Extreme:
+    """The extreme of a curve and where it lies."""
+
+    value: float
+    f_hz: float
+
+    @property
+    def db(self) -> float:
+        """The value in dB."""
+        return 20 * math.log10(max(self.value, 1e-300))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Frequency responses of the nominal loop, all of shape (n,).
+
+    Attributes
+    ----------
+    f_hz : ndarray
+    s0, s : ndarray of complex
+        Sensitivity (d_out to y) without and with the add-on.
+    add_on : ndarray of complex
+        1 - PQ; s = s0 * add_on.
+    """
+
+    f_hz: Array
+    s0: Complex
+    add_on: Complex
+
+    @property
+    def s(self) -> Complex:
+        """Sensitivity with the add-on."""
+        return self.s0 * self.add_on
+
+    @property
+    def t(self) -> Complex:
+        """Complementary sensitivity with the add-on."""
+        return 1.0 - self.s
+
+    @property
+    def min_inverse_t(self) -> Extreme:
+        """Smallest 1/|T|: the relative plant error that small gain allows at all frequencies."""
+        i = int(np.argmax(np.abs(self.t)))
+        return Extreme(1.0 / float(np.abs(self.t[i])), float(self.f_hz[i]))
+
+    @property
+    def max_add_on(self) -> Extreme:
+        """Largest |1 - PQ|: what the notches are paid with."""
+        i = int(np.argmax(np.abs(self.add_on)))
+        return Extreme(float(np.abs(self.add_on[i])), float(self.f_hz[i]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Controller:
+    """A designed add-on, judged fit to be loaded.
+
+    Attributes
+    ----------
+    method, machine : str
+    dt_s : float
+        Ticks of the blocks.
+    coefficients : tuple of CoefficientSet
+    blocks : tuple of Block
+        The same as difference equations; they run in `simulation.closed_loop`.
+    prediction : Prediction
+    noise_gain : float
+        rms of y per rms of white sensor noise, unless `notes` says otherwise.
+    spectral_radii : tuple of float
+        Of the whole loop, for the nominal plant and every member; all below 1.
+    settings : mapping
+        What was asked for (targets, widths, ...), for the record.
+    notes : tuple of str
+    """
+
+    method: str
+    machine: str
+    dt_s: float
+    coefficients: tuple[CoefficientSet, ...]
+    blocks: tuple[Block, ...]
+    prediction: Prediction
+    noise_gain: float
+    spectral_radii: tuple[float, ...]
+    settings: Mapping[str, object]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def multiplications(self) -> float:
+        """Multiplications per tick: the real-time budget."""
+        return sum(b.multiplications for b in self.blocks)
+
+    def to_dict(self, *, curves: bool = False) -> dict[str, object]:
+        """Return everything as plain values; `curves` adds the sensitivities in dB."""
+        p = self.prediction
+        document: dict[str, object] = {
+            "method": self.method,
+            "machine": self.machine,
+            "dt_s": self.dt_s,
+            "settings": dict(self.settings),
+            "coefficients": [
+                {"name": c.name, "kind": c.kind, **dict(c.values)} for c in self.coefficients
+            ],
+            "difference_equations": [_equation(b) for b in self.blocks],
+            "min_inverse_t_db": p.min_inverse_t.db,
+            "min_inverse_t_at_hz": p.min_inverse_t.f_hz,
+            "max_add_on_db": p.max_add_on.db,
+            "max_add_on_at_hz": p.max_add_on.f_hz,
+            "noise_gain": self.noise_gain,
+            "multiplications_per_sample": self.multiplications,
+            "spectral_radii": list(self.spectral_radii),
+            "notes": list(self.notes),
+        }
+        if curves:
+            document["f_hz"] = p.f_hz.tolist()
+            document["sensitivity_before_db"] = _db(p.s0).tolist()
+            document["sensitivity_db"] = _db(p.s).tolist()
+            document["add_on_db"] = _db(p.add_on).tolist()
+        return document
+
+    def to_json(self, *, curves: bool = False) -> str:
+        """Return `to_dict` as JSON text."""
+        return json.dumps(self.to_dict(curves=curves), indent=2) + "\n"
+
+    def to_c_header(self) -> str:
+        """Return the coefficients as a C header (C99, no dependency)."""
+        guard = f"STILLPATH_{_identifier(self.method)}_{_identifier(self.machine)}_H".upper()
+        prefix = _identifier(self.method).lower()
+        lines = [
+            f"/* {self.method} for {self.machine}: u = v - c, sampled every {self.dt_s!r} s. */",
+            f"#ifndef {guard}",
+            f"#define {guard}",
+            "",
+        ]
+        for part in self.coefficients:
+            lines.append(f"/* {part.name}: {part.kind} */")
+            for key, value in part.values.items():
+                lines.append(_c_definition(f"{prefix}_{part.name}_{key}", value))
+        return "\n".join([*lines, "", f"#endif /* {guard} */", ""])
+
+
+def judged(
+    method: str,
+    loops: Sequence[Loop],
+    blocks: Sequence[Block],
+    prediction: Prediction,
+    coefficients: Sequence[CoefficientSet],
+    *,
+    uncertainty: Uncertainty | None = None,
+    noise_gain: float | None = None,
+    every: int = 1,
+    sensor: SensorSpec | None = None,
+    settings: Mapping[str, object] | None = None,
+    notes: Sequence[str] = (),
+) -> Controller:
+    """Return the controller if it may be loaded.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        The nominal loop first, then the members it may turn into.
+    uncertainty : float or function of f_hz, optional
+        Relative plant error that must be survived at every frequency (small gain; sufficient,
+        not necessary). The members are always checked, exactly.
+    noise_gain : float, optional
+        Left out: the rms of T over frequency.
+    every : int
+        Ticks of the blocks per sample of the loop.
+
+    Raises
+    ------
+    Refusal
+        If the loop with the add-on is unstable for a member, or |Delta| >= 1/|T| somewhere.
+    """
+    if uncertainty is not None:
+        _check_small_gain(method, prediction, uncertainty)
+    radii = []
+    for loop in loops:
+        whole = Diagram((*loop.blocks(every=every, sensor=sensor), *blocks))
+        radius = whole.spectral_radius()
+        if radius >= 1.0 - 1e-12:
+            raise Refusal(
+                "unstable",
+                f"{method} on {loop.name!r}: not internally stable, largest |z| = {radius:.8f}; "
+                "use a narrower band pass, detune, or fewer targets",
+            )
+        radii.append(radius)
+    if noise_gain is None:
+        f = prediction.f_hz
+        power = np.trapezoid(np.abs(prediction.t) ** 2, f) / (f[-1] - f[0])
+        noise_gain = math.sqrt(float(power))
+    nominal = loops[0]
+    return Controller(
+        method,
+        nominal.name,
+        nominal.dt_s / every,
+        tuple(coefficients),
+        tuple(blocks),
+        prediction,
+        noise_gain,
+        tuple(radii),
+        dict(settings or {}),
+        (*nominal.notes, *notes),
+    )
+
+
+def frequency_grid(
+    dt_s: float, targets_hz: Sequence[float] = (), widths_hz: Sequence[float] = ()
+) -> Array:
+    """Return frequencies from above 0 to half the sampling rate, dense around the targets."""
+    top = 0.5 / dt_s
+    coarse = np.linspace(0, top, 4097)
+    near = [
+        f + np.concatenate([-offsets[::-1], [0.0], offsets])
+        for f, width in zip(targets_hz, widths_hz, strict=True)
+        for offsets in (width * np.geomspace(1e-4, 30, 200),)
+    ]
+    grid = np.unique(np.concatenate([coarse, *near]))
+    return grid[(grid >= top / 8192) & (grid <= top)]
+
+
+def _check_small_gain(method: str, prediction: Prediction, uncertainty: Uncertainty) -> None:
+    f = prediction.f_hz
+    bound = uncertainty(f) if callable(uncertainty) else np.full(len(f), uncertainty)
+    product = np.abs(bound) * np.abs(prediction.t)
+    worst = int(np.argmax(product))
+    if product[worst] >= 1.0:
+        raise Refusal(
+            "small gain",
+            f"{method}: the plant may be off by {bound[worst]:.3g} at {f[worst]:.5g} Hz, but the "
+            f"loop allows 1/|T| = {1 / np.abs(prediction.t[worst]):.3g} there; narrow the band, "
+            "detune, drop that target, or identify the plant better",
+            float(f[worst]),
+        )
+
+
+def _db(response: Complex) -> Array:
+    return 20 * np.log10(np.maximum(np.abs(response), 1e-15))
+
+
+def _equation(block: Block) -> dict[str, object]:
+    return {
+        "output": block.output,
+        "inputs": [list(wire) for wire in block.inputs],
+        "num": list(block.num),
+        "den": list(block.den),
+        "delay": block.delay,
+        "every": block.every,
+        "phase": block.phase,
+        "zero_between": block.zero_between,
+    }
+
+
+def _identifier(text: str) -> str:
+    return "".join(ch if ch.isalnum() and ch.isascii() else "_" for ch in text)
+
+
+def _c_definition(name: str, value: Values) -> str:
+    if isinstance(value, int):
+        return f"enum {{ {name} = {value} }};"
+    if isinstance(value, float):
+        return f"static const double {name} = {value!r};"
+    if value and isinstance(value[0], tuple):
+        rows = [row for row in value if isinstance(row, tuple)]
+        inner = ",\n  ".join("{" + ", ".join(repr(float(v)) for v in row) + "}" for row in rows)
+        return f"static const double {name}[{len(rows)}][{len(rows[0])}] = {{\n  {inner}}};"
+    numbers = [v for v in value if not isinstance(v, tuple)]
+    listed = ", ".join(repr(float(v)) for v in numbers)
+    return f"static const double {name}[{len(numbers)}] = {{{listed}}};"
