@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.machine import Machine
+from models.schedule import OperatingPoint
 
 __all__ = [
     "COMPENSATORS",
@@ -54,6 +55,10 @@ class Compensator(Protocol):
         """Take the last command as executed."""
         ...
 
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is when the next piece begins; it stands still."""
+        ...
+
     def compensate(
         self,
         y_d_mm: NDArray[np.float64],
@@ -92,9 +97,14 @@ class Memoryless:
     def commit(self) -> None:
         """Do nothing."""
 
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Do nothing."""
+
 
 def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
     """Make the compensator `name` for a machine, at the sampling time `dt_s`.
+
+    For a machine with schedules it follows the plants (`compensation.scheduled`).
 
     Raises
     ------
@@ -102,7 +112,13 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         If there is no such compensator or it cannot be designed for this machine.
     """
     made: Compensator
-    if name == "fbf":
+    if machine.schedules:
+        from compensation.scheduled import ScheduledCompensator
+
+        made = ScheduledCompensator(
+            machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
+        )
+    elif name == "fbf":
         from compensation.fbf import PreviewFbf
 
         made = PreviewFbf(machine, dt_s, **settings)

@@ -35,6 +35,7 @@ from compensation.sliding import balanced_weights, slide
 from compensation.window_problem import Bounds
 from models.machine import Machine
 from models.plants import DiscretePlant, PlantSet, plant_set
+from models.schedule import OperatingPoint
 
 __all__ = ["LADDER", "ROBUST", "PreviewFbf", "Rung"]
 
@@ -152,6 +153,9 @@ class PreviewFbf:
         """Take the last command as executed."""
         for axis, command in zip(self._axes, self._last, strict=True):
             axis.commit(command)
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Do nothing: the plants of this machine stay."""
 
     def compensate(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> Array:
         """Command of a piece that starts and ends standing still on the path.

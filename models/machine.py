@@ -12,7 +12,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from models.errors import ModelError
 from models.plants import PlantSetSpec
+from models.schedule import AxisSchedule
 
 __all__ = [
     "AxisTravel",
@@ -134,6 +136,9 @@ class Machine(_Document):
         `x` and `y` to the plants (commanded position to nozzle position) of that axis.
     mesh_slope : float
         Largest slope of the bed mesh; Z follows X and Y with at most this ratio.
+    schedules : dict
+        `x` and `y` to how the plants of that axis change during a print, if they do. Without a
+        schedule, or where none is looked at, the plants are those of `axes`.
     """
 
     schema_version: Literal[1] = 1
@@ -147,6 +152,7 @@ class Machine(_Document):
     axes: dict[Literal["x", "y"], PlantSetSpec]
     pressure_advance_s: NonNegative = 0.0
     mesh_slope: NonNegative = 0.0
+    schedules: dict[Literal["x", "y"], AxisSchedule] = {}
 
     @model_validator(mode="after")
     def _complete(self) -> Machine:
@@ -156,10 +162,35 @@ class Machine(_Document):
         for axis in ("x", "y"):
             if axis not in self.axes:
                 raise ValueError(f"plant of axis {axis} is missing")
+        self._check_schedules()
         return self
 
     @property
     def revision(self) -> str:
         """First 12 hex digits of the SHA-256 of the canonical JSON document."""
-        document = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        content = self.model_dump(mode="json")
+        if not self.schedules:
+            # Machines from before there were schedules keep their revision.
+            del content["schedules"]
+        document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
+
+    def _check_schedules(self) -> None:
+        densities = set()
+        for axis, schedule in self.schedules.items():
+            try:
+                schedule.check(self.axes[axis])
+            except ModelError as error:
+                raise ModelError(f"schedule of axis {axis}: {error}") from None
+            if schedule.mass is not None:
+                densities.add(schedule.mass.filament_density_g_cm3)
+                if self.kinematics == "corexy":
+                    raise ModelError(
+                        f"schedule of axis {axis}: the bed of a corexy machine does not move in X "
+                        "and Y, so the print's mass changes nothing; leave `mass` out"
+                    )
+        if len(densities) > 1:
+            raise ModelError(
+                f"the schedules name filament densities of {sorted(densities)} g/cm3; there is one "
+                "filament"
+            )

@@ -16,7 +16,9 @@ from gcode.segments import ErrorFilter, Segments, fit_segments
 from gcode.timeline import Timeline, build_timeline, group_rows
 from gcode.types import Phases
 from models.machine import Machine
+from models.operating import machine_at
 from models.plants import plant_set
+from models.schedule import EMPTY, OperatingPoint
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
@@ -79,10 +81,16 @@ class PieceCompensator:
         self._tolerance_mm = 1e-3 * options.tolerance_um
         self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
         self.encoder = KlipperEncoder(machine)
-        self._filter = ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
+        self._filter = _error_filter(machine)
 
-    def compensate(self, piece: Piece) -> CompensatedPiece:
+    def compensate(self, piece: Piece, point: OperatingPoint = EMPTY) -> CompensatedPiece:
         """Return the piece with its command.
+
+        Parameters
+        ----------
+        piece : Piece
+        point : OperatingPoint
+            Where the machine is when the piece begins; without schedules it does not matter.
 
         Raises
         ------
@@ -90,6 +98,9 @@ class PieceCompensator:
             When no command within the machine's limits is found, or the firmware would refuse it.
         """
         try:
+            if self._machine.schedules:
+                self.compensator.operate_at(point)
+                self._filter = _error_filter(machine_at(self._machine, point))
             return self._compensate(piece)
         except (DesignError, GcodeError) as error:
             raise Unfit(str(error)) from error
@@ -165,6 +176,10 @@ class PieceCompensator:
                     f"the command would take {axis} to {low if low < travel.min_mm else high:.3f} "
                     f"mm, outside {travel.min_mm:g} to {travel.max_mm:g} mm"
                 )
+
+
+def _error_filter(machine: Machine) -> ErrorFilter:
+    return ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
 
 
 def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Phases) -> None:

@@ -1,8 +1,9 @@
 """Figures of a whole print, added up piece by piece: before, after, and the best shaper.
 
 Every channel is the nominal plant's answer to the motion that the firmware executes, measured
-against the same planned path. Memory stays bounded: errors go into tallies, into bins of time that
-double when they run out, and into a limited number of layers with a limited number of points.
+against the same planned path; plants that follow a schedule are those of the moment. Memory stays
+bounded: errors go into tallies, into bins of time that double when they run out, and into a limited
+number of layers with a limited number of points.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from numpy.typing import NDArray
 
 from compensation.shapers import shape, shaper_pulses
 from models.machine import Machine
-from models.plants import plant_set
+from models.schedule import EMPTY, OperatingPoint
+from service.pipeline.band import BandContent
 from service.pipeline.result import Channel, ErrorFigures, GroupFigures, LayerView, Track
 from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, MotionMeter, Tally
-from simulation.response import PlantStream
+from simulation.scheduled import MachineStream
 
 __all__ = ["Measurement", "MotionSamples", "part_of"]
 
@@ -75,10 +77,12 @@ class Measurement:
         self, machine: Machine, dt_s: float, shaper: BestShaper, *, compensated: bool
     ) -> None:
         self._dt_s = dt_s
-        self._plants = [plant_set(machine.axes[a], dt_s).nominal for a in ("x", "y")]
+        self._machine = machine
+        self._point = EMPTY
+        self._band = BandContent(machine, dt_s)
         self._names = ("before", "after", "shaper") if compensated else ("before", "shaper")
         self._meters = {name: MotionMeter(dt_s, stride=STRIDE) for name in self._names}
-        self._streams: dict[str, PlantStream] = {}
+        self._streams: dict[str, MachineStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = {name: _Bins() for name in self._names}
@@ -86,10 +90,17 @@ class Measurement:
         self._fresh = True
         self._last: MotionSamples | None = None
 
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is from now on."""
+        self._point = point
+        for stream in self._streams.values():
+            stream.operate_at(point)
+
     def add(self, samples: MotionSamples) -> None:
         """Add motion."""
         if len(samples):
             self._last = part_of(samples, len(samples) - 1, len(samples))
+            self._band.add(samples.path_mm, samples.extruding)
             self._measure(self._shaper.push(samples))
 
     def stand(self, samples: int) -> Array | None:
@@ -115,6 +126,7 @@ class Measurement:
     def jump(self) -> None:
         """Say that the position is lost: the machine stands still when motion goes on."""
         self._measure(self._shaper.flush())
+        self._band.jump()
         self._fresh = True
         self._last = None
 
@@ -128,12 +140,14 @@ class Measurement:
             return
         command, samples = shaped
         if self._fresh:
-            self._streams = {name: PlantStream(self._plants) for name in self._names}
+            self._streams = {
+                name: MachineStream(self._machine, self._dt_s, self._point) for name in self._names
+            }
             self._fresh = False
         commands = {"before": samples.path_mm, "after": samples.executed_mm, "shaper": command}
         errors = {}
         for name in self._names:
-            y = self._streams[name].push(commands[name])
+            y = self._streams[name].push(commands[name], samples.path_mm)
             errors[name] = self._meters[name].push(
                 samples.path_mm, y, samples.extruding, samples.layer, samples.feature
             )
@@ -157,6 +171,10 @@ class Measurement:
             )
             for name, meter in self._meters.items()
         ]
+
+    def warnings(self) -> list[str]:
+        """Return what the figures do not stand for, in words."""
+        return self._band.warnings()
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""

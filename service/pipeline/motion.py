@@ -7,7 +7,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from service.pipeline.clock import StageClock
 from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.operating import Operation
 from service.pipeline.progress import Progress, ProgressCallback
 from service.pipeline.result import Result, StageTime
 from service.pipeline.yardstick import cached_shaper
@@ -104,6 +105,7 @@ def simulate_file(
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     measurement = Measurement(machine, DT_S, shaper, compensated=False)
     motion = _Motion(source, machine, DT_S, progress)
+    operation = Operation(machine)
     extruding_s = 0.0
     peak_velocity = 0.0
     for part in motion:
@@ -111,7 +113,10 @@ def simulate_file(
             measurement.jump()
         with clock.stage("measure"):
             samples = part.motion()
+            moves = part.own_moves()
+            measurement.operate_at(operation.at(moves))
             measurement.add(samples)
+            operation.passed(moves)
         extruding_s += DT_S * float(np.sum(samples.extruding))
         if len(samples) > 1:
             step = np.hypot(*np.diff(samples.path_mm))
@@ -144,7 +149,8 @@ def simulate_file(
         pieces=0,
         put_back=[],
         put_back_extruding_share=0.0,
-        warnings=[],
+        warnings=measurement.warnings(),
+        notes=operation.notes(),
         layers=measurement.layers(),
         features=measurement.features(motion.feature_names),
         track=measurement.track(),
@@ -161,6 +167,12 @@ class _Part:
     moves: Moves
     first_move: int
     jumped: bool
+
+    def own_moves(self) -> Moves:
+        """Return the moves in which the samples lie."""
+        first, last = self.samples.move_index[[0, -1]] - self.first_move
+        moves = self.moves
+        return Moves(**{f.name: getattr(moves, f.name)[first : last + 1] for f in fields(moves)})
 
     def motion(self) -> MotionSamples:
         """Return the samples with line, layer and feature."""

@@ -114,6 +114,8 @@ class Result(_Figures):
     put_back: list[PutBack]
     put_back_extruding_share: float
     warnings: list[str]
+    notes: list[str] = []
+    """What is worth knowing and no trouble, for instance how plants followed a schedule."""
     layers: list[GroupFigures]
     features: list[GroupFigures]
     track: Track

@@ -36,6 +36,7 @@ from service.pipeline.compensating import (
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples, part_of
 from service.pipeline.motion import plan_file, simulate_file
+from service.pipeline.operating import Operation
 from service.pipeline.options import Options
 from service.pipeline.progress import Progress, ProgressCallback
 from service.pipeline.result import PutBack, Result, StageTime
@@ -125,6 +126,7 @@ class _Job:
         self._reader = Interpreter(machine)
         self._checker = Interpreter(machine)
         self._splitter = Splitter(machine, compensate=self._changes)
+        self._operation = Operation(machine)
         self._measurement = Measurement(machine, DT_S, self._shaper, compensated=True)
         if self._changes:
             self._writer = KlipperWriter(machine, self._work.encoder.limits, self._stamp())
@@ -136,10 +138,13 @@ class _Job:
             if self._changes:
                 self._emit(target, self._writer.header())
             for item in self._items(source):
+                self._point = self._operation.at(item.moves)
+                self._measurement.operate_at(self._point)
                 if isinstance(item, Piece):
                     self._emit(target, self._piece(item))
                 else:
                     self._emit(target, self._passage(item))
+                self._operation.passed(item.moves)
                 self._say("compensating", source.tell() / max(size, 1))
             if self._sum.moves == 0:
                 raise GcodeError("the file contains no moves: is it G-code?")
@@ -186,7 +191,7 @@ class _Job:
         writer, checker = copy.copy(self._writer), None
         try:
             with self._clock.stage("compensate"):
-                made = self._work.compensate(piece)
+                made = self._work.compensate(piece, self._point)
             with self._clock.stage("write"):
                 text = self._writer.piece(piece, made.encoded)
             with self._clock.stage("read back"):
@@ -350,7 +355,7 @@ class _Job:
     def _result(self, size: int) -> Result:
         total, measured = self._sum, self._measurement
         put_back_s = sum(p.extruding_seconds for p in total.put_back)
-        warnings = list(total.warnings)
+        warnings = [*total.warnings, *measured.warnings()]
         if self._changes and self._writer.shaper_unknown:
             warnings.append(
                 "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
@@ -384,6 +389,7 @@ class _Job:
             put_back=total.put_back,
             put_back_extruding_share=put_back_s / total.extruding_s if total.extruding_s else 0.0,
             warnings=warnings,
+            notes=self._operation.notes(),
             layers=measured.layers(),
             features=measured.features(self._reader.feature_names),
             track=measured.track(),

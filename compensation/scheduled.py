@@ -1,0 +1,186 @@
+"""A compensator for a machine whose plants change during the print: one for every operating point.
+
+Mass and height change between pieces, which begin and end at rest. The compensator of the new point
+then takes over the motion of the last seconds, so that it knows how the machine still vibrates;
+commands begin and end on the path, so that nothing steps. Plants that depend on x and y are blended
+within a piece: u = sum_i w_i(y_d) u_i, with weights of the planned position that add up to 1. Where
+the plan stands they stand too, and every u_i stands on the plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import Compensator, DesignError
+from models.machine import Machine
+from models.operating import OperatingGrid, machine_at
+from models.schedule import EMPTY, OperatingPoint
+
+__all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "ScheduledCompensator"]
+
+Array = NDArray[np.float64]
+
+STEP = 0.01
+"""Ratio, minus 1, of a resonance from one design to the next in mass and height."""
+BLEND_STEP = 0.02
+"""The same in x and y. The blend of two neighbours is off by the square of their difference."""
+REMEMBERED_S = 4.0
+"""How much of the past a compensator is shown when it takes over."""
+_ROOM = 0.98
+"""Blends of designs that exhaust the machine's limits would exceed them a little."""
+
+
+class ScheduledCompensator:
+    """Compensators of the same kind for the operating points of a machine.
+
+    Parameters
+    ----------
+    machine : Machine
+        With schedules.
+    make : callable
+        From a machine without schedules to its compensator.
+    dt_s : float
+
+    Attributes
+    ----------
+    name, lead_s, tail_s
+        As in `compensation.base.Compensator`.
+
+    Raises
+    ------
+    DesignError
+        Where the empty machine's compensator cannot be designed.
+    """
+
+    def __init__(
+        self, machine: Machine, make: Callable[[Machine], Compensator], dt_s: float
+    ) -> None:
+        self._machine, self._make, self._dt_s = machine, make, dt_s
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._remembered = round(REMEMBERED_S / dt_s)
+        self._made: dict[OperatingPoint, Compensator] = {}
+        self._knowing: set[OperatingPoint] = set()
+        """Points whose compensators know the state of the machine."""
+        self._past = np.zeros((2, 1))
+        self._last: Array | None = None
+        self._used: tuple[OperatingPoint, ...] = ()
+        self._level: OperatingPoint | None = None
+        self._points: list[OperatingPoint] = []
+        self.lead_s = self.tail_s = 0.0
+        self.operate_at(EMPTY)
+        self.name = self._made[self._points[0]].name
+
+    def reset(self, position_mm: Array) -> None:
+        """Take the machine to stand still at `position_mm` (2,)."""
+        self._past = np.array(position_mm, float)[:, None]
+        for point in self._knowing:
+            self._made[point].reset(position_mm)
+
+    def observe(self, command_mm: Array) -> None:
+        """Let the machine follow a command (2, n) that was not ours."""
+        self._remember(command_mm)
+        for point in self._knowing:
+            self._made[point].observe(command_mm)
+
+    def commit(self) -> None:
+        """Take the last command as executed."""
+        if self._last is None:
+            return
+        # The last sample of a piece is the first one of what follows.
+        self._remember(self._last[:, :-1])
+        for point in self._used:
+            self._made[point].commit()
+        # A blend is no command of any of its parts.
+        self._knowing = set(self._used) if len(self._used) == 1 else set()
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Take the designs for this point; the machine stands still.
+
+        Raises
+        ------
+        DesignError
+            Where there is none.
+        """
+        level = self._grid.level(point)
+        if level == self._level:
+            return
+        left, self._level = self._points, level
+        self._points = self._grid.at_level(level)
+        # A print wanders about a level before it leaves it for good.
+        kept = {*left, *self._points}
+        self._made = {p: c for p, c in self._made.items() if p in kept}
+        self._knowing &= set(self._points)
+        made = [self._compensator(one) for one in self._points]
+        self.lead_s, self.tail_s = max(c.lead_s for c in made), max(c.tail_s for c in made)
+
+    def compensate(
+        self,
+        y_d_mm: Array,
+        extruding: NDArray[np.bool_],
+        rests: NDArray[np.int64],
+    ) -> Array:
+        """See `compensation.base.Compensator.compensate`.
+
+        Raises
+        ------
+        DesignError
+            Also where a blend leaves the machine's limits.
+        """
+        weights = self._grid.weights(y_d_mm)
+        shares = {p: w for p, w in zip(self._points, weights, strict=True) if np.any(w)}
+        self._used = tuple(shares)
+        commands = {p: self._told(p).compensate(y_d_mm, extruding, rests) for p in shares}
+        if len(commands) == 1:
+            self._last = commands[self._used[0]]
+        else:
+            # From the path: where all commands stand on it, so does the blend, to the last digit.
+            self._last = y_d_mm + sum(w * (commands[p] - y_d_mm) for p, w in shares.items())
+            self._check(self._last, y_d_mm)
+        return self._last
+
+    def _compensator(self, point: OperatingPoint) -> Compensator:
+        if point not in self._made:
+            then = machine_at(self._machine, point)
+            if self._grid.nodes > 1:
+                limits = then.command
+                room = {
+                    "velocity_mm_s": _ROOM * limits.velocity_mm_s,
+                    "accel_mm_s2": _ROOM * limits.accel_mm_s2,
+                }
+                then = then.model_copy(update={"command": limits.model_copy(update=room)})
+            self._made[point] = self._make(then)
+        return self._made[point]
+
+    def _told(self, point: OperatingPoint) -> Compensator:
+        """Return a compensator that knows how the machine vibrates."""
+        one = self._compensator(point)
+        if point not in self._knowing:
+            one.reset(self._past[:, 0])
+            one.observe(self._past)
+            self._knowing.add(point)
+        return one
+
+    def _remember(self, command_mm: Array) -> None:
+        past = np.concatenate([self._past, command_mm], axis=1)
+        self._past = past[:, -self._remembered :].copy()
+
+    def _check(self, command: Array, y_d_mm: Array) -> None:
+        """Raise unless the blend keeps the limits, or the path itself is beyond them."""
+        limits, dt = self._machine.command, self._dt_s
+        for what, limit, order in (
+            ("mm/s", limits.velocity_mm_s, 1),
+            ("mm/s2", limits.accel_mm_s2, 2),
+        ):
+            asked, path = (
+                np.max(np.abs(np.diff(rows, order)), axis=1, initial=0.0) / dt**order
+                for rows in (command, y_d_mm)
+            )
+            for i in np.flatnonzero(asked > np.maximum(limit, path) * (1.0 + 1e-9)):
+                raise DesignError(
+                    f"axis {'xy'[i]}: blended over the position, the command asks for "
+                    f"{asked[i]:.0f} {what}; allowed are {limit:.0f} {what} (command limits of the "
+                    "machine): print more slowly, or measure the plants at nearer positions"
+                )

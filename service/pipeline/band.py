@@ -1,0 +1,94 @@
+"""How much of a planned motion lies beyond the frequencies for which a machine's model stands."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+
+__all__ = ["BandContent"]
+
+Array = NDArray[np.float64]
+
+BLOCK = 1024
+NOTABLE_UM = 1.0
+"""Less than this beyond the band is not worth a word."""
+
+
+class BandContent:
+    """Spectrum of the planned motion of X and Y while it prints.
+
+    Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, from
+    which a position's slow travel does not leak; |Y(f)| = |A(f)| / (2 pi f)^2.
+
+    Parameters
+    ----------
+    machine : Machine
+    dt_s : float
+    """
+
+    def __init__(self, machine: Machine, dt_s: float) -> None:
+        self._machine, self._dt_s = machine, dt_s
+        self._window = np.hanning(BLOCK + 1)[:-1]
+        self._power = np.zeros((2, BLOCK // 2 + 1))
+        self._blocks = 0
+        self._limited = any(
+            axis.band_hz or (axis.provenance and axis.provenance.trust_below_hz)
+            for axis in machine.axes.values()
+        )
+        self._path, self._prints = np.zeros((2, 0)), np.zeros(0, dtype=bool)
+
+    def add(self, path_mm: Array, extruding: NDArray[np.bool_]) -> None:
+        """Add planned positions, shape (2, n), that follow what was added before."""
+        if not self._limited:
+            return
+        path = np.concatenate([self._path, path_mm], axis=1)
+        prints = np.concatenate([self._prints, extruding])
+        count = max(0, (path.shape[1] - 2) // BLOCK)
+        accel = np.diff(path[:, : count * BLOCK + 2], 2) / self._dt_s**2
+        chosen = prints[: count * BLOCK].reshape(count, BLOCK).mean(axis=1) > 0.5
+        blocks = accel.reshape(2, count, BLOCK)[:, chosen]
+        self._power += np.sum(np.abs(np.fft.rfft(blocks * self._window)) ** 2, axis=1)
+        self._blocks += int(np.sum(chosen))
+        self._path = path[:, count * BLOCK :].copy()
+        self._prints = prints[count * BLOCK :].copy()
+
+    def jump(self) -> None:
+        """Say that what comes does not follow what was."""
+        self._path, self._prints = np.zeros((2, 0)), np.zeros(0, dtype=bool)
+
+    def beyond_um(self, f_hz: float) -> Array:
+        """Return the rms of the planned X and Y above a frequency, shape (2,)."""
+        f = np.fft.rfftfreq(BLOCK, self._dt_s)
+        above = f > f_hz
+        scale = 2.0 / (BLOCK * np.sum(self._window**2) * max(self._blocks, 1))
+        square = self._power[:, above] @ (2.0 * np.pi * f[above]) ** -4.0
+        return np.asarray(1e3 * np.sqrt(scale * square))
+
+    def warnings(self) -> list[str]:
+        """Return what lies outside the bands of the models, in words."""
+        found = []
+        for i, axis in enumerate(("x", "y")):
+            plants = self._machine.axes[axis]  # type: ignore[index]
+            trust_hz = plants.provenance.trust_below_hz if plants.provenance else None
+            if plants.band_hz is not None:
+                high_hz = plants.band_hz[1]
+                beyond = float(self.beyond_um(high_hz)[i])
+                if beyond > NOTABLE_UM:
+                    found.append(
+                        f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
+                        f"{high_hz:g} Hz, where its model was not measured (band_hz): figures are "
+                        "a guess there. Measure up to higher frequencies, or print with less "
+                        "acceleration."
+                    )
+            if trust_hz is not None:
+                beyond = float(self.beyond_um(trust_hz)[i])
+                if beyond > NOTABLE_UM:
+                    found.append(
+                        f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
+                        f"{trust_hz:g} Hz, from where its model is not to be trusted "
+                        "(trust_below_hz; the phase was not measured): a raw accelerometer log "
+                        "would tell."
+                    )
+        return found

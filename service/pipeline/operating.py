@@ -1,0 +1,107 @@
+"""Where a machine is as a file goes on: the print's mass on its bed, and the height."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gcode.types import Moves
+from models.machine import Machine
+from models.operating import OperatingGrid, machine_at, mass_schedules
+from models.schedule import EMPTY, OperatingPoint, resonances_hz
+from simulation.scheduled import BLEND_STEP, STEP
+
+__all__ = ["Operation"]
+
+_ALL_KNOWN = 7
+
+
+class Operation:
+    """Follow the moves of a file, item by item.
+
+    Parameters
+    ----------
+    machine : Machine
+
+    Attributes
+    ----------
+    printed_kg : float
+        Filament that lies on the bed. Feeding counts where X or Y moves, beyond what was pulled
+        back before; what runs out while the nozzle stands ends in a bin or is wiped off.
+
+    Notes
+    -----
+    Diameter and density are those of the machine document (`firmware.extruder`, `schedules`).
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        masses = mass_schedules(machine)
+        density_g_cm3 = masses[0].filament_density_g_cm3 if masses else 0.0
+        area_mm2 = 0.25 * math.pi * machine.firmware.extruder.filament_diameter_mm**2
+        self._kg_per_mm = 1e-6 * area_mm2 * density_g_cm3
+        self.printed_kg = 0.0
+        self._furthest_mm: float | None = None
+        self._point = EMPTY
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._level: OperatingPoint | None = None
+        self._used: dict[str, tuple[float, float]] = {}
+
+    def at(self, moves: Moves) -> OperatingPoint:
+        """Return the point at which these moves begin; its height is where they first print."""
+        if not self._machine.schedules:
+            return self._point
+        known = np.flatnonzero(moves.known == _ALL_KNOWN)
+        position = (self._point.x_mm, self._point.y_mm, self._point.z_mm)
+        if len(known):
+            travel = moves.end_mm[known] - moves.start_mm[known]
+            prints = (travel[:, 3] > 0.0) & np.any(travel[:, :2] != 0.0, axis=1)
+            x, y, z = moves.start_mm[known[np.argmax(prints)], :3].tolist()
+            position = (x, y, z)
+        self._point = OperatingPoint(self.printed_kg, *position)
+        self._note_range()
+        return self._point
+
+    def passed(self, moves: Moves) -> None:
+        """Count the filament of moves that are done."""
+        if self._kg_per_mm == 0.0 or len(moves) == 0:
+            return
+        if self._furthest_mm is None:
+            self._furthest_mm = float(moves.start_mm[0, 3])
+        fed = moves.end_mm[:, 3]
+        furthest = np.maximum.accumulate(np.append(self._furthest_mm, fed))
+        moving = np.any(moves.end_mm[:, :2] != moves.start_mm[:, :2], axis=1)
+        self.printed_kg += self._kg_per_mm * float(np.sum(np.diff(furthest)[moving]))
+        self._furthest_mm = float(furthest[-1])
+
+    def notes(self) -> list[str]:
+        """Return what the plants followed, in words."""
+        notes = []
+        for axis, schedule in self._machine.schedules.items():
+            follows = []
+            if schedule.mass is not None:
+                follows.append(
+                    f"the mass on the bed ({self.printed_kg:.3f} kg at the end, filament of "
+                    f"{schedule.mass.filament_density_g_cm3:g} g/cm3)"
+                )
+            if schedule.grid is not None:
+                measured = [a for a in ("x", "y", "z") if schedule.grid.coordinates_mm(a)]
+                follows.append(f"the position in {', '.join(measured)}")
+            text = f"The plant of axis {axis} follows {' and '.join(follows)}"
+            if axis in self._used:
+                low, high = self._used[axis]
+                text += f": its lowest resonance was between {low:.1f} and {high:.1f} Hz"
+            notes.append(f"{text}.")
+        return notes
+
+    def _note_range(self) -> None:
+        level = self._grid.level(self._point)
+        if level == self._level:
+            return
+        self._level = level
+        for node in self._grid.at_level(level):
+            for axis, plants in machine_at(self._machine, node).axes.items():
+                f_hz = float(resonances_hz(plants.nominal)[0])
+                low, high = self._used.get(axis, (f_hz, f_hz))
+                self._used[axis] = (min(low, f_hz), max(high, f_hz))

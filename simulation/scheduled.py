@@ -1,0 +1,76 @@
+"""What a machine does with a command while its plants change."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+from models.operating import OperatingGrid, machine_at
+from models.plants import discretise
+from models.schedule import EMPTY, OperatingPoint
+from simulation.response import PlantStream
+
+__all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "MachineStream"]
+
+Array = NDArray[np.float64]
+
+STEP = 0.001
+"""Ratio, minus 1, by which a resonance moves in mass or height before the plants are taken anew."""
+BLEND_STEP = 0.02
+"""The same from node to node in x and y."""
+REMEMBERED_S = 4.0
+"""How much of the past new plants are shown: vibrations of before have died down by then."""
+
+
+class MachineStream:
+    """Answer of X and Y of a machine to a command that arrives in blocks.
+
+    The nominal plants answer; the machine stands still at the first sample pushed. Plants that
+    depend on x and y answer all, and count with the weights of the planned position.
+
+    Parameters
+    ----------
+    machine : Machine
+    dt_s : float
+    point : OperatingPoint
+        Where the machine is at first; without schedules it does not matter.
+    """
+
+    def __init__(self, machine: Machine, dt_s: float, point: OperatingPoint = EMPTY) -> None:
+        self._machine, self._dt_s = machine, dt_s
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
+        self._past = np.zeros((2, 0))
+        self._level: OperatingPoint | None = None
+        self._streams: list[PlantStream] = []
+        self.operate_at(point)
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Go on with the plants of this point, which still vibrate from what was before."""
+        level = self._grid.level(point)
+        if level == self._level:
+            return
+        self._level = level
+        self._streams = []
+        for node in self._grid.at_level(level):
+            axes = machine_at(self._machine, node).axes
+            stream = PlantStream([discretise(axes[a].nominal, self._dt_s) for a in ("x", "y")])
+            stream.push(self._past)
+            self._streams.append(stream)
+
+    def push(self, u_mm: Array, path_mm: Array) -> Array:
+        """Return the positions that answer a command, shape (2, n).
+
+        Parameters
+        ----------
+        u_mm, path_mm : ndarray, shape (2, n)
+            The command, and the planned positions that weigh the plants.
+        """
+        if self._remembered:
+            self._past = np.concatenate([self._past, u_mm], axis=1)[:, -self._remembered :].copy()
+        if len(self._streams) == 1:
+            return self._streams[0].push(u_mm)
+        answers = [stream.push(u_mm) - u_mm for stream in self._streams]
+        blended = np.einsum("in,ikn->kn", self._grid.weights(path_mm), np.stack(answers))
+        return np.asarray(u_mm + blended)
