@@ -1,0 +1,22 @@
+"""Readers of measurement and model files; see `read_measurements`."""
+
+from models.identification.readers.reading import read_content, read_measurements
+from models.identification.readers.resampling import resampled
+from models.identification.readers.settings import (
+    ReadSettings,
+    date_in_name,
+    direction_of,
+    excitation_for,
+    excitation_notes,
+)
+
+__all__ = [
+    "ReadSettings",
+    "date_in_name",
+    "direction_of",
+    "excitation_for",
+    "excitation_notes",
+    "read_content",
+    "read_measurements",
+    "resampled",
+]

@@ -1,0 +1,112 @@
+"""Raw accelerations: Klipper's CSV, and what M956 of RepRapFirmware writes."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from models.errors import ModelError
+from models.identification.readers.checks import check_alive, check_long, check_steady
+from models.identification.readers.settings import ReadSettings
+from models.identification.readers.tables import Table
+from models.identification.types import AccelerationLog
+
+__all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
+
+_UNITS = {"mm/s^2": 1.0, "m/s^2": 1000.0, "g": 9806.65}
+_LEAST_SAMPLES = 64
+_KLIPPER = ("accel_x", "accel_y", "accel_z")
+_TRAILER = re.compile(r"rate\s+([\d.]+)\s*,?\s*overflows\s+(\d+)", re.IGNORECASE)
+_OVERFLOWS = re.compile(r"overflows\W{0,4}(\d+)", re.IGNORECASE)
+
+
+def is_klipper_log(table: Table) -> bool:
+    """Whether the columns are those of ACCELEROMETER_MEASURE and OUTPUT=raw_data."""
+    return table.names[:1] == ("time",) and any(n.startswith("accel_") for n in table.names)
+
+
+def is_m956(table: Table) -> bool:
+    """Whether the columns are those of M956."""
+    return table.names[:1] == ("sample",) and 1 < len(table.names) <= 4
+
+
+def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:
+    """Read `#time,accel_x,accel_y,accel_z` in s and mm/s^2.
+
+    Format: klippy/extras/adxl345.py, 2026-08; newer forks put a line `##` with the sensor's
+    statistics before it.
+
+    Raises
+    ------
+    ModelError
+        For a column that is missing or dead, samples lost by the sensor, gaps in time.
+    """
+    for comment in table.comments:
+        lost = _OVERFLOWS.search(comment)
+        if lost and int(lost[1]) > 0:
+            raise _overflowed(table, int(lost[1]))
+    check_long(table, _LEAST_SAMPLES, "samples")
+    values = table.numbers(("time", *_KLIPPER))
+    check_steady(values[:, 0], table)
+    accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
+    columns = dict(zip("xyz", accel.T, strict=True))
+    notes = check_alive(columns, table, axis, settings.sensor_axis)
+    return AccelerationLog(values[:, 0], accel, axis, table.source, (*table.notes, *notes))
+
+
+def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> AccelerationLog:
+    """Read `Sample,X,Y,Z` in g with the last line `Rate <Hz>, overflows <n>`.
+
+    Format: RepRapFirmware src/Accelerometers/Accelerometers.cpp, 3.4 to 3.6. Time is the
+    sample's number over the rate; axes that were not asked for are NaN.
+
+    Raises
+    ------
+    ModelError
+        If samples were lost, the recording failed, or the last line is missing.
+    """
+    rate_hz = _rate_hz(table)
+    table = table.without_last("")
+    check_long(table, _LEAST_SAMPLES, "samples")
+    extra = [n for n in table.names[1:] if n not in "xyz"]
+    if extra:
+        raise ModelError(f"{table.source}: column {extra[0]!r} is not one of X, Y, Z")
+    values = table.numbers(table.names)
+    check_steady(values[:, 0] / rate_hz, table)
+    accel = np.full((len(values), 3), np.nan)
+    for i, name in enumerate(table.names[1:], start=1):
+        accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
+    notes = check_alive(dict(zip("xyz", accel.T, strict=True)), table, axis, settings.sensor_axis)
+    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, notes)
+
+
+def _rate_hz(table: Table) -> float:
+    last = table.rows[-1] if table.rows else ""
+    found = _TRAILER.match(last.strip())
+    if found is None:
+        if last[:1].isalpha():
+            raise ModelError(
+                f"{table.source}, line {table.lines[-1]}: the firmware says {last.strip()!r:.80}; "
+                "record again"
+            )
+        raise ModelError(
+            f"{table.source}: the last line `Rate <Hz>, overflows <n>` is missing, so the "
+            "sampling rate is unknown: the file is cut off, record again"
+        )
+    if int(found[2]) > 0:
+        raise _overflowed(table, int(found[2]))
+    try:
+        rate_hz = float(found[1])
+    except ValueError:
+        rate_hz = 0.0
+    if not 10.0 <= rate_hz <= 1e6:
+        raise table.at(-1, f"sampling rate {found[1]} Hz is not between 10 Hz and 1 MHz")
+    return rate_hz
+
+
+def _overflowed(table: Table, count: int) -> ModelError:
+    return ModelError(
+        f"{table.source}: the sensor overflowed {count} times, so samples are lost at unknown "
+        "places (0 are allowed); record again with a lower rate or a faster bus"
+    )

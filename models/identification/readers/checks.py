@@ -1,0 +1,109 @@
+"""What every recording must pass: rising time without gaps, and columns that are alive."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.identification.readers.tables import Table
+
+__all__ = ["check_alive", "check_long", "check_rising", "check_steady"]
+
+Array = NDArray[np.float64]
+
+_GAP_SAMPLES = 2.5
+"""Two periods are one lost sample, which is let pass; half a period allows for jitter."""
+
+
+def check_long(table: Table, least: int, what: str) -> None:
+    """Raise ModelError if the table has fewer than `least` rows."""
+    if len(table.rows) < least:
+        raise ModelError(
+            f"{table.source}: {len(table.rows)} {what}, at least {least} are needed; "
+            "record the whole test"
+        )
+
+
+def check_rising(values: Array, table: Table, name: str) -> None:
+    """Raise ModelError at the first value that is not above the one before it."""
+    falls = np.flatnonzero(np.diff(values) <= 0)
+    if len(falls):
+        i = int(falls[0]) + 1
+        raise table.at(
+            i,
+            f"{name} {values[i]:.9g} does not rise (before it: {values[i - 1]:.9g}); "
+            "lines are doubled or out of order, export the file again",
+        )
+
+
+def check_steady(time_s: Array, table: Table) -> None:
+    """Raise ModelError at the first gap of more than two samples."""
+    check_rising(time_s, table, "time")
+    steps = np.diff(time_s)
+    period = float(np.median(steps))
+    gaps = np.flatnonzero(steps > _GAP_SAMPLES * period)
+    if len(gaps):
+        i = int(gaps[0])
+        more = f" ({len(gaps)} gaps in all)" if len(gaps) > 1 else ""
+        raise table.at(
+            i + 1,
+            f"gap in time{more}: {steps[i] * 1e3:.4g} ms after {time_s[i]:.6f} s, "
+            f"{steps[i] / period - 1:.0f} samples are missing; at most 1 may be. Measure again "
+            "with less load on the host, or a lower rate of the sensor",
+        )
+
+
+def check_alive(
+    columns: dict[str, Array], table: Table, axis: str | None, sensor_axis: str | None
+) -> tuple[str, ...]:
+    """Refuse a recording whose column of interest is constant; note any other such column.
+
+    Parameters
+    ----------
+    columns : dict
+        By sensor axis; columns of NaN were not recorded.
+    axis : str, optional
+        Tested axis, or direction like "1.000,1.000".
+    sensor_axis : str, optional
+        Column along the tested axis; default: that of the same name.
+
+    Raises
+    ------
+    ModelError
+        If no column moves, or the one along the tested axis does not or was not recorded.
+    """
+    recorded = {name: v for name, v in columns.items() if not np.isnan(v).any()}
+    dead = {name: float(v[0]) for name, v in recorded.items() if np.ptp(v) == 0.0}
+    if len(dead) == len(recorded):
+        raise ModelError(
+            f"{table.source}: every column of the sensor is constant "
+            f"({_listed(dead)}): it did not measure; check its wiring and measure again"
+        )
+    for name in _along(axis, sensor_axis):
+        if name in columns and name not in recorded:
+            raise ModelError(
+                f"{table.source}: the sensor's {name} was not recorded, but axis {axis} was "
+                "tested; record all axes, or give sensor_axis if the sensor is mounted turned"
+            )
+        if name in dead:
+            raise ModelError(
+                f"{table.source}: the sensor's {name} is dead (constant {dead[name]:g}) while axis "
+                f"{axis} was tested; check the sensor, or give sensor_axis if it is mounted turned"
+            )
+    return (f"the sensor's {_listed(dead)} is constant",) if dead else ()
+
+
+def _along(axis: str | None, sensor_axis: str | None) -> tuple[str, ...]:
+    if sensor_axis is not None:
+        return (sensor_axis,)
+    if axis is None:
+        return ()
+    if "," not in axis:
+        return (axis,)
+    parts = [float(part) for part in axis.split(",")]
+    return tuple(name for name, part in zip("xyz", parts, strict=False) if part)
+
+
+def _listed(dead: dict[str, float]) -> str:
+    return ", ".join(f"{name} = {value:g}" for name, value in dead.items())

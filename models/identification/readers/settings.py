@@ -1,0 +1,214 @@
+"""What measurement files do not carry: asked for, or assumed by the date of the firmware."""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import date
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from models.errors import ModelError
+from models.identification.types import AccelerationLog, Excitation, Spectrum
+
+__all__ = [
+    "ReadSettings",
+    "date_in_name",
+    "direction_of",
+    "excitation_for",
+    "excitation_notes",
+]
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Column = str | Annotated[int, Field(ge=0)]
+"""By name, or counted from 0."""
+
+_NEW_TEST = date(2024, 12, 1)
+_OLD = {"accel_per_hz_mm_s": 75.0, "f_end_hz": 10000.0 / 75.0, "sweeping_accel_mm_s2": 0.0}
+_DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
+_DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
+
+
+class ReadSettings(BaseModel):
+    """What a file leaves open; None means: as the file, its name or the firmware's date says.
+
+    Attributes
+    ----------
+    axis : str, optional
+        Tested axis: "x", "y", "z", or a direction like "1.000,1.000".
+    accel_per_hz_mm_s, f_start_hz, f_end_hz, hz_per_s : float, optional
+        Of the firmware's [resonance_tester].
+    sweeping_accel_mm_s2, sweeping_period_s : float, optional
+        The slow square wave of newer versions; acceleration 0 for none.
+    firmware_date : date, optional
+        Of the Klipper version that made the file.
+    sensor_axis : str, optional
+        Axis of the sensor that lies along the tested axis, if it is mounted turned.
+    time_column, command_column, measured_column, axis_column : str or int, optional
+        Columns of a recorded drive, by name or counted from 0.
+    acceleration_unit, magnitude_unit : str, optional
+        Where a file is not in its format's own unit.
+    sampling_s : float, optional
+        Of a discrete model whose file does not say.
+    repair_rounding : bool
+        Move the coefficients of a discrete model within the rounding of their printed
+        decimals so that the DC gain is 1.
+    dc_gain : float, optional
+        The DC gain that the model may have: the steps per mm are off by this factor.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    axis: str | None = None
+    accel_per_hz_mm_s: Positive | None = None
+    f_start_hz: Positive | None = None
+    f_end_hz: Positive | None = None
+    hz_per_s: Positive | None = None
+    sweeping_accel_mm_s2: NonNegative | None = None
+    sweeping_period_s: Positive | None = None
+    firmware_date: date | None = None
+    sensor_axis: Literal["x", "y", "z"] | None = None
+    time_column: Column | None = None
+    command_column: Column | None = None
+    measured_column: Column | None = None
+    axis_column: Column | None = None
+    acceleration_unit: Literal["mm/s^2", "m/s^2", "g"] | None = None
+    magnitude_unit: Literal["abs", "dB"] | None = None
+    sampling_s: Positive | None = None
+    repair_rounding: bool = False
+    dc_gain: Positive | None = None
+
+    @field_validator("axis")
+    @classmethod
+    def _known_axis(cls, axis: str | None) -> str | None:
+        if axis is not None:
+            direction_of(axis, allow_z=True)
+        return axis
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ReadSettings:
+        low, high = self.f_start_hz, self.f_end_hz
+        if low is not None and high is not None and low >= high:
+            raise ModelError(f"f_start_hz {low:g} must be below f_end_hz {high:g}")
+        if self.repair_rounding and self.dc_gain is not None:
+            raise ModelError("repair_rounding makes the DC gain 1; leave out dc_gain")
+        return self
+
+
+def direction_of(axis: str, *, allow_z: bool = False) -> tuple[float, float]:
+    """Return the unit vector (x, y) of "x", "y" or a direction like "1.000,-1.000".
+
+    Raises
+    ------
+    ModelError
+        If the text is no axis, or (without `allow_z`) the axis is not in the plane.
+    """
+    text = axis.strip().lower()
+    named = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
+    if text in named:
+        return named[text]
+    if text == "z" and allow_z:
+        return 0.0, 0.0
+    if _DIAGONAL.fullmatch(text):
+        x, y, *rest = (float(part) for part in text.split(","))
+        size = math.hypot(x, y)
+        if size > 0 and not any(rest):
+            return x / size, y / size
+    raise ModelError(
+        f"axis {axis!r} is not a direction of the plane; give x, y, or components like 1.000,1.000"
+    )
+
+
+def excitation_for(
+    measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
+) -> Excitation:
+    """Return the firmware's resonance test: the file first, then the settings, then defaults.
+
+    Defaults of klippy/extras/resonance_tester.py: before 2024-12 from 5 to 133.33 Hz with
+    75 mm/s and without the slow square wave; since then from 5 to 135 Hz with 60 mm/s,
+    400 mm/s^2 and 1.2 s. Always 1 Hz/s.
+
+    Raises
+    ------
+    ModelError
+        If nobody says which axis was tested, or it is not in the plane.
+    """
+    return _resolved(measurement, settings or ReadSettings()).excitation
+
+
+def excitation_notes(
+    measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
+) -> tuple[str, ...]:
+    """Return in words what `excitation_for` assumed because nobody said it."""
+    return _resolved(measurement, settings or ReadSettings()).notes
+
+
+def date_in_name(name: str) -> date | None:
+    """Return the date in a file name such as resonances_x_20211217_070942.csv, if it has one."""
+    for found in _DATE.finditer(name):
+        try:
+            return date(*(int(part) for part in found.groups()))
+        except ValueError:
+            continue
+    return None
+
+
+class _Resolved(NamedTuple):
+    excitation: Excitation
+    notes: tuple[str, ...]
+
+
+def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -> _Resolved:
+    axis = settings.axis or measurement.axis
+    if axis is None:
+        raise ModelError(
+            f"{measurement.source}: neither the file nor its name says which axis was tested; "
+            "give the axis"
+        )
+    made = settings.firmware_date or date_in_name(measurement.source)
+    old = made is not None and made < _NEW_TEST
+    defaults = Excitation(direction=direction_of(axis))
+    given = {
+        "accel_per_hz_mm_s": settings.accel_per_hz_mm_s,
+        "f_start_hz": settings.f_start_hz,
+        "f_end_hz": settings.f_end_hz,
+        "hz_per_s": settings.hz_per_s,
+        "sweeping_accel_mm_s2": settings.sweeping_accel_mm_s2,
+        "sweeping_period_s": settings.sweeping_period_s,
+    }
+    if isinstance(measurement, Spectrum) and measurement.accel_per_hz_mm_s is not None:
+        given["accel_per_hz_mm_s"] = measurement.accel_per_hz_mm_s
+    values: dict[str, float] = {}
+    assumed: list[str] = []
+    for name, value in given.items():
+        if value is not None:
+            values[name] = value
+            continue
+        values[name] = _OLD.get(name, getattr(defaults, name)) if old else getattr(defaults, name)
+        idle = name == "sweeping_period_s" and values["sweeping_accel_mm_s2"] == 0
+        if not idle:
+            assumed.append(f"{name} {values[name]:g}")
+    if values["f_start_hz"] >= values["f_end_hz"]:
+        raise ModelError(
+            f"{measurement.source}: the test would run from {values['f_start_hz']:g} to "
+            f"{values['f_end_hz']:g} Hz; give both f_start_hz and f_end_hz"
+        )
+    excitation = Excitation(direction=defaults.direction, **values)
+    if not assumed:
+        return _Resolved(excitation, ())
+    return _Resolved(
+        excitation,
+        (f"assumed {', '.join(assumed)}: the defaults of Klipper {_era(made, settings)}",),
+    )
+
+
+def _era(made: date | None, settings: ReadSettings) -> str:
+    if made is None:
+        return (
+            "since 2024-12, because no date is known (give firmware_date if the firmware is older)"
+        )
+    era = "before 2024-12" if made < _NEW_TEST else "since 2024-12"
+    told = "firmware_date" if settings.firmware_date else "the date in the file's name"
+    return f"{era} by {told}, {made.isoformat()}"

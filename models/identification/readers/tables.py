@@ -1,0 +1,212 @@
+"""Tables of numbers as text: delimiter, header, rows with their line numbers."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+
+__all__ = ["Table", "as_table"]
+
+Array = NDArray[np.float64]
+
+_LARGEST = 1e30
+"""Nothing measured is larger; beyond it, squares and sums would overflow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Rows of one text file, not yet turned into numbers.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Column names in lower case; empty if the file has no header.
+    rows, lines : list
+        The text of each row, and its line number from 1.
+    delimiter : str or None
+        None: white space.
+    comments : tuple of str
+        Lines that begin with # and are not the header.
+    first_line : str
+        For messages.
+    """
+
+    source: str
+    names: tuple[str, ...]
+    rows: list[str]
+    lines: list[int]
+    delimiter: str | None
+    comments: tuple[str, ...] = ()
+    first_line: str = ""
+    notes: tuple[str, ...] = field(default=())
+
+    def index(self, column: str | int) -> int:
+        """Return the position of a column; raise ModelError if there is none."""
+        width = len(self.names) or (len(self.split(self.rows[0])) if self.rows else 0)
+        if isinstance(column, int):
+            if column < width:
+                return column
+            raise ModelError(f"{self.source}: no column {column}, counted from 0; it has {width}")
+        if column.lower() in self.names:
+            return self.names.index(column.lower())
+        listed = ", ".join(self.names) or "none named"
+        raise ModelError(f"{self.source}: column {column!r} is missing; there are: {listed:.300}")
+
+    def numbers(self, columns: Sequence[str | int]) -> Array:
+        """Return the columns as numbers, shape (rows, columns).
+
+        Raises
+        ------
+        ModelError
+            Naming the line of the first row that is too short, not a number or not finite.
+        """
+        wanted = [self.index(column) for column in columns]
+        self._check_widths()
+        try:
+            values = np.loadtxt(
+                self.rows, delimiter=self.delimiter, usecols=wanted, ndmin=2, comments=None
+            )
+        except (ValueError, IndexError):
+            raise self._first_bad(wanted) from None
+        if values.size and not np.abs(values).max() < _LARGEST:
+            raise self._first_bad(wanted)
+        return values
+
+    def texts(self, column: str | int) -> list[str]:
+        """Return a column as it stands, without the blanks around."""
+        at = self.index(column)
+        self._check_widths()
+        return [self.split(row)[at].strip() for row in self.rows]
+
+    def split(self, row: str) -> list[str]:
+        """Return the fields of a row."""
+        return row.split(self.delimiter)
+
+    def without_last(self, note: str) -> Table:
+        """Return the table without its last row, which the note explains."""
+        return replace(self, rows=self.rows[:-1], lines=self.lines[:-1], notes=(*self.notes, note))
+
+    def picked(self, rows: NDArray[np.intp]) -> Table:
+        """Return the table of the rows at the given positions."""
+        return replace(self, rows=[self.rows[i] for i in rows], lines=[self.lines[i] for i in rows])
+
+    def at(self, row: int, text: str) -> ModelError:
+        """Return an error at a row."""
+        return ModelError(f"{self.source}, line {self.lines[row]}: {text}")
+
+    def _check_widths(self) -> None:
+        if not self.rows:
+            raise ModelError(f"{self.source}: there is a header but no row of numbers")
+        expected = len(self.names) or len(self.split(self.rows[0]))
+        for i, row in enumerate(self.rows):
+            width = len(row.split()) if self.delimiter is None else row.count(self.delimiter) + 1
+            if width != expected:
+                raise self.at(
+                    i, f"{width} fields where {expected} are expected; remove or complete the line"
+                )
+
+    def _first_bad(self, wanted: Sequence[int]) -> ModelError:
+        for i, row in enumerate(self.rows):
+            fields = self.split(row)
+            for column in wanted:
+                value = _number(fields[column])
+                if value is None or not abs(value) < _LARGEST:
+                    name = self.names[column] if self.names else f"column {column}"
+                    return self.at(
+                        i,
+                        f"{name} is {fields[column].strip()!r:.60}, not a finite number; "
+                        "remove the line or measure again",
+                    )
+        return ModelError(f"{self.source}: the rows cannot be read as numbers")
+
+
+def as_table(text: str, source: str) -> Table:
+    """Find delimiter, header and rows of a text.
+
+    The header is the first line that is neither a comment nor numbers, otherwise the last
+    comment above the rows that has as many fields as they. A last line that was cut off in
+    writing is left out, with a note.
+    """
+    listed = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    filled = [(i + 1, line) for i, line in enumerate(listed) if line and not line.isspace()]
+    comments = [line for _, line in filled if line.startswith("#")]
+    rows = [(i, line) for i, line in filled if not line.startswith("#")]
+    header = ""
+    if rows and not _numeric_start(rows[0][1]):
+        header = rows.pop(0)[1]
+    delimiter = _delimiter(rows[0][1] if rows else header)
+    if not header and rows:
+        header = _commented_header(comments, delimiter, len(rows[0][1].split(delimiter)))
+    table = Table(
+        source=source,
+        names=_names(header, delimiter),
+        rows=[line for _, line in rows],
+        lines=[i for i, _ in rows],
+        delimiter=delimiter,
+        comments=tuple(line for line in comments if line != header),
+        first_line=filled[0][1] if filled else "",
+    )
+    return table if not listed[-1] else _without_cut_line(table)
+
+
+def _numeric_start(line: str) -> bool:
+    for delimiter in (",", ";", None):
+        fields = line.split(delimiter)
+        if fields and _number(fields[0]) is not None:
+            return True
+    return False
+
+
+def _delimiter(line: str) -> str | None:
+    return next((mark for mark in (",", ";", "\t") if mark in line), None)
+
+
+def _commented_header(comments: list[str], delimiter: str | None, width: int) -> str:
+    for line in reversed(comments):
+        if not line.startswith("##") and len(_names(line, delimiter)) == width:
+            return line
+    return ""
+
+
+def _names(header: str, delimiter: str | None) -> tuple[str, ...]:
+    text = header.lstrip("#").strip()
+    if not text:
+        return ()
+    if delimiter is None:
+        return tuple(text.lower().split())
+    try:
+        fields = next(csv.reader([text], delimiter=delimiter))
+    except csv.Error:
+        fields = text.split(delimiter)
+    return tuple(name.strip().lower() for name in fields)
+
+
+def _without_cut_line(table: Table) -> Table:
+    """Leave out a last line without line end if it is shorter than the others."""
+    if len(table.rows) < 3 or table.rows[-1][:1].isalpha():
+        return table
+    earlier, before, last = (table.split(row) for row in table.rows[-3:])
+    short = len(last) < len(before) or (
+        _number(last[-1]) is None and _number(before[-1]) is not None
+    )
+    same = _decimals(earlier[-1]) == _decimals(before[-1])
+    if short or (same and _decimals(last[-1]) < _decimals(before[-1])):
+        return table.without_last(f"line {table.lines[-1]}, the last, is cut off and left out")
+    return table
+
+
+def _decimals(number: str) -> int:
+    return len(number.strip().partition(".")[2])
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

@@ -1,0 +1,276 @@
+"""Models of python-control and MATLAB, and the loading rules with their messages."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+import scipy.io
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from models.errors import ModelError
+from models.identification.readers import ReadSettings, read_content, resampled
+from models.identification.types import PlantModel
+from models.plants import PairsSpec, PlantSpec, PolePair, ZeroPair, discretise, frequency_response
+
+F_HZ = np.linspace(0.1, 200.0, 150)
+DT_S = 1e-3
+PAIRS = PairsSpec(
+    poles=(PolePair(f_hz=47, zeta=0.035), PolePair(f_hz=95, zeta=0.06)),
+    zeros=(ZeroPair(f_hz=62, zeta=-0.1),),
+)
+TAZ = (
+    '{"num": [0.0874, -0.3415, 0.5118, -0.3481, 0.09063], '
+    '"den": [1.0, -4.54, 8.283, -7.583, 3.479, -0.639], "dt": 0.001}'
+)
+
+
+def read(document: Any, **known: Any) -> PlantModel:
+    text = document if isinstance(document, str) else json.dumps(document)
+    (model,) = read_content(text.encode(), "model.json", settings=ReadSettings(**known))
+    assert isinstance(model, PlantModel)
+    return model
+
+
+def mat(**variables: Any) -> bytes:
+    out = io.BytesIO()
+    scipy.io.savemat(out, variables)
+    return out.getvalue()
+
+
+def system(discrete: bool) -> control.StateSpace:
+    """The pair plant, realised by python-control."""
+    plant = control.tf(1, 1)
+    for zero in PAIRS.zeros:
+        w = 2 * np.pi * zero.f_hz
+        plant = plant * control.tf([1 / w**2, 2 * zero.zeta / w, 1], [1])
+    for pole in PAIRS.poles:
+        w = 2 * np.pi * pole.f_hz
+        plant = plant * control.tf([1], [1 / w**2, 2 * pole.zeta / w, 1])
+    state = control.tf2ss(plant)
+    return control.sample_system(state, DT_S, "foh") if discrete else state
+
+
+def response(plant: Any, discrete: bool) -> np.ndarray:
+    at = np.exp(2j * np.pi * F_HZ * DT_S) if discrete else 2j * np.pi * F_HZ
+    return np.asarray(plant(at))
+
+
+def pairs_of(roots: np.ndarray) -> list[list[float]]:
+    return [[float(r.real), float(r.imag)] for r in roots]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("form", ["tf", "zpk", "ss"])
+@pytest.mark.parametrize("container", ["json", "mat", "struct"])
+def test_python_control_and_matlab(discrete: bool, form: str, container: str) -> None:
+    state = system(discrete)
+    dt = DT_S if discrete else 0
+    fields: dict[str, Any]
+    if form == "tf":
+        plant = control.tf(state)
+        num, den = np.real(plant.num[0][0]), np.real(plant.den[0][0])
+        fields = {"num": num, "den": den, "dt": dt}
+    elif form == "zpk":
+        zeros = state.zeros()[np.abs(state.zeros()) < 1e5]
+        poles = state.poles()
+        leading = np.real(np.prod(0j + dt / DT_S - poles) / np.prod(0j + dt / DT_S - zeros))
+        fields = {"z": zeros, "p": poles, "k": leading, "Ts": dt}
+    else:
+        fields = {"A": state.A, "B": state.B, "C": state.C, "D": state.D, "Ts": dt}
+    if container == "json":
+        plain = {
+            name: pairs_of(value) if name in "zp" else np.asarray(value).tolist()
+            for name, value in fields.items()
+        }
+        model = read(plain)
+    else:
+        content = mat(**fields) if container == "mat" else mat(y=fields, other=3.0)
+        (one,) = read_content(content, "model.mat")
+        assert isinstance(one, PlantModel)
+        model = one
+        assert model.axis == ("y" if container == "struct" else None)
+    assert model.spec.sampling_s == (DT_S if discrete else None)
+    expected = response(state, discrete)
+    np.testing.assert_allclose(frequency_response(model.spec, F_HZ), expected, rtol=2e-5)
+
+
+def test_ways_of_writing_numbers() -> None:
+    poles = [[-20.0, 300.0], [-20.0, -300.0]]
+    for written in (
+        poles,
+        [{"re": a, "im": b} for a, b in poles],
+        [{"real": a, "imag": b} for a, b in poles],
+        ["-20+300j", "-20 - 300i"],
+    ):
+        spec = read({"zeros": [], "poles": written, "gain": 20**2 + 300**2}).spec
+        np.testing.assert_allclose(sorted(spec.roots().poles.imag), [-300, 300])
+    nested = read({"num": [[[1.0]]], "den": [[[0.01, 1.0]]], "dt": None})
+    np.testing.assert_allclose(nested.spec.roots().poles, [-100])
+
+
+def test_own_documents_and_axes() -> None:
+    own = json.loads(PAIRS.model_dump_json())
+    assert read(own).spec == PAIRS
+    models = read_content(json.dumps({"x": own, "y": own}).encode(), "m.json")
+    assert [m.axis for m in models] == ["x", "y"]
+
+
+def test_printed_taz_polynomial_is_refused_and_repaired() -> None:
+    """Figures of repair (a) in the reference notes, section 6."""
+    with pytest.raises(ModelError, match=r"model\.json: model has an integrator .*rounded\?"):
+        read(TAZ)
+    with pytest.raises(ModelError, match="repair_rounding"):
+        read(TAZ)
+    model = read(TAZ, repair_rounding=True)
+    plant = discretise(model.spec, DT_S)
+    assert np.sum(model.spec.num) == pytest.approx(np.sum(model.spec.den), abs=1e-14)
+    assert np.abs(plant.poles()).max() == pytest.approx(0.9803, abs=1e-4)
+    assert (np.abs(plant.zeros()) > 1).sum() == 2
+    np.testing.assert_allclose(plant.modes(), [[21.0, 0.29], [35.5, 0.089]], rtol=0.01)
+    what, poles = model.notes
+    assert "at most 9% of half their last decimal" in what
+    assert "-4.54 to -4.53995" in what
+    assert "largest |z| 0.9803" in poles
+
+
+def test_repair_counts_the_decimals_of_matlab_files_too() -> None:
+    taz = json.loads(TAZ)
+    content = mat(num=taz["num"], den=taz["den"], Ts=0.001)
+    with pytest.raises(ModelError, match="repair_rounding"):
+        read_content(content, "taz.mat")
+    (model,) = read_content(content, "taz.mat", settings=ReadSettings(repair_rounding=True))
+    assert isinstance(model, PlantModel)
+    assert model.spec == read(TAZ, repair_rounding=True).spec
+
+
+def test_repair_refuses_more_than_rounding() -> None:
+    with pytest.raises(ModelError, match="times the rounding of the coefficients"):
+        read('{"num": [0.50], "den": [1, -0.900000], "dt": 0.001}', repair_rounding=True)
+    with pytest.raises(ModelError, match="no rounding to repair"):
+        read('{"num": [1], "den": [2, 0, -2], "dt": 0.001}', repair_rounding=True)
+
+
+@pytest.mark.parametrize(
+    ("gain", "note"),
+    [(1.0, None), (1.01, "DC gain 1.01 scaled to 1"), (0.9, "warning: DC gain 0.9 scaled to 1")],
+)
+def test_dc_gain_is_scaled(gain: float, note: str | None) -> None:
+    model = read({"num": [gain], "den": [0.01, 1.0]})
+    assert [n.startswith(note) for n in model.notes if note] == [True] * len(model.notes)
+    assert len(model.notes) == (note is not None)
+    np.testing.assert_allclose(frequency_response(model.spec, [0.0]), 1.0, rtol=1e-12)
+
+
+def test_dc_gain_far_off_needs_a_word() -> None:
+    document = {"num": [1.3], "den": [0.01, 1.0]}
+    with pytest.raises(ModelError, match=r"DC gain 1\.3 is more than 15% .*give it as dc_gain"):
+        read(document)
+    for kind in (
+        document,
+        {"zeros": [], "poles": [-100.0], "gain": 130.0},
+        {"A": [[-100.0]], "B": [[1.0]], "C": [[130.0]], "D": 0},
+        {"kind": "fir", "taps": [0.65, 0.65], "dt_s": 0.001},
+    ):
+        model = read(kind, dc_gain=1.3)
+        assert model.notes[0] == "DC gain divided by the stated 1.3 (steps per mm)"
+        np.testing.assert_allclose(frequency_response(model.spec, [0.0]), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ({"num": [1], "den": [1, 2, -3]}, r"unstable plant: pole s = 1"),
+        ({"num": [0.1], "den": [1, -1.1], "dt": 0.001}, r"unstable plant: pole z = 1\.1"),
+        ({"num": [1], "den": [1, 2, 0]}, "model has an integrator"),
+        ({"zeros": [], "poles": [1.0, 0.5], "dt": 0.001}, "model has an integrator"),
+        ({"zeros": [], "poles": [[-1, 3]], "gain": 1}, "lacks its complex conjugate"),
+        ({"num": [1, 0, 1], "den": [1, 1]}, "improper"),
+        ({"num": [1], "den": [1, 1], "dt": True}, "does not say its sampling time"),
+        ({"num": [1], "den": [1, 1], "Ts": -1}, "does not say its sampling time"),
+        ({"num": [1], "den": ["a", 1]}, "den is .* not made of numbers"),
+        ({"num": [[1], [2]], "den": [1, 1]}, "not made of numbers"),
+        ({"num": ["1+2j"], "den": [1, 1]}, "complex coefficients"),
+        ({"A": [[1, 2]], "B": [1], "C": [1], "D": 0}, "do not fit together"),
+        ({"A": "no", "B": [1], "C": [1]}, "A is not a matrix"),
+        ({"num": [1]}, "it needs num and den"),
+        ({"kind": "other"}, "other"),
+        ({"x": [1]}, "axis x is not an object"),
+        ("[1, 2]", "a JSON model is an object"),
+        ('{"num": [NaN], "den": [1, 1]}', "NaN is not a finite number"),
+        ('{"num": [1e999], "den": [1, 1]}', "num"),
+        ('{"num": [1', "not a JSON model"),
+        ("{" * 100_000, "not a JSON model"),
+        ('{"a":' * 100_000, "not a JSON model"),
+    ],
+)
+def test_refusals(document: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message) as caught:
+        read(document)
+    assert str(caught.value).startswith("model.json: ")
+
+
+def test_sampling_time_may_be_told() -> None:
+    document = {"num": [0.1], "den": [1, -0.9], "dt": True}
+    assert read(document, sampling_s=0.002).spec.sampling_s == 0.002
+
+
+def test_matlab_refusals() -> None:
+    for head in (b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + b" " * 500, b"\x89HDF\r\n\x1a\n" * 9):
+        with pytest.raises(ModelError, match=r"HDF5.*-v7"):
+            read_content(head, "model.mat")
+    with pytest.raises(ModelError, match="no model among the variables other"):
+        read_content(mat(other=np.ones(3)), "model.mat")
+    with pytest.raises(ModelError, match="damaged MATLAB file"):
+        read_content(mat(num=np.ones(3), den=np.ones(3))[:170], "model.mat")
+    bomb = io.BytesIO()
+    scipy.io.savemat(bomb, {"num": np.zeros((1000, 5000))}, do_compression=True)
+    with pytest.raises(ModelError, match="unpacks to more than"):
+        read_content(bomb.getvalue(), "model.mat")
+
+
+@hypothesis_settings(max_examples=30, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.floats(10, 150), st.floats(0.02, 0.4)),
+        min_size=1, max_size=3, unique_by=lambda m: round(m[0]),
+    )
+)  # fmt: skip
+def test_written_models_come_back(modes: list[tuple[float, float]]) -> None:
+    spec = PairsSpec(poles=tuple(PolePair(f_hz=f, zeta=z) for f, z in modes))
+    sampled, _ = resampled(spec, DT_S)
+    for original in (spec, sampled):
+        model = read(original.model_dump_json())
+        assert model.spec == original
+
+
+def test_resampled_states_its_error() -> None:
+    same, nothing = resampled(PAIRS, DT_S)[0], resampled(resampled(PAIRS, DT_S)[0], DT_S)
+    assert nothing == (same, 0.0)
+    spec, error = resampled(PAIRS, DT_S, 150.0)
+    f_hz = np.linspace(0, 150, 1001)
+    discrete = control.sample_system(system(False), DT_S, "foh")
+    np.testing.assert_allclose(
+        frequency_response(spec, f_hz), discrete(np.exp(2j * np.pi * f_hz * DT_S)), atol=1e-8
+    )
+    exact = frequency_response(PAIRS, f_hz)
+    off = np.abs(frequency_response(spec, f_hz) - exact).max() / np.abs(exact).max()
+    assert error == pytest.approx(off, rel=1e-3)
+    assert 1e-4 < error < 0.02
+
+
+def test_resampled_back_and_forth() -> None:
+    fine, _ = resampled(PAIRS, 0.5e-3)
+    coarse, _ = resampled(fine, DT_S)
+    direct: PlantSpec = resampled(PAIRS, DT_S)[0]
+    np.testing.assert_allclose(
+        frequency_response(coarse, F_HZ), frequency_response(direct, F_HZ), atol=1e-7
+    )
+    with pytest.raises(ModelError, match="pure delay"):
+        resampled(read({"kind": "fir", "taps": [0.5, 0.5], "dt_s": 0.001}).spec, 0.002)

@@ -1,0 +1,101 @@
+"""The resonance test that made a file: what it says, what the user says, what is assumed."""
+
+from __future__ import annotations
+
+from datetime import date
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from models.errors import ModelError
+from models.identification.readers import (
+    ReadSettings,
+    date_in_name,
+    direction_of,
+    excitation_for,
+    excitation_notes,
+)
+from models.identification.types import Excitation, Spectrum
+
+
+def spectrum(
+    source: str, axis: str | None = "x", accel_per_hz_mm_s: float | None = None
+) -> Spectrum:
+    return Spectrum(np.arange(3.0), {"x": np.ones(3)}, axis, source, accel_per_hz_mm_s)
+
+
+OLD = Excitation((1.0, 0.0), 5.0, 10000 / 75, 75.0, 1.0, 0.0, 1.2)
+NEW = Excitation((1.0, 0.0), 5.0, 135.0, 60.0, 1.0, 400.0, 1.2)
+
+
+@pytest.mark.parametrize(
+    ("source", "firmware", "expected", "words"),
+    [
+        ("resonances_x_20211217_070942.csv", None, OLD, "before 2024-12 by the date in the file"),
+        ("resonances_x_20250102_070942.csv", None, NEW, "since 2024-12 by the date in the file"),
+        ("resonances_x_a.csv", date(2024, 11, 30), OLD, "before 2024-12 by firmware_date"),
+        ("resonances_x_20211217_070942.csv", date(2025, 1, 1), NEW, "2025-01-01"),
+        ("resonances_x_a.csv", None, NEW, "no date is known"),
+    ],
+)
+def test_defaults_by_date(
+    source: str, firmware: date | None, expected: Excitation, words: str
+) -> None:
+    settings = ReadSettings(firmware_date=firmware)
+    assert excitation_for(spectrum(source), settings) == expected
+    (note,) = excitation_notes(spectrum(source), settings)
+    assert words in note
+    assert f"accel_per_hz_mm_s {expected.accel_per_hz_mm_s:g}" in note
+
+
+def test_file_before_settings_before_defaults() -> None:
+    settings = ReadSettings(accel_per_hz_mm_s=90, f_end_hz=200, firmware_date=date(2023, 1, 1))
+    told = excitation_for(spectrum("a.csv", "1,-1", 100.0), settings)
+    assert told.accel_per_hz_mm_s == 100.0
+    assert told.f_end_hz == 200.0
+    assert told.sweeping_accel_mm_s2 == 0.0
+    np.testing.assert_allclose(told.direction, (np.sqrt(0.5), -np.sqrt(0.5)))
+    assert excitation_for(spectrum("a.csv"), settings).accel_per_hz_mm_s == 90.0
+    (note,) = excitation_notes(spectrum("a.csv", "x", 100.0), settings)
+    assert "accel_per_hz" not in note
+    assert "f_end_hz" not in note
+
+
+def test_nothing_assumed_when_everything_is_said() -> None:
+    settings = ReadSettings(
+        axis="y", accel_per_hz_mm_s=75, f_start_hz=5, f_end_hz=100, hz_per_s=1,
+        sweeping_accel_mm_s2=0,
+    )  # fmt: skip
+    assert excitation_notes(spectrum("a.csv", None), settings) == ()
+    assert excitation_for(spectrum("a.csv", None), settings).direction == (0.0, 1.0)
+
+
+def test_refusals() -> None:
+    with pytest.raises(ModelError, match=r"a\.csv: neither the file nor its name says which axis"):
+        excitation_for(spectrum("a.csv", None))
+    with pytest.raises(ModelError, match="'z' is not a direction of the plane"):
+        excitation_for(spectrum("a.csv", "z"))
+    with pytest.raises(ModelError, match="from 5 to 4 Hz"):
+        excitation_for(spectrum("a.csv"), ReadSettings(f_end_hz=4))
+    for wrong in (
+        {"axis": "w"},
+        {"f_start_hz": 9, "f_end_hz": 8},
+        {"repair_rounding": True, "dc_gain": 1.2},
+        {"accel_per_hz": 75},
+        {"time_column": -1},
+    ):
+        with pytest.raises(ValidationError):
+            ReadSettings.model_validate(wrong)
+
+
+@pytest.mark.parametrize("text", ["", "xy", "0,0", "1.0,1.0,1.0", "1,2,3,4", "nan,1"])
+def test_no_direction(text: str) -> None:
+    with pytest.raises(ModelError, match="not a direction"):
+        direction_of(text)
+
+
+def test_date_in_name() -> None:
+    assert date_in_name("0_2024-03-09_10.11.12.csv") == date(2024, 3, 9)
+    assert date_in_name("raw_20249999_20240102.csv") == date(2024, 1, 2)
+    assert date_in_name("raw_data_x_1.csv") is None

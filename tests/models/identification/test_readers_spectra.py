@@ -1,0 +1,205 @@
+"""Spectra of every generation of Klipper, and tables of frequency responses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.errors import ModelError
+from models.identification.readers import ReadSettings, read_content, read_measurements
+from models.identification.types import FrequencyResponse, Spectrum
+
+RATE_HZ = 3193.7
+
+
+def some_spectrum() -> tuple[np.ndarray, np.ndarray]:
+    """Klipper's way of making one, by scipy: frequencies, densities of x, y, z, xyz."""
+    noise = np.random.default_rng(2).normal(0, 2000, (3, 40_000))
+    f_hz, psd = scipy.signal.welch(
+        noise, RATE_HZ, ("kaiser", 6.0), nperseg=2048, noverlap=1024, detrend="constant"
+    )
+    kept = f_hz < 200
+    return f_hz[kept], np.vstack([psd, psd.sum(axis=0)])[:, kept]
+
+
+F_HZ, PSD = some_spectrum()
+
+
+def table(header: str, psd: np.ndarray, *more: str) -> str:
+    rows = [
+        ",".join([f"{f:.1f}", *(f"{p:.3e}" for p in column), *more])
+        for f, column in zip(F_HZ, psd.T, strict=True)
+    ]
+    return header + "\n" + "\n".join(rows) + "\n"
+
+
+def read(text: str, name: str = "resonances_x_20220101_120000.csv", **known: object) -> Spectrum:
+    (one,) = read_content(text.encode(), name, settings=ReadSettings.model_validate(known))
+    assert isinstance(one, Spectrum)
+    return one
+
+
+def test_resonances() -> None:
+    spectrum = read(table("freq,psd_x,psd_y,psd_z,psd_xyz", PSD))
+    assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
+    for name, expected in zip(spectrum.psd, PSD, strict=True):
+        np.testing.assert_allclose(spectrum.psd[name], expected, rtol=6e-4)
+    assert spectrum.axis == "x"
+    assert spectrum.accel_per_hz_mm_s is None
+    assert spectrum.notes == ()
+
+
+def test_grid_is_restored_from_rounded_frequencies() -> None:
+    spectrum = read(table("freq,psd_x,psd_y,psd_z,psd_xyz", PSD))
+    assert np.abs(np.round(F_HZ, 1) - F_HZ).max() > 0.04
+    np.testing.assert_allclose(spectrum.f_hz, F_HZ, atol=0.01)
+
+
+def test_kalico_column_and_data_sets() -> None:
+    kalico = read(table("freq,psd_x,psd_y,psd_z,psd_xyz,accel_per_hz", PSD, "100.0"))
+    assert kalico.accel_per_hz_mm_s == 100.0
+    assert list(kalico.psd) == ["x", "y", "z", "xyz"]
+    sets = read(table('freq,"adxl345, hotend",bed', PSD[:2]))
+    assert list(sets.psd) == ["adxl345, hotend", "bed"]
+    np.testing.assert_allclose(sets.psd["bed"], PSD[1], rtol=6e-4)
+
+
+def low(f_hz: np.ndarray) -> np.ndarray:
+    return np.where(f_hz < 10, np.exp(1 - (10 / (f_hz + 0.1)) ** 2), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "more", "kept"),
+    [
+        ("psd_x,psd_y,psd_z,psd_xyz,shapers:,zv(59.6),mzv(55.0)", ("", "0.1", "0.2"), low),
+        ("psd_x,psd_y,psd_z,psd_xyz,zv(59.6),2hump_ei(67.2)", ("0.1", "0.2"), low),
+        ("psd_x,psd_y,psd_z,psd_xyz,mzv", ("0.1",), low),
+        (
+            "psd_x,psd_y,psd_z,psd_xyz,accel_per_hz,mzv(55.0/80.1),smooth_ei(50.0)",
+            ("60.0", "0.1", "0.2"),
+            lambda f: np.tanh(0.1 * f),
+        ),
+        ("psd_x,psd_y,psd_z,psd_xyz,zv(59.6)", ("0.1",), lambda f: 1.0 * (f >= 5)),
+    ],
+)
+def test_normalisation_is_undone(header: str, more: tuple[str, ...], kept: object) -> None:
+    assert callable(kept)
+    written = PSD * kept(F_HZ) / (F_HZ + 0.1)
+    spectrum = read(table("freq," + header, written, *more), "calibration_data_y_1.csv")
+    assert spectrum.axis == "y"
+    at = spectrum.f_hz > 5.2
+    assert at.sum() > 110
+    reference = np.interp(spectrum.f_hz, F_HZ, PSD[0])
+    np.testing.assert_allclose(spectrum.psd["x"][at], reference[at], rtol=3e-3)
+    assert all((psd >= 0).all() and psd[0] > 0 for psd in spectrum.psd.values())
+    assert spectrum.notes == ("Klipper's normalisation by frequency is undone",)
+
+
+def test_data_sets_with_shapers() -> None:
+    written = PSD[:2] * low(F_HZ) / (F_HZ + 0.1)
+    spectrum = read(table("freq,a,b,shapers:,mzv(40.2)", written, "", "0.3"))
+    assert list(spectrum.psd) == ["a", "b"]
+    np.testing.assert_allclose(spectrum.psd["b"][-50:], PSD[1, -50:], rtol=3e-3)
+
+
+def test_spectrum_faults() -> None:
+    header = "freq,psd_x,psd_y,psd_z,psd_xyz"
+    dead = PSD.copy()
+    dead[0] = 0
+    with pytest.raises(ModelError, match="sensor's x is dead"):
+        read(table(header, dead))
+    assert read(table(header, dead), sensor_axis="z").notes == ("the sensor's x = 0 is constant",)
+    with pytest.raises(ModelError, match="every column"):
+        read(table(header, 0 * PSD))
+    negative = PSD.copy()
+    negative[2, 7] = -4
+    with pytest.raises(ModelError, match="line 9: psd_z is negative"):
+        read(table(header, negative))
+    with pytest.raises(ModelError, match="after freq there must be"):
+        read(table("freq,mzv(40)", PSD[:1]))
+    with pytest.raises(ModelError, match="frequencies, at least"):
+        read("\n".join(table(header, PSD).split("\n")[:9]) + "\n")
+    with pytest.raises(ModelError, match="does not rise"):
+        read(table(header, PSD).replace("\n6.2,", "\n2.2,"))
+    text = table(header + ",accel_per_hz", PSD, "60.0")
+    with pytest.raises(ModelError, match="the same in every line"):
+        read(text[: text.rindex("60.0")] + "75.0\n")
+
+
+@pytest.mark.shared
+def test_every_measured_table_is_read(shared_dir: Path) -> None:
+    files = sorted((shared_dir / "measurements").rglob("*.csv"))
+    assert len(files) == 45
+    for path in files:
+        (spectrum,) = read_measurements(path)
+        assert isinstance(spectrum, Spectrum)
+        assert list(spectrum.psd) == ["x", "y", "z", "xyz"]
+        assert spectrum.axis == path.name.split("_")[1]
+        written = np.loadtxt(path, delimiter=",", skiprows=1)
+        np.testing.assert_allclose(spectrum.f_hz, written[:, 0], atol=0.0501)
+        np.testing.assert_array_equal(spectrum.psd["xyz"], written[:, 4])
+        # The bins of 2048 samples at 3200 Hz, whatever the sensor's clock says.
+        np.testing.assert_allclose(np.diff(spectrum.f_hz), 3200 / 2048, rtol=0.05)
+        assert np.ptp(np.diff(spectrum.f_hz)) < 1e-9
+
+
+POINTS = st.lists(
+    st.tuples(st.floats(1e-3, 1e3), st.floats(-360_000, 360_000)), min_size=8, max_size=30
+)
+
+
+@given(POINTS, st.sampled_from(["abs", "dB", "unit", "re", "rad"]))
+def test_response_is_read_as_written(points: list[tuple[float, float]], form: str) -> None:
+    f_hz = 1.0 + np.arange(len(points))
+    mag, phase_deg = np.array(points).T
+    expected = mag * np.exp(1j * np.deg2rad(phase_deg))
+    header, first, second = {
+        "abs": ("mag,phase_deg", mag, phase_deg),
+        "dB": ("mag_dB,phase_deg", 20 * np.log10(mag), phase_deg),
+        "unit": ("mag,phase_deg", 20 * np.log10(mag), phase_deg),
+        "re": ("real,imag", expected.real, expected.imag),
+        "rad": ("magnitude,phase_rad", mag, np.deg2rad(phase_deg)),
+    }[form]
+    columns = zip(f_hz.tolist(), first.tolist(), second.tolist(), strict=True)
+    text = f"freq_hz,{header}\n" + "".join(f"{f!r},{a!r},{b!r}\n" for f, a, b in columns)
+    settings = ReadSettings(magnitude_unit="dB") if form == "unit" else None
+    (one,) = read_content(text.encode(), "frf_y.csv", settings=settings)
+    assert isinstance(one, FrequencyResponse)
+    np.testing.assert_array_equal(one.f_hz, f_hz)
+    np.testing.assert_allclose(one.response, expected, rtol=1e-10)
+    assert np.isnan(one.coherence).all()
+    assert np.isnan(one.sd).all()
+    assert one.axis == "y"
+
+
+def test_responses_by_amplitude() -> None:
+    lines = ["freq_hz,mag,phase_deg,coherence,amplitude"]
+    for amplitude in ("40", "75"):
+        lines += [f"{f},{float(amplitude) / f},{-f},0.98,{amplitude}" for f in range(5, 25)]
+    both = read_content("\n".join(lines).encode(), "frf_x.csv")
+    assert [m.label for m in both if isinstance(m, FrequencyResponse)] == ["40", "75"]
+    for one in both:
+        assert isinstance(one, FrequencyResponse)
+        np.testing.assert_allclose(np.abs(one.response), float(one.label) / np.arange(5, 25))
+        np.testing.assert_allclose(one.coherence, 0.98)
+
+
+def test_response_faults() -> None:
+    def text(header: str, row: str) -> bytes:
+        return (header + "\n" + "".join(f"{f},{row}\n" for f in range(5, 25))).encode()
+
+    with pytest.raises(ModelError, match=r"line 2: mag is negative .*dB"):
+        read_content(text("freq_hz,mag,phase_deg", "-3,1"), "f.csv")
+    with pytest.raises(ModelError, match="column 'phase_deg' is missing"):
+        read_content(text("freq_hz,mag,coherence", "3,1"), "f.csv")
+    with pytest.raises(ModelError, match=r"coherence 1\.2 is not between"):
+        read_content(text("freq_hz,mag,phase_deg,coherence", "3,1,1.2"), "f.csv")
+    with pytest.raises(ModelError, match="column 'imag' is missing"):
+        read_content(text("freq_hz,real", "3"), "f.csv")
+    with pytest.raises(ModelError, match="dB is beyond"):
+        read_content(text("freq_hz,mag_db,phase_deg", "900,1"), "f.csv")
