@@ -130,7 +130,7 @@ class Diagram:
         if not columns:
             return 0.0
         radius = float(np.abs(np.linalg.eigvals(np.array(columns).T)).max())
-        return radius ** (1.0 / self.period)
+        return float(radius ** (1.0 / self.period))
 
     def response(self, f_hz: ArrayLike, dt_s: float, source: str, target: str) -> Complex:
         """Return the frequency response from an outer signal to any signal.

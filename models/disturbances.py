@@ -145,7 +145,7 @@ def sample(
     ModelError
         If a frequency is not below half the sampling rate, or the generator is missing.
     """
-    t = np.arange(samples) * dt_s
+    t: Array = np.arange(samples, dtype=np.float64) * dt_s
     if isinstance(spec, Narrowband):
         return _tones(spec.tones, t, dt_s)
     if isinstance(spec, Switched):

@@ -141,6 +141,13 @@ class Loop:
         return _tuple(np.convolve(self.plant_num, self.controller[1]))
 
     @property
+    def tracking_num(self) -> Coefficients:
+        """Numerator of y/r, over `t0_den`."""
+        if not self.fed_back:
+            return self.servo_num
+        return _tuple(np.convolve(np.convolve(self.plant_num, self.rate_den), self.error_num))
+
+    @property
     def plant_radius(self) -> float:
         """Largest pole modulus of P; 1 for an integrator."""
         return _radius(self.plant_den)
@@ -169,8 +176,7 @@ class Loop:
 
     def tracking(self, f_hz: ArrayLike) -> Complex:
         """Return y/r at `f_hz`."""
-        error = polynomial_response(self.error_num, self.error_den, self.z(f_hz))
-        return self.servo(f_hz) * (error if self.fed_back else 1.0)
+        return polynomial_response(self.tracking_num, self.t0_den, self.z(f_hz))
 
     def varied(self, gain: float = 1.0, delay_samples: float = 0.0) -> Loop:
         """Return the loop with another plant gain and more delay, its controller unchanged.

@@ -1,0 +1,295 @@
+"""Tones faster than the sensor can see: model-based multirate predictor (MMP) and observer.
+
+Paper 001 (Xiao, Jiang, Chen, Mechatronics 2019). A sensor gives every L-th sample; between them
+d[nL + k] = sum_j w_kj dL[n - j] - sum_j b_j d[(n - j)L + k], exact for the tones it is made for.
+The printed system (22)-(24) has 2mL unknowns; only its 2m equations at the tones matter:
+W_k(e^-jth_i) = e^(jw_i k) B(e^-jth_i), w_i = 2 pi f_i Ts, th_i = L w_i.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from compensation.base import DesignError
+from compensation.feedback.controller import (
+    CoefficientSet,
+    Controller,
+    Prediction,
+    Refusal,
+    Uncertainty,
+    frequency_grid,
+    judged,
+)
+from compensation.feedback.fmsdob import Shape, design_q, model_blocks
+from models.diagrams import Block, polynomial_response
+from models.disturbances import SensorSpec
+from models.loops import Loop
+
+__all__ = ["Predictor", "mmp", "predictor", "predictor_of_gain", "singular_distance_hz"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+DEFAULT_NOISE_GAIN = 2.0
+_ALPHAS = (0.5, 0.7, 0.8, 0.85, 0.9, 0.93, 0.95, 0.97, 0.98, 0.99)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predictor:
+    """From slow samples to fast ones.
+
+    Attributes
+    ----------
+    f_hz : tuple of float
+        The tones it is exact for.
+    ratio : int
+        L, fast samples per slow one.
+    dt_s : float
+        Between fast samples.
+    alpha : float
+        Radius of its poles, per slow sample: 0 forgets at once, near 1 averages noise away.
+    b : tuple of float
+        1, b_1 .. b_2m.
+    w : ndarray, shape (L, 2m)
+        Row k gives the sample k after the newest slow one.
+    late : int
+        Age of the newest slow sample, in slow samples. When 0, row 0 is not used: that sample
+        is known.
+    """
+
+    f_hz: tuple[float, ...]
+    ratio: int
+    dt_s: float
+    alpha: float
+    b: tuple[float, ...]
+    w: Array
+    late: int = 0
+
+    @property
+    def runs(self) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+        """Numerator and denominator, per slow sample, of each of the L interleaved filters."""
+        rows = tuple((tuple(row.tolist()), self.b) for row in self.w)
+        return rows if self.late else (((1.0,), (1.0,)), *rows[1:])
+
+    @property
+    def noise_gain(self) -> float:
+        """Largest rms of a predicted sample per rms of white noise on the slow ones."""
+        z = np.exp(1j * np.linspace(0, np.pi, 4097))
+        predicting = self.runs if self.late else self.runs[1:]
+        power = [np.mean(np.abs(polynomial_response(*run, z)) ** 2) for run in predicting]
+        return float(np.sqrt(max(power)))
+
+    @property
+    def settling_s(self) -> float:
+        """Time in which its start decays to 1 %."""
+        runs = len(self.b) if self.alpha == 0 else math.log(0.01) / math.log(self.alpha)
+        return runs * self.ratio * self.dt_s
+
+    def response(self, f_hz: ArrayLike) -> Complex:
+        """Return the part of the output at f of a tone at f; 1 at the tones (no aliases)."""
+        w = 2 * np.pi * np.atleast_1d(np.asarray(f_hz, float)) * self.dt_s
+        slow = np.exp(1j * w * self.ratio)
+        parts = [
+            np.exp(-1j * w * (k + self.late * self.ratio)) * polynomial_response(*run, slow)
+            for k, run in enumerate(self.runs)
+        ]
+        return np.asarray(np.mean(parts, axis=0), complex)
+
+    def blocks(self, source: str, target: str) -> tuple[Block, ...]:
+        """Return the predictor as blocks; `source` holds its value between slow samples."""
+        return tuple(
+            Block(target, ((source, 1.0),), *run, every=self.ratio, phase=k)
+            for k, run in enumerate(self.runs)
+        )
+
+
+def predictor(
+    f_hz: Sequence[float], ratio: int, dt_s: float, alpha: float = 0.95, late: int = 0
+) -> Predictor:
+    """Return the predictor of given tones.
+
+    Parameters
+    ----------
+    ratio : int
+        L, at least 2.
+    dt_s : float
+        Between fast samples.
+    alpha : float
+        In [0, 1).
+    late : int
+        Age of the newest slow sample when it arrives, in slow samples.
+
+    Raises
+    ------
+    DesignError
+        If a parameter is out of range.
+    Refusal
+        If two tones, or a tone and its mirror image, look the same to the sensor.
+    """
+    if ratio < 2 or not 0 <= alpha < 1 or late < 0:
+        raise DesignError(
+            f"predictor with L = {ratio}, alpha = {alpha:g}, {late} samples late: L must be at "
+            "least 2, alpha in [0, 1), the age not negative"
+        )
+    w = 2 * np.pi * np.asarray(f_hz, float) * dt_s
+    if len(w) == 0 or np.any(w <= 0) or np.any(w >= np.pi):
+        raise DesignError(f"tones {list(f_hz)} Hz: each must lie between 0 and {0.5 / dt_s:g} Hz")
+    distance = singular_distance_hz(f_hz, ratio * dt_s)
+    if distance * ratio * dt_s < 1e-9:
+        raise Refusal(
+            "singular",
+            f"tones {', '.join(f'{f:g}' for f in f_hz)} Hz cannot be told apart with a sensor at "
+            f"{1 / (ratio * dt_s):g} Hz (singular set, paper 001 (14)); change its rate",
+        )
+    b = np.ones(1)
+    for turn in w * ratio:
+        b = np.convolve(b, [1.0, -2 * alpha * math.cos(turn), alpha**2])
+    powers = np.arange(2 * len(w))
+    at = np.exp(-1j * np.outer(w * ratio, powers))
+    b_at = np.polyval(b[::-1], np.exp(-1j * w * ratio))
+    ahead = np.exp(1j * np.outer(w, np.arange(ratio) + late * ratio)) * b_at[:, None]
+    rows = np.linalg.solve(
+        np.concatenate([at.real, at.imag]), np.concatenate([ahead.real, ahead.imag])
+    ).T
+    tones = tuple(float(f) for f in f_hz)
+    return Predictor(tones, ratio, dt_s, alpha, tuple(b.tolist()), rows, late)
+
+
+def predictor_of_gain(
+    f_hz: Sequence[float],
+    ratio: int,
+    dt_s: float,
+    noise_gain: float = DEFAULT_NOISE_GAIN,
+    late: int = 0,
+) -> Predictor:
+    """Return the fastest predictor whose noise gain is at most `noise_gain`.
+
+    Raises
+    ------
+    Refusal
+        If even a slow one has more: the tones are too near the singular set.
+    """
+    for alpha in _ALPHAS:
+        made = predictor(f_hz, ratio, dt_s, alpha, late)
+        if made.noise_gain <= noise_gain:
+            return made
+    raise Refusal(
+        "singular",
+        f"tones {', '.join(f'{f:g}' for f in f_hz)} Hz with a sensor at {1 / (ratio * dt_s):g} Hz: "
+        f"noise gain {made.noise_gain:.3g} even at alpha = {made.alpha:g} (at most "
+        f"{noise_gain:g}); they lie {singular_distance_hz(f_hz, ratio * dt_s):.3g} Hz from tones "
+        "that look alike, change the sensor's rate",
+    )
+
+
+def singular_distance_hz(f_hz: Sequence[float], slow_dt_s: float) -> float:
+    """Return how far a set of tones is from the singular set of a sensor, paper 001 (14).
+
+    The least distance of any f_i to a multiple of half the sensor's rate, or of any f_i +- f_j to
+    a multiple of its rate.
+    """
+    rate = 1.0 / slow_dt_s
+    tones = [float(f) for f in f_hz]
+    found = [abs(f - round(2 * f / rate) * rate / 2) for f in tones]
+    for i, first in enumerate(tones):
+        for second in tones[:i]:
+            found += [
+                abs(both - round(both / rate) * rate) for both in (first + second, first - second)
+            ]
+    return min(found)
+
+
+def mmp(
+    loops: Sequence[Loop],
+    targets_hz: Sequence[float],
+    sensor: SensorSpec,
+    *,
+    alpha: float | None = 0.95,
+    bandwidth_hz: float = 10.0,
+    shape: Shape = "pointwise",
+    noise_gain: float = DEFAULT_NOISE_GAIN,
+    uncertainty: Uncertainty | None = None,
+) -> Controller:
+    """Design predictor and forward-model observer for tones seen by a slow sensor.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        The nominal loop, then the members of its plant set.
+    sensor : SensorSpec
+        Its rate (`every` is L) and age.
+    alpha : float or None
+        Of the predictor; None takes the fastest that keeps `noise_gain`.
+    noise_gain : float
+        Largest noise gain of the predictor that is accepted.
+
+    Raises
+    ------
+    DesignError
+        If a parameter is out of range.
+    Refusal
+        Singular tones, too much noise gain, an unstable member, or small gain violated.
+    """
+    nominal = loops[0]
+    made = (
+        predictor_of_gain(targets_hz, sensor.every, nominal.dt_s, noise_gain, sensor.delay_samples)
+        if alpha is None
+        else predictor(targets_hz, sensor.every, nominal.dt_s, alpha, sensor.delay_samples)
+    )
+    if made.noise_gain > noise_gain:
+        raise Refusal(
+            "singular",
+            f"mmp on {nominal.name!r}: the predictor multiplies sensor noise by "
+            f"{made.noise_gain:.3g} (at most {noise_gain:g}); the tones lie "
+            f"{singular_distance_hz(targets_hz, sensor.every * nominal.dt_s):.3g} Hz from tones "
+            "that look alike. Raise alpha, or change the sensor's rate",
+        )
+    q = design_q(nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz)
+    f = frequency_grid(nominal.dt_s, targets_hz, (bandwidth_hz,) * len(targets_hz))
+    through = nominal.servo(f) * q.response(2 * np.pi * f * nominal.dt_s) * made.response(f)
+    return judged(
+        "mmp",
+        loops,
+        (*_compared(nominal, sensor), *made.blocks("dslow", "dhat"), *q.blocks("dhat", "c")),
+        Prediction(f, nominal.s0(f), 1.0 - through),
+        (
+            CoefficientSet(
+                "predictor",
+                "predictor",
+                {"ratio": made.ratio, "b": made.b, "w": tuple(tuple(r) for r in made.w.tolist())},
+            ),
+            *q.coefficients(),
+            CoefficientSet("model", "iir", {"num": nominal.servo_num, "den": nominal.t0_den}),
+        ),
+        uncertainty=uncertainty,
+        noise_gain=made.noise_gain,
+        sensor=sensor,
+        settings={
+            "targets_hz": [float(t) for t in targets_hz],
+            "ratio": sensor.every,
+            "alpha": made.alpha,
+            "bandwidth_hz": bandwidth_hz,
+            "shape": shape,
+        },
+        notes=(
+            "noise gain: of the predictor, per slow sample",
+            "sensitivity: the part at the disturbance's own frequency; aliases of other "
+            "frequencies are left out",
+            f"the tones lie {singular_distance_hz(targets_hz, sensor.every * nominal.dt_s):.4g} Hz "
+            "from the singular set",
+        ),
+    )
+
+
+def _compared(loop: Loop, sensor: SensorSpec) -> tuple[Block, ...]:
+    """Return blocks that give the disturbance at the sensor's samples, from model and sensor."""
+    late, every = sensor.delay_samples, sensor.every
+    return (
+        *model_blocks(loop),
+        Block("seen", (("model", 1.0),), delay=late, every=every),
+        Block("dslow", (("ym", 1.0), ("seen", -1.0)), every=every),
+    )
