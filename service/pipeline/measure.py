@@ -197,6 +197,7 @@ class Measurement:
                     name=label,
                     seconds=round(STRIDE * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
+                    contour_max_um={n: 1e3 * t[key].max for n, t in tallies.items() if key in t},
                 )
             )
         return out

@@ -42,11 +42,12 @@ class Channel(_Figures):
 
 
 class GroupFigures(_Figures):
-    """Contour error while extruding, for one layer or feature: rms by channel name."""
+    """Contour error while extruding, for one layer or feature, by channel name."""
 
     name: str
     seconds: float
     contour_rms_um: dict[str, float]
+    contour_max_um: dict[str, float] = {}
 
 
 class PutBack(_Figures):
