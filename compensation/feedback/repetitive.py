@@ -1,0 +1,387 @@
+"""Plug-in repetitive control at the rate of the loop, whole or fractional periods (paper 004).
+
+    C_all = (C + P^-1 L) / (1 - L),   L = (1 - a^N) z^-N / (1 - a^N z^-N) * prod q_j(1/z) q_j(z)
+
+With the servo V = P / (1 + PC), for which 1/V = 1/P + C, that is C plus an add-on
+
+    R = L / (1 - L) * 1/V      on the control error,
+
+and neither P, which has an integrator, nor 1/P has to be computed. With the exact inverse
+S = S0 (1 - L); with E = V times its approximate inverse, S = S0 (1 - L) / (1 + L (E - 1)).
+
+The period need not divide the sampling rate: ``wide-band`` rounds N and widens the notches by a,
+``quasi`` takes the greatest common divisor for the fundamental; `compensation.feedback.multirate`
+takes the least common multiple for the rate.
+
+The inverse: zeros of V up to radius 0.97 are cancelled; those near the circle are cancelled as if
+they lay at 0.97 (an exact inverse rings there: paper 004's own fast plant has two at |z| = 1), and
+those outside are expanded into the future, which the period's delay has room for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from compensation.feedback.controller import (
+    CoefficientSet,
+    Controller,
+    Extreme,
+    Prediction,
+    Refusal,
+    Uncertainty,
+    frequency_grid,
+    judged,
+)
+from models.diagrams import Block, polynomial_response
+from models.loops import Loop
+
+__all__ = [
+    "InternalModel",
+    "ServoInverse",
+    "design_quasi",
+    "design_wide_band",
+    "exact_frequency",
+    "instant_margin",
+    "internal_model",
+    "invert_servo",
+    "periodic_residual",
+    "plug_in_factor",
+    "repetitive_blocks",
+    "repetitive_coefficients",
+]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_RADIUS = 0.97
+_SERIES_LEFT = 1e-3
+_LARGEST_PERIOD = 4000
+
+
+@dataclass(frozen=True, slots=True)
+class InternalModel:
+    """L, what a repetitive controller remembers of a period.
+
+    Attributes
+    ----------
+    period : int
+        N, samples.
+    alpha : float
+        a in 0..1: smaller is wider.
+    nyquist_pairs : int
+        n0: the low-pass is cos(w/2)^(2 n0).
+    notches : tuple of float
+        Further zero-phase pairs, rad per sample: ((cos w - cos W) / (1 - cos W))^2.
+    """
+
+    period: int
+    alpha: float
+    nyquist_pairs: int = 3
+    notches: tuple[float, ...] = ()
+
+    @property
+    def taps(self) -> Array:
+        """The zero-phase low-pass, symmetric, sum 1."""
+        taps = np.ones(1)
+        for _ in range(self.nyquist_pairs):
+            taps = np.convolve(taps, [0.25, 0.5, 0.25])
+        for notch in self.notches:
+            pair = np.array([0.5, -math.cos(notch), 0.5]) / (1 - math.cos(notch))
+            taps = np.convolve(taps, np.convolve(pair, pair))
+        return np.asarray(taps)
+
+    @property
+    def lead(self) -> int:
+        """Samples by which the low-pass looks ahead."""
+        return len(self.taps) // 2
+
+    def lowpass(self, angle: ArrayLike) -> Array:
+        """Return the low-pass at `angle` rad per sample; real."""
+        w = np.asarray(angle, float)
+        value = np.cos(w / 2) ** (2 * self.nyquist_pairs)
+        for notch in self.notches:
+            value = value * ((np.cos(w) - math.cos(notch)) / (1 - math.cos(notch))) ** 2
+        return np.asarray(value)
+
+    def response(self, angle: ArrayLike) -> Complex:
+        """Return L at `angle` rad per sample."""
+        w = np.asarray(angle, float)
+        past, share = np.exp(-1j * w * self.period), self.alpha**self.period
+        return np.asarray((1 - share) * past / (1 - share * past) * self.lowpass(w))
+
+    def generator(self) -> tuple[Array, Array]:
+        """Return numerator and denominator of z^(N - lead) L / (1 - L), powers of z^-1."""
+        share = self.alpha**self.period
+        den = np.zeros(self.period + self.lead + 1)
+        den[0] = 1.0
+        den[self.period] -= share
+        den[self.period - self.lead :] -= (1 - share) * self.taps
+        return (1 - share) * self.taps, den
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ServoInverse:
+    """z^-preview / V, causal and stable.
+
+    Attributes
+    ----------
+    num, den : tuple of float
+        Powers of z^-1.
+    preview : int
+        Samples that have to be given away elsewhere.
+    notes : tuple of str
+    """
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    preview: int
+    notes: tuple[str, ...] = ()
+
+    def response(self, angle: ArrayLike) -> Complex:
+        """Return the approximate 1/V itself at `angle` rad per sample."""
+        z = np.exp(1j * np.asarray(angle, float))
+        return np.asarray(polynomial_response(self.num, self.den, z) * z**self.preview)
+
+
+def design_wide_band(
+    loops: Sequence[Loop],
+    fundamental_hz: float,
+    *,
+    alpha: float = 0.8,
+    nyquist_pairs: int = 3,
+    notches_hz: Sequence[float] = (),
+    uncertainty: Uncertainty | None = None,
+) -> Controller:
+    """Round the period to whole samples and widen the notches.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+        The nominal loop and what it may turn into.
+    fundamental_hz : float
+    alpha : float
+    nyquist_pairs : int
+    notches_hz : sequence of float
+        Frequencies where the add-on shall do nothing.
+    uncertainty
+        See `compensation.feedback.controller.judged`.
+
+    Raises
+    ------
+    Refusal
+        If the period is too short for the inverse, or the loop would not be stable.
+    """
+    period = round(1.0 / (loops[0].dt_s * fundamental_hz)) if fundamental_hz > 0 else 0
+    model = internal_model(loops[0].dt_s, period, alpha, nyquist_pairs, notches_hz)
+    asked = {"fundamental_hz": fundamental_hz, "alpha": alpha, "nyquist_pairs": nyquist_pairs,
+             "notches_hz": tuple(notches_hz)}  # fmt: skip
+    return _designed("rc-wide", loops, model, fundamental_hz, asked, uncertainty)
+
+
+def design_quasi(
+    loops: Sequence[Loop],
+    fundamental_hz: float,
+    *,
+    alpha: float = 0.999,
+    nyquist_pairs: int = 3,
+    notches_hz: Sequence[float] = (),
+    uncertainty: Uncertainty | None = None,
+) -> Controller:
+    """Repeat the greatest common divisor of fundamental and sampling rate.
+
+    Parameters and errors as `design_wide_band`; a divisor far below the fundamental makes a long
+    memory of which most notches lie where nothing is to be rejected (a note says how many).
+    """
+    rate = exact_frequency(1.0 / loops[0].dt_s)
+    wanted = exact_frequency(fundamental_hz)
+    divisor = Fraction(
+        math.gcd(rate.numerator * wanted.denominator, wanted.numerator * rate.denominator),
+        rate.denominator * wanted.denominator,
+    )
+    model = internal_model(loops[0].dt_s, int(rate / divisor), alpha, nyquist_pairs, notches_hz)
+    asked = {"fundamental_hz": fundamental_hz, "divisor_hz": float(divisor), "alpha": alpha,
+             "nyquist_pairs": nyquist_pairs, "notches_hz": tuple(notches_hz)}  # fmt: skip
+    note = f"one notch of {wanted / divisor} lies on the disturbance"
+    return _designed("rc-quasi", loops, model, fundamental_hz, asked, uncertainty, (note,))
+
+
+def exact_frequency(f_hz: float) -> Fraction:
+    """Return a frequency as a fraction, exact to 1 mHz.
+
+    Raises
+    ------
+    Refusal
+        If it is not positive.
+    """
+    if not (math.isfinite(f_hz) and f_hz > 0):
+        raise Refusal("singular", f"frequency {f_hz} Hz must be positive")
+    return Fraction(round(f_hz * 1000), 1000)
+
+
+def invert_servo(
+    num: Sequence[float], den: Sequence[float], radius: float = _RADIUS
+) -> ServoInverse:
+    """Return a causal, stable inverse of V = num/den up to a preview.
+
+    Parameters
+    ----------
+    num, den : sequence of float
+        Powers of z^-1.
+    radius : float
+        Largest pole of the inverse.
+    """
+    top = np.trim_zeros(np.asarray(num, float), "b")
+    delay = int(np.flatnonzero(top)[0])
+    zeros = np.roots(top[delay:])
+    size = np.abs(zeros)
+    near = (size > radius) & (size <= 1 / radius)
+    far = zeros[size > 1 / radius]
+    pulled = np.where(near, radius * zeros / np.where(size == 0, 1, size), zeros)[
+        size <= 1 / radius
+    ]
+    # The steady gain counts; moving a pole would change it.
+    bottom = np.real(np.poly(pulled)) if len(pulled) else np.ones(1)
+    left = float(top.sum() / bottom.sum())
+    series, preview = np.ones(1), delay
+    for zero in far:
+        # 1 / (1 - a/z) = -(z/a) (1 + z/a + (z/a)^2 + ...), |a| > 1: the future.
+        terms = max(1, math.ceil(-math.log(_SERIES_LEFT) / math.log(abs(zero))))
+        part = -((1 / zero) ** np.arange(terms, 0, -1))
+        series = np.convolve(series, part)
+        preview += terms
+    series = np.real(series)
+    numerator = np.convolve(np.asarray(den, float), series / series.sum()) / left
+    notes = [f"zero at |z| = {s:.4f} inverted as if at {radius:g}" for s in size[near][::2]]
+    notes += [f"zero at |z| = {abs(zero):.4g} inverted into the future" for zero in far]
+    return ServoInverse(tuple(numerator.tolist()), tuple(bottom.tolist()), preview, tuple(notes))
+
+
+def internal_model(
+    dt_s: float, period: int, alpha: float, pairs: int, notches_hz: Sequence[float]
+) -> InternalModel:
+    """Return L with everything checked; frequencies at the rate 1 / `dt_s`.
+
+    Raises
+    ------
+    Refusal
+        Naming what is out of range.
+    """
+    if not 0 < alpha < 1:
+        raise Refusal("singular", f"alpha {alpha} must lie between 0 and 1")
+    if not 0 <= pairs <= 20:
+        raise Refusal("singular", f"{pairs} zero pairs at Nyquist; 0 to 20 are possible")
+    angles = tuple(2 * math.pi * f * dt_s for f in notches_hz)
+    if any(not 0 < angle <= math.pi for angle in angles):
+        raise Refusal(
+            "singular", f"notches {tuple(notches_hz)} Hz must lie below {0.5 / dt_s:g} Hz"
+        )
+    if not 2 <= period <= _LARGEST_PERIOD:
+        raise Refusal(
+            "singular",
+            f"a period of {period} samples (2 to {_LARGEST_PERIOD} are possible): round the "
+            "fundamental, or use the wide-band design",
+        )
+    return InternalModel(period, alpha, pairs, angles)
+
+
+def plug_in_factor(internal: Complex, match: Complex | float = 1.0) -> Complex:
+    """Return S/S0 = (1 - L) / (1 + L (E - 1)), E = V times the inverse in use; 1 if exact."""
+    return np.asarray((1 - internal) / (1 + internal * (match - 1)))
+
+
+def repetitive_blocks(
+    model: InternalModel, inverse: ServoInverse, source: tuple[tuple[str, float], ...], target: str
+) -> tuple[Block, Block]:
+    """Return R = L / (1 - L) / V as two blocks from `source` to `target`.
+
+    Raises
+    ------
+    Refusal
+        If the period is shorter than what low-pass and inverse look ahead.
+    """
+    num, den = model.generator()
+    spare = model.period - model.lead - inverse.preview
+    if spare < 0:
+        raise Refusal(
+            "inverse",
+            f"a period of {model.period} samples is shorter than the {model.lead} samples of the "
+            f"low-pass and the {inverse.preview} of the inverse; fewer zero pairs, or multirate",
+        )
+    generator = Block("rc", source, tuple(num.tolist()), tuple(den.tolist()), delay=spare)
+    return generator, Block(target, (("rc", 1.0),), inverse.num, inverse.den)
+
+
+def instant_margin(loop: Loop, model: InternalModel, harmonics_hz: Sequence[float]) -> Extreme:
+    """Return min 1/|T| in closed form: around a narrow notch T runs through a circle.
+
+    Its diameter is from T0 to T0 + S0 q, q the low-pass there; so the largest |T| of a notch is
+    |T0 + S0 q / 2| + |S0 q / 2|. Exact for a -> 1, without the inverse's error.
+    """
+    f = np.asarray(harmonics_hz, float)
+    half = 0.5 * loop.s0(f) * model.lowpass(2 * np.pi * f * loop.dt_s)
+    allowed = 1.0 / (np.abs(loop.t0(f) + half) + np.abs(half))
+    worst = int(np.argmin(allowed))
+    return Extreme(float(allowed[worst]), float(f[worst]))
+
+
+def periodic_residual(servo: Complex, factor: Complex, amplitudes: Sequence[float]) -> float:
+    """Return the rms of y under sin waves at the plant's input, at the same frequencies."""
+    lines = np.abs(servo * factor) * np.asarray(amplitudes, float)
+    return math.sqrt(float(np.sum(lines**2)) / 2)
+
+
+def repetitive_coefficients(
+    model: InternalModel, inverse: ServoInverse
+) -> tuple[CoefficientSet, ...]:
+    """Return what a controller loads: the memory of a period, and the inverse behind it."""
+    return (
+        CoefficientSet(
+            "memory",
+            "repetitive",
+            {
+                "period": model.period,
+                "share": float(model.alpha**model.period),
+                "lead": model.lead,
+                "taps": tuple(model.taps.tolist()),
+            },
+        ),
+        CoefficientSet(
+            "inverse", "iir", {"num": inverse.num, "den": inverse.den, "preview": inverse.preview}
+        ),
+    )
+
+
+def _designed(
+    method: str,
+    loops: Sequence[Loop],
+    model: InternalModel,
+    fundamental_hz: float,
+    asked: dict[str, object],
+    uncertainty: Uncertainty | None,
+    notes: tuple[str, ...] = (),
+) -> Controller:
+    nominal = loops[0]
+    inverse = invert_servo(nominal.servo_num, nominal.t0_den)
+    blocks = repetitive_blocks(model, inverse, (("ym", 1.0), ("r", -1.0)), "c")
+    targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)[:64]
+    widths = np.full(len(targets), max(0.05 * fundamental_hz, 1.0))
+    f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
+    angle = 2 * np.pi * f * nominal.dt_s
+    match = nominal.servo(f) * inverse.response(angle)
+    factor = plug_in_factor(model.response(angle), match)
+    return judged(
+        method,
+        loops,
+        blocks,
+        Prediction(f, nominal.s0(f), factor),
+        repetitive_coefficients(model, inverse),
+        uncertainty=uncertainty,
+        settings=asked | {"period": model.period},
+        notes=(*inverse.notes, *notes),
+    )

@@ -1,0 +1,172 @@
+"""Command prefilters for closed loops: ZPETC and the zero-phase FIR (paper 002, section IV).
+
+    r = A(1/z) B-(z) / (z^-m B+(1/z) B-(1)^2) y_d,    y / r = z^-m B+ B- / A
+
+The inverse is `compensation.inversion`'s, of the loop's answer to its reference; here it gets a
+low-pass, its delays and a form to load. Its gain grows to tens of dB: without the low-pass the
+quantum of a reference alone saturates a drive, so the FIR is on unless it is switched off, and
+its cutoff follows from the acceleration that is allowed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import DesignError
+from compensation.feedback.controller import CoefficientSet, Extreme
+from compensation.inversion import Inversion, invert
+from compensation.inverting import zero_phase_fir
+from models.loops import Loop
+from models.plants import DiscretePlant, balanced_discrete
+
+__all__ = ["Prefilter", "design_prefilter", "fir_within", "reference_plant"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_LADDER_STEP = 0.85
+_PREVIEW = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prefilter:
+    """From the desired position to the reference of a loop.
+
+    Attributes
+    ----------
+    inversion : Inversion
+    fir : ndarray, shape (2 l + 1,), or None
+    dt_s : float
+    """
+
+    inversion: Inversion
+    fir: Array | None
+    dt_s: float
+
+    @property
+    def preview(self) -> int:
+        """Samples of the desired position that must be known beforehand."""
+        return self.inversion.preview + (0 if self.fir is None else len(self.fir) // 2)
+
+    def apply(self, y_d: Array) -> Array:
+        """Return the reference for a desired position, shape (n,), known from end to end."""
+        return self.inversion.apply(y_d, self.fir)
+
+    def response(self, f_hz: Array) -> Complex:
+        """Return r / y_d at `f_hz`."""
+        value = self.inversion.response(f_hz, self.dt_s)
+        if self.fir is not None:
+            angle = 2 * np.pi * np.asarray(f_hz, float) * self.dt_s
+            half = len(self.fir) // 2
+            cosines = np.cos(np.outer(angle, np.arange(1, half + 1)))
+            value = value * (self.fir[half] + 2 * cosines @ self.fir[half + 1 :])
+        return np.asarray(value)
+
+    @property
+    def peak(self) -> Extreme:
+        """Largest gain and where it lies."""
+        f_hz = np.linspace(0, 0.5 / self.dt_s, 8193)
+        gain = np.abs(self.response(f_hz))
+        at = int(np.argmax(gain))
+        return Extreme(float(gain[at]), float(f_hz[at]))
+
+    @property
+    def coefficients(self) -> tuple[CoefficientSet, ...]:
+        """What a controller loads: taps, sections and the low-pass, in this order."""
+        command = self.inversion.command
+        parts = [
+            CoefficientSet(
+                "zpetc", "fir", {"taps": tuple(command.taps.tolist()), "preview": command.preview}
+            )
+        ]
+        if command.sections is not None:
+            rows = tuple(tuple(row) for row in command.sections.tolist())
+            parts.append(CoefficientSet("inverse", "sos", {"rows": rows}))
+        if self.fir is not None:
+            parts.append(CoefficientSet("lowpass", "fir", {"taps": tuple(self.fir.tolist())}))
+        return tuple(parts)
+
+
+def design_prefilter(
+    loop: Loop,
+    *,
+    kind: str = "zpetc",
+    cutoff_hz: float | None = None,
+    length: int = _PREVIEW,
+    order: int = 0,
+) -> Prefilter:
+    """Invert the loop's answer to its reference.
+
+    Parameters
+    ----------
+    loop : Loop
+    kind, order
+        See `compensation.inversion.invert`.
+    cutoff_hz : float, optional
+        Of the zero-phase FIR; none if left out (see `fir_within`).
+    length : int
+        l: the FIR looks l samples ahead.
+
+    Raises
+    ------
+    DesignError
+        If the inverse does not exist.
+    """
+    # The scale of a reference is the user's: the inverse must reach constants exactly.
+    inversion = invert(kind, reference_plant(loop), order, unit_dc=True)
+    fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
+    return Prefilter(inversion, fir, loop.dt_s)
+
+
+def fir_within(
+    loop: Loop,
+    y_d: Array,
+    accel_limit: float,
+    *,
+    kind: str = "zpetc",
+    length: int = _PREVIEW,
+    slowest_hz: float = 10.0,
+) -> Prefilter:
+    """Return the prefilter with the highest cutoff whose reference keeps an acceleration.
+
+    Parameters
+    ----------
+    y_d : ndarray, shape (n,)
+        A typical motion.
+    accel_limit : float
+        Units of y_d per s^2.
+
+    Raises
+    ------
+    DesignError
+        If even `slowest_hz` exceeds it.
+    """
+    cutoff_hz, needed = 0.4 / loop.dt_s, 0.0
+    while cutoff_hz >= slowest_hz:
+        made = design_prefilter(loop, kind=kind, cutoff_hz=cutoff_hz, length=length)
+        needed = float(np.max(np.abs(np.diff(made.apply(y_d), 2)))) / loop.dt_s**2
+        if needed <= accel_limit:
+            return made
+        cutoff_hz *= _LADDER_STEP
+    raise DesignError(
+        f"even with a low-pass at {slowest_hz:g} Hz ({length} samples ahead) the reference needs "
+        f"an acceleration of {needed:.4g} (limit {accel_limit:.4g}); take a longer low-pass, or "
+        "move more slowly"
+    )
+
+
+def reference_plant(loop: Loop) -> DiscretePlant:
+    """Return the loop from its reference to its output as a plant."""
+    error = (loop.error_num, loop.error_den) if loop.fed_back else ((1.0,), (1.0,))
+    num = np.convolve(np.convolve(loop.plant_num, loop.rate_den), error[0])
+    den = np.asarray(loop.t0_den, float)
+    length = max(len(num), len(den))
+    top, bottom = (np.pad(p, (0, length - len(p))) / den[0] for p in (num, den))
+    # Controller form; loops are strictly proper, so nothing of the reference passes at once.
+    a = np.eye(length - 1, k=-1)
+    a[0] = -bottom[1:]
+    b = np.eye(1, length - 1)[0]
+    return balanced_discrete(a, b, top[1:], 0.0, loop.notes, loop.dt_s)
