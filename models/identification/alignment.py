@@ -1,0 +1,302 @@
+"""Where Klipper's resonance test lies in an accelerometer log, and along which sensor direction.
+
+The regenerated command is a chirp, so its cross-correlation with the log has one sharp peak. The
+correlation is a vector (one component per sensor axis): its norm finds the start whichever way
+the sensor is mounted, and its direction is that of the tested axis as the sensor sees it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
+from scipy.interpolate import CubicSpline
+
+from models.errors import ModelError
+from models.identification.excitation import VelocityProfile, regenerate
+from models.identification.types import AccelerationLog, Excitation
+
+__all__ = ["AlignedLog", "align", "check_pair", "resample"]
+
+Array = NDArray[np.float64]
+
+_BAND_HZ = 10.0
+_LEAST_CORRELATION = 0.6
+_SECOND_PEAK = 0.8
+_LEAST_FRACTION = 0.95
+_LATEST_START_S = 0.5
+_LEAD_S = 0.5
+_LARGEST_TURN = 0.7
+_SAME_DIRECTION = 0.7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedLog:
+    """Command and measured acceleration of one test, sampled together.
+
+    Attributes
+    ----------
+    rate_hz : float
+    command_mm_s2, measured_mm_s2 : ndarray, shape (n,)
+        The command as averages over the sampling interval (`VelocityProfile.cell_averages`), the
+        measurement along `direction`; from just before the test to its end.
+    start_s : float
+        Start of the test on the clock of the log. Delays of sensor and machine are in it.
+    f_reached_hz : float
+        Where the record ends in the sweep.
+    direction : ndarray, shape (3,)
+        Unit vector of the tested axis in the sensor's axes.
+    correlation : float
+        Of command and measurement in the band of alignment, 0 to 1.
+    """
+
+    rate_hz: float
+    command_mm_s2: Array
+    measured_mm_s2: Array
+    start_s: float
+    f_reached_hz: float
+    direction: Array
+    correlation: float
+    notes: tuple[str, ...] = ()
+
+
+def align(
+    log: AccelerationLog, excitation: Excitation, *, sensor_direction: ArrayLike | None = None
+) -> AlignedLog:
+    """Find the test in the whole of `log`, its start and the sensor's direction.
+
+    Parameters
+    ----------
+    sensor_direction : array_like, shape (3,), optional
+        Direction of the tested axis in the sensor's axes, if the mounting is known: the log of
+        another axis is then refused.
+
+    Raises
+    ------
+    ModelError
+        If the test is not in the log (another sweep, a sensor that does not move with the axis),
+        is there twice, lacks its start or its end, or if the axis is not the one that was asked
+        for.
+    """
+    _check_axis(log, excitation)
+    profile = regenerate(excitation)
+    grid_s, accel = resample(log)
+    rate_hz = (len(grid_s) - 1) / float(grid_s[-1] - grid_s[0])
+    low_hz = 1.2 * excitation.f_start_hz
+    band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
+    _check_length(log, grid_s, excitation, band_hz[1])
+    start_s = _find_start(log, profile, excitation, grid_s, accel, band_hz)
+
+    command = profile.cell_averages(grid_s - start_s, 1.0 / rate_hz)
+    vector, correlation = _correlate(command, accel, rate_hz, band_hz)
+    if correlation < _LEAST_CORRELATION:
+        raise ModelError(_not_found(log, excitation, accel, correlation))
+    direction = vector / np.linalg.norm(vector)
+    _check_direction(log, direction, sensor_direction)
+    f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
+
+    kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
+    return AlignedLog(
+        rate_hz,
+        command[kept],
+        np.asarray(accel[kept] @ direction, np.float64),
+        start_s,
+        f_reached_hz,
+        direction,
+        correlation,
+        notes,
+    )
+
+
+def check_pair(x: AlignedLog, y: AlignedLog) -> None:
+    """Raise ModelError if the logs of two axes show motion along the same sensor direction.
+
+    The machine's axes are perpendicular; two logs that move alike are of the same axis.
+    """
+    cosine = abs(float(x.direction @ y.direction))
+    if cosine > _SAME_DIRECTION:
+        raise ModelError(
+            "the logs of X and Y both show motion along the sensor direction "
+            f"{_vector(x.direction)}: the same axis was measured twice; measure the other one"
+        )
+
+
+def resample(log: AccelerationLog) -> tuple[Array, Array]:
+    """Return a uniform grid and the accelerations on it, medians (gravity) taken off.
+
+    Cubic splines at the rounded rate 1/median(dt); columns that were not recorded become 0.
+
+    Returns
+    -------
+    time_s : ndarray, shape (n,)
+    accel_mm_s2 : ndarray, shape (n, 3)
+
+    Raises
+    ------
+    ModelError
+        If nothing was recorded.
+    """
+    time_s = log.time_s
+    recorded = ~np.isnan(log.accel_mm_s2).any(axis=0)
+    if len(time_s) < 16 or not recorded.any():
+        raise ModelError(f"{log.source}: no accelerations in the log; record the test again")
+    rate_hz = float(round(1.0 / float(np.median(np.diff(time_s)))))
+    count = int((time_s[-1] - time_s[0]) * rate_hz) + 1
+    grid_s = time_s[0] + np.arange(count) / rate_hz
+    accel = np.zeros((count, 3))
+    accel[:, recorded] = CubicSpline(time_s, log.accel_mm_s2[:, recorded])(grid_s)
+    return grid_s, accel - np.median(accel, axis=0)
+
+
+def _find_start(
+    log: AccelerationLog,
+    profile: VelocityProfile,
+    excitation: Excitation,
+    grid_s: Array,
+    accel: Array,
+    band_hz: tuple[float, float],
+) -> float:
+    """Return the time of the greatest norm of the cross-correlation, to a fraction of a sample."""
+    h = float(grid_s[1] - grid_s[0])
+    # Only the part of the sweep that passes the band takes part: 1 Hz more for its flanks.
+    head_s = (band_hz[1] + 1.0 - excitation.f_start_hz) / excitation.hz_per_s
+    head = int(min(head_s, profile.duration_s) / h)
+    command = profile.cell_averages(np.arange(head) * h, h)
+    size = next_fast_len(len(accel) + head, real=True)
+    passed = _band_pass(rfftfreq(size, h), band_hz)
+    cross = rfft(accel, size, axis=0) * (passed * rfft(command, size).conj())[:, None]
+    norm = np.linalg.norm(irfft(cross, size, axis=0), axis=1)
+    best = int(np.argmax(norm))
+    _check_unique(log, norm, best, h)
+    before, peak, after = norm[best - 1], norm[best], norm[(best + 1) % size]
+    fraction = 0.5 * (before - after) / (before - 2 * peak + after)
+    # The last `head` lags are negative ones: the log begins within the test.
+    lag = best - size if best >= len(accel) else best
+    return float(grid_s[0] + (lag + fraction) * h)
+
+
+def _correlate(
+    command: Array, accel: Array, rate_hz: float, band_hz: tuple[float, float]
+) -> tuple[Array, float]:
+    """Return the inner products of command and accelerations in the band, and their correlation."""
+    size = next_fast_len(len(command), real=True)
+    passed = np.flatnonzero(_band_pass(rfftfreq(size, 1.0 / rate_hz), band_hz))
+    u = rfft(command, size)[passed]
+    a = rfft(accel, size, axis=0)[passed]
+    vector = np.real(u.conj() @ a)
+    along = a @ (vector / max(float(np.linalg.norm(vector)), 1e-300))
+    energy = float(np.sum(np.abs(u) ** 2) * np.sum(np.abs(along) ** 2))
+    return np.asarray(vector, np.float64), float(np.linalg.norm(vector) / np.sqrt(energy or 1.0))
+
+
+def _band_pass(f_hz: Array, band_hz: tuple[float, float]) -> Array:
+    """Return 1 in the band, with cosine flanks of 1 Hz inside it."""
+    low, high = band_hz
+    inside = np.clip(np.minimum(f_hz - low, high - f_hz), 0.0, 1.0)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * inside), np.float64)
+
+
+def _check_axis(log: AccelerationLog, excitation: Excitation) -> None:
+    named = {"x": (1.0, 0.0), "y": (0.0, 1.0)}.get(log.axis or "")
+    if named is None:
+        return
+    cosine = abs(float(np.dot(named, excitation.direction)))
+    if cosine < _SAME_DIRECTION:
+        raise ModelError(
+            f"{log.source}: the file is a test of axis {log.axis}, but the direction "
+            f"({excitation.direction[0]:g}, {excitation.direction[1]:g}) was asked for; "
+            "name the axis of the file"
+        )
+
+
+def _check_length(
+    log: AccelerationLog, grid_s: Array, excitation: Excitation, band_end_hz: float
+) -> None:
+    span_s = float(grid_s[-1] - grid_s[0])
+    needed_s = (band_end_hz - excitation.f_start_hz) / excitation.hz_per_s
+    if span_s < needed_s:
+        total_s = (excitation.f_end_hz - excitation.f_start_hz) / excitation.hz_per_s
+        raise ModelError(
+            f"{log.source}: the log is {span_s:.1f} s long, too short to find a test of "
+            f"{total_s:.0f} s in it; record the whole test"
+        )
+
+
+def _check_unique(log: AccelerationLog, norm: Array, best: int, h: float) -> None:
+    near = int(2.0 / h)
+    others = np.roll(norm, near - best)[2 * near + 1 :]
+    if len(others) and others.max() > _SECOND_PEAK * norm[best]:
+        away_s = (int(np.argmax(others)) + near + 1) * h
+        raise ModelError(
+            f"{log.source}: the test fits the log as well {away_s:.1f} s later as where it fits "
+            "best: more than one test, or none; give a log of one test"
+        )
+
+
+def _check_direction(
+    log: AccelerationLog, direction: Array, sensor_direction: ArrayLike | None
+) -> None:
+    if sensor_direction is None:
+        return
+    expected = np.asarray(sensor_direction, np.float64)
+    cosine = abs(float(direction @ expected)) / float(np.linalg.norm(expected))
+    if cosine < _LARGEST_TURN:
+        raise ModelError(
+            f"{log.source}: the sensor moved along {_vector(direction)}, not along "
+            f"{_vector(expected)} as its mounting says: another axis was measured, or the sensor "
+            "is mounted otherwise; measure the axis again or correct the sensor's axes"
+        )
+
+
+def _check_ends(
+    log: AccelerationLog,
+    excitation: Excitation,
+    profile: VelocityProfile,
+    grid_s: Array,
+    start_s: float,
+) -> tuple[float, tuple[str, ...]]:
+    """Return the frequency that the log reaches, and notes on a small part that is missing."""
+    late_s = float(grid_s[0]) - start_s
+    if late_s > _LATEST_START_S:
+        raise ModelError(
+            f"{log.source}: the log begins {late_s:.1f} s after the start of the test, at "
+            f"{excitation.f_start_hz + excitation.hz_per_s * late_s:.1f} Hz of the sweep; "
+            "record from before its start"
+        )
+    lasted_s = float(grid_s[-1]) - start_s
+    f_reached_hz = min(excitation.f_start_hz + excitation.hz_per_s * lasted_s, excitation.f_end_hz)
+    if lasted_s >= profile.duration_s - 0.01:
+        return f_reached_hz, ()
+    if f_reached_hz < _LEAST_FRACTION * excitation.f_end_hz:
+        raise ModelError(
+            f"{log.source}: the log ends {profile.duration_s - lasted_s:.1f} s before the end of "
+            f"the test, at {f_reached_hz:.1f} Hz of {excitation.f_end_hz:g} Hz; record the whole "
+            f"test, or give f_end_hz = {np.floor(f_reached_hz):g} to use what is there"
+        )
+    return f_reached_hz, (f"the log ends at {f_reached_hz:.1f} Hz of the sweep",)
+
+
+def _not_found(
+    log: AccelerationLog, excitation: Excitation, accel: Array, correlation: float
+) -> str:
+    """Say why nothing correlates: nothing moved, or something else did."""
+    moved = float(np.sqrt(np.sum(np.var(accel, axis=0))))
+    sent = excitation.accel_per_hz_mm_s * 0.5 * (excitation.f_start_hz + excitation.f_end_hz)
+    if moved < 0.1 * sent:
+        return (
+            f"{log.source}: the sensor saw {moved:.0f} mm/s^2 rms of a test of about "
+            f"{sent:.0f} mm/s^2: it does not move with the tested axis (another axis, a bed "
+            "whose sensor sits on the toolhead, a loose sensor); measure at the part that moves"
+        )
+    return (
+        f"{log.source}: the test is not in the log: the greatest correlation with a sweep from "
+        f"{excitation.f_start_hz:g} to {excitation.f_end_hz:g} Hz at {excitation.hz_per_s:g} Hz/s "
+        f"is {correlation:.2f}; check min_freq, max_freq, hz_per_sec and the Klipper version "
+        "against printer.cfg"
+    )
+
+
+def _vector(direction: Array) -> str:
+    return "({:.2f}, {:.2f}, {:.2f})".format(*direction)

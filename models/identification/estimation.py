@@ -1,0 +1,336 @@
+"""Frequency responses of measurements: Klipper's resonance test, and any recorded drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.fft import next_fast_len, rfft, rfftfreq
+from scipy.signal import csd
+from scipy.signal.windows import tukey
+
+from models.errors import ModelError
+from models.identification.alignment import AlignedLog, align
+from models.identification.local_model import (
+    LocalResponse,
+    Transformed,
+    bins_needed,
+    local_response,
+)
+from models.identification.types import (
+    AccelerationLog,
+    DrivenLog,
+    Excitation,
+    FrequencyResponse,
+)
+
+__all__ = [
+    "Progress",
+    "check_plateau",
+    "estimate_aligned",
+    "estimate_driven",
+    "estimate_response",
+    "estimate_welch",
+    "plateau_gain",
+]
+
+Array = NDArray[np.float64]
+Progress: TypeAlias = Callable[[str, float], None]
+"""Called with a stage ("align", "estimate") and how much of it is done, 0 to 1."""
+
+_HALF_BAND_HZ = 1.0
+_STEP_HZ = 0.25
+_TAPER = 0.01
+_PLATEAU_HZ = (8.0, 15.0)
+_PLATEAU_TOLERANCE = 0.15
+_LEAST_COHERENCE = 0.95
+_WEAKEST_DRIVE = 1e-5
+_SEGMENTS = 12
+_MOST_POINTS = 4096
+_REST = 0.25
+
+
+def estimate_response(
+    log: AccelerationLog,
+    excitation: Excitation,
+    *,
+    sensor_direction: ArrayLike | None = None,
+    label: str = "",
+    progress: Progress | None = None,
+) -> FrequencyResponse:
+    """Return the response of the tested axis from a log of Klipper's resonance test.
+
+    Whole-record transforms of regenerated command and aligned measurement, then local least
+    squares in +-1 Hz around every 0.25 Hz between f_start + 1 Hz and 1 Hz below what the log
+    reaches. All points are returned; those of coherence below 0.95 are best left out of a fit.
+
+    Raises
+    ------
+    ModelError
+        If the test cannot be found in the log (`alignment.align`), or its level is not that of
+        `excitation` (`check_plateau`).
+    """
+    report = progress or _silent
+    report("align", 0.0)
+    aligned = align(log, excitation, sensor_direction=sensor_direction)
+    report("align", 1.0)
+    response = estimate_aligned(log, aligned, excitation, label=label)
+    check_plateau(response, excitation)
+    report("estimate", 1.0)
+    return response
+
+
+def estimate_aligned(
+    log: AccelerationLog, aligned: AlignedLog, excitation: Excitation, *, label: str = ""
+) -> FrequencyResponse:
+    """Return the response from a log that is aligned already; its level is not checked."""
+    record = _transformed(
+        aligned.command_mm_s2, aligned.measured_mm_s2, aligned.rate_hz, taper=_TAPER
+    )
+    first, last = excitation.f_start_hz + 1.0, aligned.f_reached_hz - 1.0
+    if last < first + 1.0:
+        raise ModelError(
+            f"{log.source}: the log reaches {aligned.f_reached_hz:.1f} Hz of the sweep only; "
+            "record the whole test"
+        )
+    f_hz = np.arange(np.ceil(first / _STEP_HZ), np.floor(last / _STEP_HZ) + 1) * _STEP_HZ
+    found = local_response([record], f_hz, _HALF_BAND_HZ)
+    # The command is known as averages over samples, the sensor samples points.
+    undone = np.sinc(f_hz / aligned.rate_hz)
+    notes = (*log.notes, *aligned.notes)
+    return FrequencyResponse(
+        f_hz,
+        found.response * undone,
+        found.sd * undone,
+        found.coherence,
+        axis=log.axis,
+        label=label,
+        source=log.source,
+        notes=notes,
+    )
+
+
+def plateau_gain(response: FrequencyResponse) -> float | None:
+    """Return the gain that the response has towards 0 Hz, from 8 to 15 Hz; None if unknown.
+
+    A resonance above lifts the band by 1/(1 - f^2/f_r^2), so the real part of 1/H is a line in
+    f^2; the gain is where it meets 0 Hz.
+    """
+    low, high = _PLATEAU_HZ
+    used = (response.f_hz >= low) & (response.f_hz <= high) & (response.coherence >= 0.8)
+    if np.count_nonzero(used) < 4:
+        return None
+    squared, magnitude = response.f_hz[used] ** 2, np.abs(response.response[used])
+    slope, inverse_gain = np.polyfit(squared, 1.0 / magnitude, 1)
+    # A plant that falls is no resonance far above: its own level says more than a line.
+    return float(1.0 / inverse_gain) if slope < 0 else float(np.median(magnitude))
+
+
+def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
+    """Raise ModelError if the gain towards 0 Hz is more than 15 % off 1.
+
+    An axis without slip follows slow motion exactly, so any other level means that the command
+    was another one than `excitation` says, or that the sensor's scale is off.
+    """
+    gain = plateau_gain(response)
+    if gain is None or abs(gain - 1.0) <= _PLATEAU_TOLERANCE:
+        return
+    stated = excitation.accel_per_hz_mm_s
+    raise ModelError(
+        f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the axis moved "
+        f"{gain:.2f} times as much as commanded with accel_per_hz = {stated:g}; it must be 1 "
+        f"within {_PLATEAU_TOLERANCE:.0%}. The log looks like accel_per_hz = {stated * gain:.3g}: "
+        "check printer.cfg [resonance_tester] and the sensor's scale"
+    )
+
+
+def estimate_driven(
+    driven: DrivenLog | Sequence[DrivenLog],
+    *,
+    half_band_hz: float | None = None,
+    label: str = "",
+    progress: Progress | None = None,
+) -> FrequencyResponse:
+    """Return the response of a recorded drive by local least squares.
+
+    For a swept sine, a step or any other short record: there Welch's method has only one segment
+    at each frequency, and its coherence says nothing. Several logs of the same axis are put into
+    one set of equations. Transients are fitted too unless every command begins and ends at the
+    same rest (near both ends of a sweep they can hardly be told from the response).
+
+    Parameters
+    ----------
+    half_band_hz : float, optional
+        Default: what the unknowns need, some 8 bins of one log and fewer of several; more of
+        long logs, so that there are some 4000 points at most.
+
+    Returns
+    -------
+    FrequencyResponse
+        At the frequencies with at least -50 dB of the strongest drive.
+    """
+    logs = _several(driven)
+    report = progress or _silent
+    records = []
+    for i, log in enumerate(logs):
+        records.append(_transformed(log.command, log.measured, _rate_hz(log), taper=0.0))
+        report("estimate", (i + 1) / (len(logs) + 1))
+    transient = not all(_rests(log.command) for log in logs)
+    reach = bins_needed(len(records), transient=transient) // 2
+    half = half_band_hz or max(
+        *(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS
+    )
+    f_hz = _driven_grid(records, half)
+    found = local_response(records, f_hz, half, transient=transient)
+    report("estimate", 1.0)
+    return _driven_response(logs, f_hz, found, label)
+
+
+def estimate_welch(
+    driven: DrivenLog | Sequence[DrivenLog],
+    *,
+    segment_s: float | None = None,
+    label: str = "",
+    progress: Progress | None = None,
+) -> FrequencyResponse:
+    """Return H1 = S_uy/S_uu by Welch's method: Hann windows, half overlapping.
+
+    H1 is right when the command is known and the noise is on the measurement. For drives that
+    last (noise, printing moves); a single sweep is better served by `estimate_driven`.
+
+    Parameters
+    ----------
+    segment_s : float, optional
+        Default: as long as 12 segments in all the logs allow, and 8192 samples at most.
+
+    Returns
+    -------
+    FrequencyResponse
+        At the bins with at least -50 dB of the strongest drive. sd^2 = |H|^2 (1 - coherence) /
+        (coherence K), K the number of independent segments (Bendat and Piersol, Random Data, 4th
+        ed., section 9.2; that of a complex error, twice that of the magnitude).
+    """
+    logs = _several(driven)
+    report = progress or _silent
+    rate_hz = _rate_hz(logs[0])
+    if any(abs(_rate_hz(log) / rate_hz - 1) > 1e-3 for log in logs):
+        raise ModelError(f"{logs[0].source}: logs of different rates; estimate them one by one")
+    samples = _segment_samples(logs, rate_hz, segment_s)
+    sums: list[NDArray[np.complex128]] = []
+    count = 0
+    for i, log in enumerate(logs):
+        segments = 2 * len(log.time_s) // samples - 1
+        pairs = ((log.command, log.command), (log.command, log.measured), (log.measured,) * 2)
+        spectra = [segments * _cross_spectrum(a, b, rate_hz, samples) for a, b in pairs]
+        sums = [a + b for a, b in zip(sums, spectra, strict=True)] if sums else spectra
+        count += segments
+        report("estimate", (i + 1) / len(logs))
+    uu, uy, yy = sums[0].real, sums[1], sums[2].real
+    f_hz = rfftfreq(samples, 1.0 / rate_hz)
+    used = (uu >= _WEAKEST_DRIVE * uu.max()) & (f_hz > 1.5 * rate_hz / samples) & (yy > 0)
+    response = uy[used] / uu[used]
+    coherence = np.clip(np.abs(uy[used]) ** 2 / (uu[used] * yy[used]), 1e-12, 1.0)
+    # Neighbouring Hann segments that half overlap have a squared correlation of 1/36.
+    independent = count / (1.0 + 2.0 / 36.0 * (1.0 - 1.0 / count))
+    sd = np.abs(response) * np.sqrt((1.0 - coherence) / (coherence * independent))
+    found = LocalResponse(response, np.asarray(sd, np.float64), coherence)
+    return _driven_response(logs, np.asarray(f_hz[used], np.float64), found, label)
+
+
+def _transformed(command: Array, measured: Array, rate_hz: float, *, taper: float) -> Transformed:
+    """Transform a whole record, with bins whose noise does not depend on its length."""
+    n = len(command)
+    window = tukey(n, taper) if taper else np.ones(n)
+    size = next_fast_len(n, real=True)
+    scale = 1.0 / np.sqrt(n)
+    u, y = (rfft(v * window, size) * scale for v in (command, measured))
+    return Transformed(rate_hz / size, u, y)
+
+
+def _driven_grid(records: Sequence[Transformed], half_band_hz: float) -> Array:
+    """Return frequencies, an eighth of the band's width apart, where there is enough drive."""
+    step = 0.25 * half_band_hz
+    end = _nyquist_hz(records) - half_band_hz
+    grid = np.arange(1, int(end / step)) * step
+    power = np.zeros(len(grid))
+    for record in records:
+        summed = np.concatenate([[0.0], np.cumsum(np.abs(record.command) ** 2)])
+        above = ((grid + half_band_hz) / record.spacing_hz).astype(int)
+        below = (np.maximum(grid - half_band_hz, 0.0) / record.spacing_hz).astype(int)
+        power += summed[above] - summed[below]
+    driven = grid[power >= _WEAKEST_DRIVE * power.max()] if len(grid) else grid
+    if len(driven) == 0:
+        raise ModelError("the record is too short for a frequency response; record longer")
+    return np.asarray(driven, np.float64)
+
+
+def _nyquist_hz(records: Sequence[Transformed]) -> float:
+    return min(r.spacing_hz * (len(r.command) - 1) for r in records)
+
+
+def _segment_samples(logs: Sequence[DrivenLog], rate_hz: float, segment_s: float | None) -> int:
+    total = sum(len(log.time_s) for log in logs)
+    shortest = min(len(log.time_s) for log in logs)
+    many = min(2.0 * total / (_SEGMENTS + len(logs)), 2.0 * _MOST_POINTS)
+    samples = int(min(segment_s * rate_hz if segment_s else many, shortest))
+    if samples < 16:
+        raise ModelError(
+            f"{logs[0].source}: segments of {samples} samples are too short for a spectrum; "
+            "record longer, or choose longer segments"
+        )
+    return samples
+
+
+def _cross_spectrum(
+    first: Array, second: Array, rate_hz: float, samples: int
+) -> NDArray[np.complex128]:
+    spectrum = csd(first, second, rate_hz, window="hann", nperseg=samples, detrend="constant")[1]
+    return np.asarray(spectrum, complex)
+
+
+def _driven_response(
+    logs: Sequence[DrivenLog], f_hz: Array, found: LocalResponse, label: str
+) -> FrequencyResponse:
+    if not np.any(found.coherence >= _LEAST_COHERENCE):
+        raise ModelError(
+            f"{logs[0].source}: the measurement follows the command at no frequency (greatest "
+            f"coherence {found.coherence.max():.2f}, {_LEAST_COHERENCE} is needed); check that the "
+            "columns are command and measurement of the same axis, and drive it harder"
+        )
+    return FrequencyResponse(
+        f_hz,
+        found.response,
+        found.sd,
+        found.coherence,
+        axis=logs[0].axis,
+        label=label,
+        source=", ".join(dict.fromkeys(log.source for log in logs)),
+        notes=tuple(dict.fromkeys(note for log in logs for note in log.notes)),
+    )
+
+
+def _several(driven: DrivenLog | Sequence[DrivenLog]) -> tuple[DrivenLog, ...]:
+    logs = (driven,) if isinstance(driven, DrivenLog) else tuple(driven)
+    if not logs:
+        raise ModelError("no log to estimate from; give at least one")
+    axes = {log.axis for log in logs if log.axis is not None}
+    if len(axes) > 1:
+        raise ModelError(f"logs of different axes ({', '.join(sorted(axes))}); one axis at a time")
+    return logs
+
+
+def _rests(values: Array) -> bool:
+    """Whether a record ends where it began, and hardly moves there."""
+    edge = max(len(values) // 50, 1)
+    ends = np.concatenate([values[:edge], values[-edge:]])
+    return bool(np.std(ends) <= _REST * np.std(values))
+
+
+def _rate_hz(log: DrivenLog) -> float:
+    return (len(log.time_s) - 1) / float(log.time_s[-1] - log.time_s[0])
+
+
+def _silent(_stage: str, _fraction: float) -> None:
+    pass
