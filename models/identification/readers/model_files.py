@@ -117,24 +117,30 @@ def _model(fields: Any, source: str, axis: str | None, settings: ReadSettings) -
     if not isinstance(fields, Mapping):
         raise ModelError(f"{source}: the model of axis {axis} is not an object with {_FORMS}")
     try:
-        document, notes = _document(fields, settings)
-        if settings.dc_gain is not None:
-            document, notes = (
-                _divided(document, settings.dc_gain),
-                [
-                    *notes,
-                    f"DC gain divided by the stated {settings.dc_gain:g} (steps per mm)",
-                ],
-            )
-        if settings.repair_rounding and document.get("kind") == "tf" and document.get("dt_s"):
-            document, moved = _repaired(document)
-            notes = [*notes, *moved]
-        spec = _SPEC.validate_python(_floats(document))
+        with np.errstate(over="raise", divide="raise", invalid="raise"):
+            spec, notes = _specified(fields, settings)
     except ValidationError as error:
         raise ModelError(f"{source}: {_complaint(error)}") from None
-    except (ModelError, OverflowError) as error:
+    except ModelError as error:
         raise ModelError(f"{source}: {error}") from None
-    return PlantModel(spec, axis, source, (*notes, *spec.notes))
+    except (ArithmeticError, np.linalg.LinAlgError):
+        raise ModelError(
+            f"{source}: the model's numbers are too large, too small or too close to singular to "
+            "compute with; check units and powers of ten"
+        ) from None
+    return PlantModel(spec, axis, source, tuple(notes))
+
+
+def _specified(fields: Mapping[str, Any], settings: ReadSettings) -> tuple[PlantSpec, list[str]]:
+    document, notes = _document(fields, settings)
+    if settings.dc_gain is not None:
+        document = _divided(document, settings.dc_gain)
+        notes.append(f"DC gain divided by the stated {settings.dc_gain:g} (steps per mm)")
+    if settings.repair_rounding and document.get("kind") == "tf" and document.get("dt_s"):
+        document, moved = _repaired(document)
+        notes += moved
+    spec = _SPEC.validate_python(_floats(document))
+    return spec, [*notes, *spec.notes]
 
 
 def _form(fields: Mapping[str, Any]) -> str:

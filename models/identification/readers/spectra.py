@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 _LEAST_BINS = 16
 _PER_HZ = "accel_per_hz"
-_SHAPER = re.compile(r"((smooth_)?(zvd?|mzv|ei|[23]hump_ei|si|zvd_ei))(\([\d./]*\))?")
+_SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
 _MIN_FREQ_HZ = 5.0
 """MIN_FREQ of klippy/extras/shaper_calibrate.py."""
 

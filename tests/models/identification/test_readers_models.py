@@ -10,12 +10,15 @@ import control
 import numpy as np
 import pytest
 import scipy.io
+import scipy.sparse
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from models.errors import ModelError
 from models.identification.readers import ReadSettings, read_content, resampled
+from models.identification.readers.matlab import matlab_variables
 from models.identification.types import PlantModel
 from models.plants import PairsSpec, PlantSpec, PolePair, ZeroPair, discretise, frequency_response
 
@@ -201,6 +204,7 @@ def test_dc_gain_far_off_needs_a_word() -> None:
         ({"A": "no", "B": [1], "C": [1]}, "A is not a matrix"),
         ({"num": [1]}, "it needs num and den"),
         ({"kind": "other"}, "other"),
+        ({"A": [[-1e303]], "B": [[1]], "C": [[1]]}, "too large, too small"),
         ({"x": [1]}, "axis x is not an object"),
         ("[1, 2]", "a JSON model is an object"),
         ('{"num": [NaN], "den": [1, 1]}', "NaN is not a finite number"),
@@ -219,6 +223,51 @@ def test_refusals(document: Any, message: str) -> None:
 def test_sampling_time_may_be_told() -> None:
     document = {"num": [0.1], "den": [1, -0.9], "dt": True}
     assert read(document, sampling_s=0.002).spec.sampling_s == 0.002
+
+
+@hypothesis_settings(deadline=None)
+@given(
+    st.dictionaries(
+        st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,30}", fullmatch=True),
+        arrays.arrays(
+            st.sampled_from(["f8", "f4", "i2", "u1", "i8", "c16"]),
+            arrays.array_shapes(min_dims=1, max_dims=3, max_side=4),
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+    st.booleans(),
+    st.booleans(),
+)
+def test_matlab_variables_as_scipy(
+    variables: dict[str, np.ndarray], compressed: bool, in_struct: bool
+) -> None:
+    out = io.BytesIO()
+    written = {"s": variables} if in_struct else variables
+    scipy.io.savemat(out, written, do_compression=compressed, long_field_names=True)
+    found = matlab_variables(out.getvalue(), "a.mat")
+    expected = scipy.io.loadmat(io.BytesIO(out.getvalue()), squeeze_me=True)
+    if in_struct:
+        found, expected = found["s"], expected["s"]
+    for name in variables:
+        reference = expected[name].item() if in_struct else expected[name]
+        np.testing.assert_array_equal(found[name], np.asarray(reference, found[name].dtype))
+
+
+def test_other_matlab_variables_do_not_disturb() -> None:
+    content = mat(
+        note="made by hand", sparse=scipy.sparse.eye_array(3), many=np.array([1, "a"], object),
+        list=[{"a": 1}, {"a": 2}], cell=np.array([[2.5]], object), G={"z": [], "p": -100, "k": 100},
+    )  # fmt: skip
+    found = matlab_variables(content, "a.mat")
+    assert {name for name, value in found.items() if value is None} == {
+        "note", "sparse", "many", "list",
+    }  # fmt: skip
+    assert found["cell"] == 2.5
+    (model,) = read_content(content, "a.mat")
+    assert isinstance(model, PlantModel)
+    assert model.source == "a.mat, G"
+    np.testing.assert_allclose(model.spec.roots().poles, [-100])
 
 
 def test_matlab_refusals() -> None:
