@@ -1,0 +1,283 @@
+"""Compensation of ripple: a table over position, laid over any other compensator.
+
+Where ripple enters decides what undoes it (reference: repetitive compensation of print files):
+
+``input``
+    y = G (u + delta(u)). With r what the other compensator wants the machine to receive, the
+    command u solves u + delta(u) = r: no plant, any speed.
+``output``
+    y = G u + d(s(t)). The command is r - G^-1 d along the planned path; it needs the plant.
+
+A wave of wavenumber k is a vibration of k v / 2 pi Hz at the speed v. Its share fades, without
+phase, where its own acceleration would exceed a budget, and towards the Nyquist frequency: on fast
+travel the machine cannot follow, and nothing is printed. The budget is the largest of a ladder
+whose command keeps the machine's limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import Compensator, DesignError, Memoryless
+from compensation.holds import stand_still
+from compensation.inversion import Inversion, invert
+from models.machine import Machine
+from models.plants import DiscretePlant, plant_set
+from models.ripple import AxisRipple, RippleTable
+
+__all__ = ["PassThrough", "RippleCompensator", "input_command", "output_command", "wave_shares"]
+
+Array = NDArray[np.float64]
+
+_STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
+"""Budgets of a wave's acceleration, in parts of the machine's limit."""
+_BAND = (0.30, 0.45)
+"""Frequencies, times the sampling time, between which a wave fades away."""
+_BLEND_S = 0.02
+_MOST_STEPS, _CLOSE_MM = 20, 1e-12
+_SLOWEST_ZERO = 0.97
+"""Zeros of the plant nearer the unit circle are not cancelled: their inverse rings."""
+_EXTRA_TERMS = 3
+_MOTORS = np.array([[1.0, 1.0], [1.0, -1.0]])
+"""Motors A and B of CoreXY from X and Y."""
+
+
+def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = None) -> Array:
+    """Return u with u + delta(u) = wanted, sample by sample: equal inputs, equal outputs.
+
+    Parameters
+    ----------
+    wanted_mm : ndarray, shape (n,)
+    table : RippleTable
+    share : ndarray, shape (len(table), n), optional
+        Of every wave; see `wave_shares`.
+
+    Raises
+    ------
+    DesignError
+        If the ripple is so steep that no command undoes it.
+    """
+    if table.steepest >= 1.0:
+        raise DesignError(
+            f"the ripple's slope reaches {table.steepest:.3g} mm per mm (limit 1): the motor would "
+            "have to turn back to move on; check amplitudes and pitches"
+        )
+    u = wanted_mm.copy()
+    for _ in range(_MOST_STEPS):
+        step = (u + table.deviation_mm(u, share) - wanted_mm) / (1.0 + table.slope(u, share))
+        u -= step
+        if np.max(np.abs(step), initial=0.0) < _CLOSE_MM:
+            break
+    return u
+
+
+def output_command(
+    path_mm: Array, table: RippleTable, inverse: Inversion, share: Array | None = None
+) -> Array:
+    """Return -G^-1 d(s) along a path, shape (n,); see `input_command`."""
+    return -inverse.apply(table.deviation_mm(path_mm, share))
+
+
+def wave_shares(
+    path_mm: Array,
+    table: RippleTable,
+    dt_s: float,
+    budget_mm_s2: float = math.inf,
+    plant: DiscretePlant | None = None,
+) -> Array:
+    """Return the share of every wave at every sample, shape (len(table), n).
+
+    1 at rest; a little more where the straight lines between samples would take some off.
+
+    Parameters
+    ----------
+    path_mm : ndarray, shape (n,)
+        What the axis does; its speed makes the waves' frequencies.
+    budget_mm_s2 : float
+        Largest amplitude of the acceleration that undoes one wave.
+    plant : DiscretePlant, optional
+        What has to be inverted to undo it (output side).
+    """
+    speed = np.abs(np.gradient(path_mm)) / dt_s if len(path_mm) > 1 else np.zeros(len(path_mm))
+    shares = np.empty((len(table), len(path_mm)))
+    low, high = _BAND
+    for k, (number, c) in enumerate(zip(table.wavenumber, table.coefficient_mm, strict=True)):
+        f_hz = number * speed / (2 * math.pi)
+        effort = abs(c) * (number * speed) ** 2
+        fade = np.clip((f_hz * dt_s - low) / (high - low), 0.0, 1.0)
+        shares[k] = 0.5 * (1 + np.cos(np.pi * fade))
+        if plant is not None:
+            effort /= _gain(plant, f_hz)
+        else:
+            # Between samples the command is linear, which takes sinc^2 off a wave; an inverse of
+            # the plant knows that already.
+            shares[k] /= np.sinc(np.minimum(f_hz * dt_s, 0.5)) ** 2
+        shares[k] *= np.minimum(1.0, budget_mm_s2 / np.maximum(effort, 1e-12))
+    return shares
+
+
+class PassThrough(Memoryless):
+    """The plan as the command."""
+
+    name = "none"
+
+    def compensate(
+        self,
+        y_d_mm: Array,
+        extruding: NDArray[np.bool_],  # noqa: ARG002
+        rests: NDArray[np.int64],  # noqa: ARG002
+    ) -> Array:
+        """See `compensation.base.Compensator.compensate`."""
+        return y_d_mm.copy()
+
+
+@dataclass(frozen=True, slots=True)
+class _Output:
+    table: RippleTable
+    plant: DiscretePlant
+    inverse: Inversion
+
+
+class RippleCompensator:
+    """Undo the ripple of a machine under another compensator.
+
+    In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
+    after, the table fades in and out.
+
+    Parameters
+    ----------
+    inner : Compensator
+        What undoes the vibration: its command is what the axes shall receive.
+    machine : Machine
+    dt_s : float
+    ripple : mapping of str to AxisRipple
+        By axis: x and y; input ripple of CoreXY belongs to its motors, a (x + y) and b (x - y).
+
+    Raises
+    ------
+    DesignError
+        If there is nothing to undo, the axes are not the machine's, homing is so uncertain that
+        the table would do harm, or a plant has no inverse.
+    """
+
+    def __init__(
+        self, inner: Compensator, machine: Machine, dt_s: float, ripple: Mapping[str, AxisRipple]
+    ) -> None:
+        self.name = f"{inner.name}+ripple"
+        self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
+        self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
+        corexy = machine.kinematics == "corexy"
+        self._to_motors = _MOTORS if corexy else np.eye(2)
+        motors = "ab" if corexy else "xy"
+        _check(ripple, motors, machine)
+        self._inputs = [_table(ripple, name, "input") for name in motors]
+        self._outputs = [
+            None if (table := _table(ripple, axis, "output")) is None
+            else _inverted(axis, plant_set(machine.axes[axis], dt_s).nominal, table)
+            for axis in ("x", "y")
+        ]  # fmt: skip
+        self._blend = max(2, round(_BLEND_S / dt_s))
+        self.budget_mm_s2 = machine.command.accel_mm_s2
+        """Of the last piece, for the acceleration of a wave; 0: no room, the ripple stays."""
+
+    def reset(self, position_mm: Array) -> None:
+        """See `compensation.base.Compensator.reset`."""
+        self._inner.reset(position_mm)
+
+    def observe(self, command_mm: Array) -> None:
+        """See `compensation.base.Compensator.observe`."""
+        self._inner.observe(command_mm)
+
+    def commit(self) -> None:
+        """See `compensation.base.Compensator.commit`."""
+        self._inner.commit()
+
+    def compensate(
+        self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
+    ) -> Array:
+        """See `compensation.base.Compensator.compensate`."""
+        wanted = self._inner.compensate(y_d_mm, extruding, rests)
+        speed, accel = self._peaks(wanted)
+        # What the inner compensator asks for is its own business; ripple must not add to it.
+        speed = max(speed, self._limits.velocity_mm_s)
+        accel = max(accel, self._limits.accel_mm_s2)
+        for step in _STEPS:
+            self.budget_mm_s2 = step * self._limits.accel_mm_s2
+            u = self._undone(wanted, y_d_mm)
+            u = wanted + stand_still(u - wanted, np.zeros_like(u), rests, self._blend)
+            needs = self._peaks(u)
+            if needs[0] <= speed and needs[1] <= accel:
+                return u
+        self.budget_mm_s2 = 0.0
+        return wanted
+
+    def _undone(self, wanted: Array, y_d: Array) -> Array:
+        aim = wanted.copy()
+        for row, output in enumerate(self._outputs):
+            if output is not None:
+                share = wave_shares(
+                    y_d[row], output.table, self._dt_s, self.budget_mm_s2, output.plant
+                )
+                aim[row] += output_command(y_d[row], output.table, output.inverse, share)
+        motors = self._to_motors @ aim
+        for row, table in enumerate(self._inputs):
+            if table is not None:
+                share = wave_shares(motors[row], table, self._dt_s, self.budget_mm_s2)
+                motors[row] = input_command(motors[row], table, share)
+        return np.asarray(np.linalg.solve(self._to_motors, motors))
+
+    def _peaks(self, u: Array) -> tuple[float, float]:
+        """Largest speed and acceleration of an axis."""
+        speed = float(np.abs(np.diff(u)).max(initial=0.0)) / self._dt_s
+        return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
+
+
+def _check(ripple: Mapping[str, AxisRipple], motors: str, machine: Machine) -> None:
+    if not ripple:
+        raise DesignError(
+            f"machine {machine.name}: no ripple is known; learn it from passes, or leave out "
+            "+ripple"
+        )
+    for axis, of_axis in ripple.items():
+        for side, fitting in (("input", motors), ("output", "xy")):
+            table = of_axis.table("input" if side == "input" else "output")
+            if len(table) == 0:
+                continue
+            if axis not in fitting:
+                raise DesignError(
+                    f"axis {axis}: {side} ripple of a {machine.kinematics} machine belongs to "
+                    f"{' or '.join(fitting)}"
+                )
+            left = table.residual_share(of_axis.homing_repeatability_mm)
+            if left >= 1.0:
+                raise DesignError(
+                    f"axis {axis}: homing repeats within {of_axis.homing_repeatability_mm:g} mm, "
+                    f"where a table leaves {left:.0%} of the ripple (limit 100 %): it would do "
+                    "harm; home more exactly (endstop phase) or leave out +ripple"
+                )
+
+
+def _table(ripple: Mapping[str, AxisRipple], axis: str, side: str) -> RippleTable | None:
+    if axis not in ripple:
+        return None
+    table = ripple[axis].table("input" if side == "input" else "output")
+    return table if len(table) else None
+
+
+def _inverted(axis: str, plant: DiscretePlant, table: RippleTable) -> _Output:
+    try:
+        inverse = invert("ebzpetc", plant, _EXTRA_TERMS, cancel_below=_SLOWEST_ZERO, unit_dc=True)
+    except DesignError as error:
+        raise DesignError(f"axis {axis}, output ripple: {error}") from None
+    return _Output(table, plant, inverse)
+
+
+def _gain(plant: DiscretePlant, f_hz: Array) -> Array:
+    """|G| at many frequencies, interpolated from a grid."""
+    grid = np.linspace(0.0, 0.5 / plant.dt_s, 513)
+    return np.interp(f_hz, grid, np.maximum(np.abs(plant.frequency_response(grid)), 1e-6))

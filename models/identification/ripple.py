@@ -1,0 +1,474 @@
+"""Learning the ripple of an axis from passes: position logs, accelerometers, slow sensors.
+
+A pass is a motion along one axis with a log of what followed. Its ripple is linear in the
+coefficients of the harmonics, whose spatial frequencies are known, so a pass is one least-squares
+problem. The waves of ripple that enters at the input go through the plant before they are fitted:
+the map is then the input's own, valid at every speed (reference, finding (iii)).
+
+An accelerometer is read where the command moves steadily: there the harmonic h is a line at
+f = h v / p, and dividing by -(2 pi f)^2 integrates twice.
+
+A sensor slower than the ripple still sees every harmonic, folded, unless two of them fold onto one
+another, or one onto a constant. `Observability` says how far a pass is from that (finding (vi)):
+the noise gain of the fit decides, the distance in Hz says which speed to choose instead.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from models.errors import ModelError
+from models.plants import DiscretePlant
+from models.response_kernels import dense_response
+from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
+
+__all__ = ["Observability", "PassLog", "RippleLearning", "WaveBasis", "folded_distances",
+           "learn_ripple", "update_ripple"]  # fmt: skip
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+LARGEST_NOISE_GAIN = 4.0
+"""Above, a harmonic is not observable: noise would count four times as much as for a wave alone."""
+_STEADY = 1e-3
+"""Relative change of speed that still counts as steady."""
+_FEWEST = 4
+"""Samples per unknown that a fit must have."""
+_LARGEST_POINTS = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassLog:
+    """One motion along an axis and what a sensor said.
+
+    Attributes
+    ----------
+    command_mm : ndarray, shape (n,)
+        Commanded position, at the plant's sampling time, from rest; machine coordinates.
+    sensor_time_s, measured : ndarray, shape (k,)
+        Since the first sample of the command; position in mm, or acceleration in mm/s^2. Any
+        rate, also below that of the ripple.
+    homed : bool
+        Whether `command_mm` counts from the machine's homed zero: without, phases mean nothing.
+    """
+
+    command_mm: Array
+    sensor_time_s: Array
+    measured: Array
+    kind: Literal["position", "acceleration"] = "position"
+    homed: bool = False
+    source: str = "pass"
+
+
+@dataclass(frozen=True, slots=True)
+class WaveBasis:
+    """Which part repeats with which pitch, and which of its harmonics to learn."""
+
+    name: str
+    pitch_mm: float
+    numbers: tuple[int, ...] = (1, 2, 3)
+    enters: RippleSide = "input"
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """How well the passes show one harmonic.
+
+    Attributes
+    ----------
+    noise_gain : float
+        Standard deviation of the coefficient over that of a wave alone among white noise; 1 is
+        the best, infinite in the singular set.
+    distance_hz : float or None
+        At steady speed: from folding onto a constant, onto itself, or onto another harmonic.
+    """
+
+    source: str
+    number: int
+    noise_gain: float
+    distance_hz: float | None
+    observable: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RippleLearning:
+    """What passes teach.
+
+    Attributes
+    ----------
+    ripple : AxisRipple
+    observability : tuple of Observability
+    residual_rms : float
+        What the waves do not explain, in the unit of the log.
+    explained : float
+        Share of the log's deviation (rms) that the waves explain, 0..1.
+    """
+
+    ripple: AxisRipple
+    observability: tuple[Observability, ...]
+    residual_rms: float
+    explained: float
+
+
+def learn_ripple(
+    passes: Sequence[PassLog],
+    basis: Sequence[WaveBasis],
+    plant: DiscretePlant,
+    *,
+    homing_repeatability_mm: float = 0.0,
+) -> RippleLearning:
+    """Fit the harmonics of `basis` to all passes at once.
+
+    Parameters
+    ----------
+    passes : sequence of PassLog
+        All positions or all accelerations.
+    basis : sequence of WaveBasis
+    plant : DiscretePlant
+        The axis, at the sampling time of the commands.
+    homing_repeatability_mm : float
+        Written into the result.
+
+    Raises
+    ------
+    ModelError
+        If a pass was not homed, is too short or never steady, or a harmonic is not observable at
+        the speeds driven; says which, and the remedy.
+    """
+    _check(passes, basis)
+    blocks = [_block(log, basis, plant) for log in passes]
+    matrix = np.hstack(
+        [
+            np.concatenate([block.waves for block in blocks]),
+            block_diag(*(block.others for block in blocks)),
+        ]
+    )
+    aim = np.concatenate([block.values for block in blocks])
+    waves = sum(len(source.numbers) for source in basis)
+    if len(aim) < _FEWEST * 2 * waves:
+        raise ModelError(
+            f"{len(aim)} usable samples for {2 * waves} unknowns, at least {_FEWEST * 2 * waves} "
+            "needed: drive longer, or learn fewer harmonics"
+        )
+    seen = _observability(matrix, blocks, basis, passes)
+    missing = [one for one in seen if not one.observable]
+    if missing:
+        raise ModelError(_unobservable(missing))
+    unknown, *_ = np.linalg.lstsq(matrix, aim, rcond=None)
+    left = aim - matrix @ unknown
+    residual = math.sqrt(float(left @ left) / len(left))
+    spread = residual * np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    sines, cosines = unknown[: 2 * waves : 2], unknown[1 : 2 * waves : 2]
+    sd_mm = np.hypot(spread[: 2 * waves : 2], spread[1 : 2 * waves : 2]) / math.sqrt(2)
+    ripple = AxisRipple(
+        sources=_sources(basis, sines + 1j * cosines, sd_mm),
+        homing_repeatability_mm=homing_repeatability_mm,
+    )
+    total = _rms_beside(matrix[:, 2 * waves :], aim)
+    explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
+    return RippleLearning(ripple, seen, residual, explained)
+
+
+def update_ripple(
+    known: AxisRipple, learnt: AxisRipple, *, gain: float = 0.5, remaining: bool = False
+) -> AxisRipple:
+    """Carry a later learning into a table: the repetitive controller between prints.
+
+    Parameters
+    ----------
+    known, learnt : AxisRipple
+        Harmonics that only one of them lists count as zero in the other.
+    gain : float
+        1: take the new as it is; smaller: average over passes, against noise.
+    remaining : bool
+        True: `learnt` is what was left with `known` at work (logs against the plan); False: the
+        whole ripple again (logs against the command as it was sent).
+
+    Raises
+    ------
+    ModelError
+        If `gain` is outside 0 to 1, or a source of the same name has another pitch or side.
+    """
+    if not 0.0 < gain <= 1.0:
+        raise ModelError(f"learning gain {gain} must lie above 0 and not above 1")
+    old, new = _by_wave(known), _by_wave(learnt)
+    for name, pitch_mm, enters, _ in new:
+        for other, other_pitch, other_side, _ in old:
+            if name == other and (pitch_mm, enters) != (other_pitch, other_side):
+                raise ModelError(
+                    f"ripple {name!r}: pitch {pitch_mm:g} mm, {enters}, but the table has "
+                    f"{other_pitch:g} mm, {other_side}; name it otherwise, or learn afresh"
+                )
+    keep = 1.0 if remaining else 1.0 - gain
+    merged: dict[tuple[str, float, RippleSide], list[RippleHarmonic]] = {}
+    for wave in dict.fromkeys([*old, *new]):
+        c_before, sd_before = old.get(wave, (0j, 0.0))
+        c_learnt, sd_learnt = new.get(wave, (0j, 0.0))
+        c, sd = keep * c_before + gain * c_learnt, math.hypot(keep * sd_before, gain * sd_learnt)
+        merged.setdefault(wave[:3], []).append(_harmonic(wave[3], c, sd))
+    return AxisRipple(
+        sources=tuple(
+            RippleSource(name=name, pitch_mm=pitch_mm, enters=enters, harmonics=tuple(harmonics))
+            for (name, pitch_mm, enters), harmonics in merged.items()
+        ),
+        homing_repeatability_mm=max(known.homing_repeatability_mm, learnt.homing_repeatability_mm),
+    )
+
+
+def folded_distances(f_hz: Array, sensor_hz: float) -> Array:
+    """Return how far each frequency is from the singular set of a sensor, shape (m,).
+
+    The smallest |f_i|, |2 f_i| or |f_i +- f_k|, modulo `sensor_hz`: at 0 the samples cannot tell
+    the harmonic from a constant, its own mirror image, or another one (paper 001, section III).
+    Keep more than 1 / (length of the record).
+    """
+    f = np.abs(np.asarray(f_hz, np.float64))
+    candidates = [f, 2 * f]
+    for shift in range(1, len(f)):
+        other = np.roll(f, shift)
+        candidates += [f - other, f + other]
+    folded = np.abs(np.array(candidates))
+    return np.asarray(np.min(np.abs(folded - sensor_hz * np.round(folded / sensor_hz)), axis=0))
+
+
+def _check(passes: Sequence[PassLog], basis: Sequence[WaveBasis]) -> None:
+    if not passes or not basis:
+        raise ModelError("at least one pass and one pitch are needed to learn a ripple")
+    if len({log.kind for log in passes}) > 1:
+        raise ModelError("positions and accelerations cannot be learnt together; learn one kind")
+    for log in passes:
+        if not log.homed:
+            raise ModelError(
+                f"{log.source}: the log does not say that the machine was homed: without the "
+                "machine's zero the phase of the ripple is arbitrary and a table would do harm; "
+                "home (G28), drive the pass in machine coordinates and mark the log as homed"
+            )
+        if len(log.sensor_time_s) != len(log.measured) or len(log.command_mm) < 3:
+            raise ModelError(f"{log.source}: times and values of unequal number, or no motion")
+        if not (np.all(np.isfinite(log.measured)) and np.all(np.isfinite(log.command_mm))):
+            raise ModelError(f"{log.source}: values that are not finite numbers; cut them out")
+    unknowns = 2 * sum(len(source.numbers) for source in basis)
+    points = unknowns * max(len(log.command_mm) for log in passes)
+    if points > 40 * _LARGEST_POINTS:
+        raise ModelError(f"{unknowns} unknowns over a command this long; cut the pass into parts")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Block:
+    """One pass: columns of sine and cosine of every wave, columns of its own, and its values."""
+
+    waves: Array
+    others: Array
+    values: Array
+    frequencies_hz: Array | None
+
+
+def _block(log: PassLog, basis: Sequence[WaveBasis], plant: DiscretePlant) -> _Block:
+    of_position = log.kind == "position"
+    return _positions(log, basis, plant) if of_position else _accelerations(log, basis, plant)
+
+
+def _positions(log: PassLog, basis: Sequence[WaveBasis], plant: DiscretePlant) -> _Block:
+    times = plant.dt_s * np.arange(len(log.command_mm))
+    inside = (log.sensor_time_s >= 0) & (log.sensor_time_s <= times[-1])
+    at = log.sensor_time_s[inside]
+
+    def seen(values: Array) -> Array:
+        return np.asarray(np.interp(at, times, values))
+
+    columns = []
+    for source, number in _waves(basis):
+        angle = _wavenumber(source, number) * log.command_mm
+        for wave in (np.sin(angle), np.cos(angle)):
+            entered = _answer(plant, wave) if source.enters == "input" else wave
+            columns.append(seen(entered))
+    followed = _answer(plant, log.command_mm)
+    # The sensor's offset, and the lag that the model does not have: not by the mean beforehand,
+    # because short passes hold broken periods.
+    lag = seen(np.gradient(followed)) / plant.dt_s
+    others = np.stack([np.ones(len(at)), lag - lag.mean()], axis=1)
+    deviation = log.measured[inside] - seen(followed)
+    steady = _steady(log.command_mm, plant)
+    whole = steady.stop - steady.start > 0.5 * len(times)
+    speed = _speed(log, steady, plant.dt_s)
+    frequencies = _frequencies(basis, speed) if whole else None
+    return _Block(np.stack(columns, axis=1), others, deviation, frequencies)
+
+
+def _accelerations(log: PassLog, basis: Sequence[WaveBasis], plant: DiscretePlant) -> _Block:
+    steady = _steady(log.command_mm, plant)
+    times = plant.dt_s * np.arange(len(log.command_mm))
+    at = log.sensor_time_s
+    inside = (at >= times[steady.start]) & (at <= times[steady.stop - 1])
+    position = np.interp(at[inside], times, log.command_mm)
+    speed = _speed(log, steady, plant.dt_s)
+    columns = []
+    for source, number in _waves(basis):
+        wavenumber = _wavenumber(source, number)
+        rate = wavenumber * speed
+        # exp(j k s(t)) turns with `rate`, backwards if the axis moves back.
+        gain = -(rate**2) * (
+            _signed_response(plant, rate) if source.enters == "input" else complex(1.0)
+        )
+        turned = gain * np.exp(1j * wavenumber * position)
+        columns += [turned.imag, turned.real]
+    gravity = np.ones((int(inside.sum()), 1))
+    waves = np.stack(columns, axis=1)
+    return _Block(waves, gravity, log.measured[inside], _frequencies(basis, speed))
+
+
+def _steady(command: Array, plant: DiscretePlant) -> slice:
+    """Return the longest stretch of steady speed, from where the start has died down."""
+    speed = np.diff(command)
+    if len(speed) == 0 or np.abs(speed).max() == 0.0:
+        return slice(0, 0)
+    same = np.abs(np.diff(speed)) <= _STEADY * np.abs(speed).max()
+    same &= np.abs(speed[1:]) > 0.05 * np.abs(speed).max()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
+    starts, ends = edges[::2], edges[1::2]
+    if len(starts) == 0:
+        return slice(0, 0)
+    longest = int(np.argmax(ends - starts))
+    settled = int(starts[longest]) + math.ceil(plant.settling_time_s(1e-3) / plant.dt_s)
+    return slice(min(settled, int(ends[longest])), int(ends[longest]))
+
+
+def _speed(log: PassLog, steady: slice, dt_s: float) -> float:
+    """Speed of the steady stretch, mm/s; 0 if there is none (positions do not need one)."""
+    length = steady.stop - steady.start
+    if length < 2:
+        if log.kind == "acceleration":
+            raise ModelError(
+                f"{log.source}: the command never moves steadily for longer than the axis needs "
+                "to settle; an accelerometer needs a stretch of constant speed, drive longer"
+            )
+        return 0.0
+    moved = float(log.command_mm[steady.stop - 1] - log.command_mm[steady.start])
+    return moved / ((length - 1) * dt_s)
+
+
+def _waves(basis: Sequence[WaveBasis]) -> list[tuple[WaveBasis, int]]:
+    return [(source, number) for source in basis for number in source.numbers]
+
+
+def _wavenumber(source: WaveBasis, number: int) -> float:
+    return 2 * math.pi * number / source.pitch_mm
+
+
+def _frequencies(basis: Sequence[WaveBasis], speed: float) -> Array:
+    return np.array([number * abs(speed) / source.pitch_mm for source, number in _waves(basis)])
+
+
+def _answer(plant: DiscretePlant, values: Array) -> Array:
+    """Response of the axis that stood still before."""
+    out = np.empty(len(values))
+    state = np.zeros(plant.order)
+    u = np.ascontiguousarray(values, np.float64)
+    dense_response(plant.a, plant.b, plant.c, plant.d, float(u[0]), state, u, out)
+    return out
+
+
+def _signed_response(plant: DiscretePlant, rate: float) -> complex:
+    value = complex(plant.frequency_response(abs(rate) / (2 * math.pi))[0])
+    return value if rate >= 0 else value.conjugate()
+
+
+def _observability(
+    matrix: Array, blocks: Sequence[_Block], basis: Sequence[WaveBasis], passes: Sequence[PassLog]
+) -> tuple[Observability, ...]:
+    """Judge all passes together by noise gain; the distance is the largest of a single one."""
+    waves = _waves(basis)
+    scale = np.linalg.norm(matrix, axis=0)
+    scale[scale == 0.0] = 1.0
+    unit = matrix / scale
+    # 1 / sqrt of the inverse's diagonal is each column's part that no other column explains.
+    _, sizes, right = np.linalg.svd(unit, full_matrices=False)
+    kept = np.maximum(sizes, 1e-9 * sizes[0])
+    spread = np.sqrt(np.sum((right / kept[:, None]) ** 2, axis=0))
+    distances = np.full(len(waves), -1.0)
+    for block, log in zip(blocks, passes, strict=True):
+        if block.frequencies_hz is not None:
+            interval = float(np.median(np.diff(log.sensor_time_s)))
+            found = folded_distances(block.frequencies_hz, 1.0 / interval)
+            distances = np.maximum(distances, found)
+    out = []
+    for k, (source, number) in enumerate(waves):
+        gain = float(np.max(spread[2 * k : 2 * k + 2]))
+        out.append(
+            Observability(
+                source.name,
+                number,
+                gain,
+                float(distances[k]) if distances[k] >= 0 else None,
+                gain <= LARGEST_NOISE_GAIN,
+            )
+        )
+    return tuple(out)
+
+
+def _rms_beside(columns: Array, values: Array) -> float:
+    """Return the rms of what is left without the waves."""
+    left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+    return math.sqrt(float(left @ left) / len(left))
+
+
+def _unobservable(missing: Sequence[Observability]) -> str:
+    named = ", ".join(
+        f"{one.source} {one.number} (noise gain {one.noise_gain:.3g}"
+        + ("" if one.distance_hz is None else f", {one.distance_hz:.3g} Hz from folding")
+        + ")"
+        for one in missing
+    )
+    return (
+        f"not observable at the speeds driven: {named}; limit {LARGEST_NOISE_GAIN:g}. The sensor "
+        "cannot tell them apart: add a pass at another speed (f = h v / pitch), or learn fewer "
+        "harmonics"
+    )
+
+
+def _sources(basis: Sequence[WaveBasis], c_mm: Complex, sd_mm: Array) -> tuple[RippleSource, ...]:
+    out, first = [], 0
+    for source in basis:
+        harmonics = tuple(
+            _harmonic(number, complex(c_mm[first + k]), float(sd_mm[first + k]))
+            for k, number in enumerate(source.numbers)
+        )
+        out.append(
+            RippleSource(
+                name=source.name,
+                pitch_mm=source.pitch_mm,
+                enters=source.enters,
+                harmonics=harmonics,
+            )
+        )
+        first += len(source.numbers)
+    return tuple(out)
+
+
+def _harmonic(number: int, c_mm: complex, sd_mm: float) -> RippleHarmonic:
+    return RippleHarmonic(
+        number=number,
+        amplitude_um=1e3 * abs(c_mm),
+        phase_deg=math.degrees(math.atan2(c_mm.imag, c_mm.real)),
+        sd_um=1e3 * sd_mm,
+    )
+
+
+def _by_wave(
+    ripple: AxisRipple,
+) -> dict[tuple[str, float, RippleSide, int], tuple[complex, float]]:
+    return {
+        (source.name, source.pitch_mm, source.enters, h.number): (
+            1e-3 * h.amplitude_um * np.exp(1j * math.radians(h.phase_deg)),
+            1e-3 * (h.sd_um or 0.0),
+        )
+        for source in ripple.sources
+        for h in source.harmonics
+    }

@@ -1,0 +1,183 @@
+"""Ripple: errors that repeat with the position of an axis, not with time.
+
+A belt's teeth, a pulley's eccentricity and a motor's poles shift an axis by a periodic function of
+where it stands. With s the commanded position of the axis after homing,
+
+    delta(s) = sum_h a_h sin(2 pi h s / p + phi_h),    p the pitch,
+
+and it enters the motion in one of two places (reference: repetitive compensation of print files,
+finding (i)):
+
+``input``
+    before the machine vibrates: y = G (u + delta(u)). Belt tooth, leadscrew, motor pole.
+``output``
+    as a deviation of the tool itself: y = G u + d(s). A crooked rail, a measured map.
+
+Phases are absolute: they count from the machine's zero after homing, and a machine that homes
+elsewhere the next time has another ripple (`RippleTable.residual_share`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = ["AxisRipple", "RippleHarmonic", "RippleSide", "RippleSource", "RippleTable"]
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+RippleSide = Literal["input", "output"]
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+STEEPEST = 0.5
+"""Largest slope |d delta / d s|: beyond 1 the motor would have to turn back to move on."""
+
+
+class _Document(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RippleHarmonic(_Document):
+    """amplitude_um sin(2 pi number s / pitch + phase_deg), s from the machine's zero."""
+
+    number: Annotated[int, Field(ge=1, le=400)]
+    amplitude_um: NonNegative
+    phase_deg: Finite
+    sd_um: NonNegative | None = None
+    """Standard deviation of the amplitude, if it was measured."""
+
+
+class RippleSource(_Document):
+    """One periodic part of the drive.
+
+    Attributes
+    ----------
+    name : str
+        What it is: "belt", "pulley", "motor pole".
+    pitch_mm : float
+        Travel of the axis after which it repeats.
+    enters : str
+        ``input`` or ``output``.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    pitch_mm: Annotated[float, Field(gt=1e-3, le=2000, allow_inf_nan=False)]
+    enters: RippleSide = "input"
+    harmonics: Annotated[tuple[RippleHarmonic, ...], Field(min_length=1, max_length=64)]
+
+    @model_validator(mode="after")
+    def _each_once(self) -> RippleSource:
+        numbers = [harmonic.number for harmonic in self.harmonics]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError(f"ripple {self.name!r}: a harmonic is listed twice in {numbers}")
+        return self
+
+
+class AxisRipple(_Document):
+    """Ripple of one axis.
+
+    Attributes
+    ----------
+    homing_repeatability_mm : float
+        How far apart two homings leave the machine's zero; the phases are off by as much.
+    """
+
+    sources: Annotated[tuple[RippleSource, ...], Field(min_length=1, max_length=16)]
+    homing_repeatability_mm: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _gentle(self) -> AxisRipple:
+        slope = self.table("input").steepest
+        if slope > STEEPEST:
+            raise ValueError(
+                f"the input ripple has a slope of up to {slope:.2g} mm per mm, more than "
+                f"{STEEPEST}: check amplitude_um (micrometres) and pitch_mm (millimetres)"
+            )
+        return self
+
+    def table(self, side: RippleSide) -> RippleTable:
+        """Return the waves of all sources that enter at `side`; there may be none."""
+        return RippleTable.of(source for source in self.sources if source.enters == side)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RippleTable:
+    """Waves along an axis: sum of Im(coefficient exp(j wavenumber s)).
+
+    Attributes
+    ----------
+    wavenumber : ndarray, shape (m,)
+        2 pi h / pitch, rad/mm.
+    coefficient_mm : ndarray of complex128, shape (m,)
+        a_h exp(j phi_h).
+    """
+
+    wavenumber: Array
+    coefficient_mm: Complex
+
+    @classmethod
+    def of(cls, sources: Iterable[RippleSource]) -> RippleTable:
+        """Collect the harmonics of `sources`."""
+        waves = [(source.pitch_mm, h) for source in sources for h in source.harmonics]
+        return cls(
+            np.array([2 * math.pi * h.number / pitch for pitch, h in waves], np.float64),
+            np.array(
+                [1e-3 * h.amplitude_um * np.exp(1j * math.radians(h.phase_deg)) for _, h in waves],
+                np.complex128,
+            ),
+        )
+
+    def __len__(self) -> int:
+        return len(self.wavenumber)
+
+    @property
+    def steepest(self) -> float:
+        """Bound of |d delta / d s|."""
+        return float(self.wavenumber @ np.abs(self.coefficient_mm))
+
+    @property
+    def largest_mm(self) -> float:
+        """Bound of |delta|."""
+        return float(np.sum(np.abs(self.coefficient_mm)))
+
+    def deviation_mm(self, position_mm: ArrayLike, weight: Array | None = None) -> Array:
+        """Return delta at the positions, shape (n,).
+
+        Parameters
+        ----------
+        position_mm : array_like, shape (n,)
+        weight : ndarray, shape (m, n), optional
+            Share of every wave at every position; default: all of it.
+        """
+        s = np.asarray(position_mm, np.float64)
+        out = np.zeros_like(s)
+        for k, (number, c) in enumerate(zip(self.wavenumber, self.coefficient_mm, strict=True)):
+            wave = abs(c) * np.sin(number * s + np.angle(c))
+            out += wave if weight is None else weight[k] * wave
+        return out
+
+    def slope(self, position_mm: ArrayLike, weight: Array | None = None) -> Array:
+        """Return d delta / d s at the positions, shape (n,); see `deviation_mm`."""
+        rates = self.wavenumber * self.coefficient_mm * 1j
+        return RippleTable(self.wavenumber, rates).deviation_mm(position_mm, weight)
+
+    def residual_share(self, offset_mm: float) -> float:
+        """Return what compensation leaves if the table lies `offset_mm` beside the ripple.
+
+        rms of delta(s + offset) - delta(s) over that of delta: 2 sin(k offset / 2) for one wave.
+        Above 1 the compensation does harm.
+        """
+        power = np.abs(self.coefficient_mm) ** 2
+        if power.sum() == 0.0:
+            return 0.0
+        left = 4 * np.sin(0.5 * self.wavenumber * offset_mm) ** 2
+        return math.sqrt(float(power @ left / power.sum()))
