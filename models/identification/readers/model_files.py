@@ -150,7 +150,7 @@ def _form(fields: Mapping[str, Any]) -> str:
         return str(fields["kind"])
     if all(names & set(_ALIASES[part]) for part in ("num", "den")):
         return "tf"
-    if names & set(_ALIASES["poles"]):
+    if names & set(_ALIASES["poles"]) and names & {*_ALIASES["zeros"], *_ALIASES["gain"]}:
         return "zpk"
     return "ss" if {"a", "b", "c"} <= names else ""
 
@@ -192,19 +192,21 @@ def _field(lower: Mapping[str, Any], part: str) -> Any:
 
 
 def _sampling_s(given: Any, settings: ReadSettings) -> float | None:
-    if isinstance(given, (bool, np.bool_)):
-        unsaid = bool(given)
-    else:
-        value = 0.0 if given is None else _one(given, "dt")
-        unsaid = value < 0
-        if not unsaid:
-            return value or settings.sampling_s
-    if unsaid and settings.sampling_s is None:
+    """Return the sampling time, None for continuous.
+
+    True in python-control and -1 in MATLAB are discrete models that do not say theirs.
+    """
+    if given is None:
+        return settings.sampling_s
+    value = (-1.0 if given else 0.0) if isinstance(given, bool) else _one(given, "dt")
+    if value >= 0:
+        return value or None
+    if settings.sampling_s is None:
         raise ModelError(
             f"the model is discrete but does not say its sampling time (dt = {given}); "
             "give sampling_s"
         )
-    return settings.sampling_s if unsaid else None
+    return settings.sampling_s
 
 
 def _polynomial(given: Any, name: str) -> list[float]:

@@ -34,7 +34,8 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
 
     Either psd_x, psd_y, psd_z, psd_xyz, or one column per data set (klippy/extras/
     shaper_calibrate.py since 2024-12); Kalico adds accel_per_hz. Columns of shapers, in any
-    of the three ways of writing them, say that the values were normalised, which is undone.
+    of the three ways of writing them, say that the values were normalised, which is undone;
+    so does the name calibration_data.
 
     Raises
     ------
@@ -53,9 +54,10 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
         raise table.at(int(row), f"{names[column]} is negative: {psd[row, column]:g}")
     f_hz = _unrounded(f_hz, table)
     notes = list(table.notes)
-    if shapers:
+    if shapers or "calibration_data" in table.source:
         f_hz, psd = _undone(f_hz, psd, smooth=any(s.startswith("smooth_") for s in shapers))
-        notes.append("Klipper's normalisation by frequency is undone")
+        why = "" if shapers else ", which the file's name tells, not its columns"
+        notes.append(f"Klipper's normalisation by frequency is undone{why}")
     by_name = {n.removeprefix("psd_"): psd[:, i] for i, n in enumerate(names)}
     notes += _check_densities(by_name, table, axis, settings)
     return Spectrum(

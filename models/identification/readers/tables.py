@@ -47,16 +47,24 @@ class Table:
     notes: tuple[str, ...] = field(default=())
 
     def index(self, column: str | int) -> int:
-        """Return the position of a column; raise ModelError if there is none."""
-        width = len(self.names) or (len(self.split(self.rows[0])) if self.rows else 0)
-        if isinstance(column, int):
-            if column < width:
-                return column
-            raise ModelError(f"{self.source}: no column {column}, counted from 0; it has {width}")
-        if column.lower() in self.names:
+        """Return the position of a column, which may be told by its number (also as a text).
+
+        Raises
+        ------
+        ModelError
+            If there is none.
+        """
+        if isinstance(column, str) and column.lower() in self.names:
             return self.names.index(column.lower())
-        listed = ", ".join(self.names) or "none named"
-        raise ModelError(f"{self.source}: column {column!r} is missing; there are: {listed:.300}")
+        if isinstance(column, str) and not column.isdecimal():
+            listed = ", ".join(self.names) or "none named"
+            raise ModelError(
+                f"{self.source}: column {column!r} is missing; there are: {listed:.300}"
+            )
+        width = len(self.names) or (len(self.split(self.rows[0])) if self.rows else 0)
+        if int(column) < width:
+            return int(column)
+        raise ModelError(f"{self.source}: no column {column}, counted from 0; it has {width}")
 
     def numbers(self, columns: Sequence[str | int]) -> Array:
         """Return the columns as numbers, shape (rows, columns).

@@ -217,7 +217,7 @@ def test_drive_with_columns_of_any_name(mark: str, by_number: bool) -> None:
     lines += [mark.join([f"{k / 500!r}", str(k), f"{u[k]!r}", f"{y[k]!r}"]) for k in range(90)]
     if by_number:
         lines.pop(0)
-        known: dict[str, object] = {"time_column": 0, "command_column": 2, "measured_column": 3}
+        known: dict[str, object] = {"time_column": 0, "command_column": "2", "measured_column": 3}
     else:
         known = {"time_column": "t", "command_column": "u", "measured_column": "acc"}
     log = read("\n".join(lines) + "\n", "log.txt", **known)

@@ -223,6 +223,11 @@ def test_refusals(document: Any, message: str) -> None:
 def test_sampling_time_may_be_told() -> None:
     document = {"num": [0.1], "den": [1, -0.9], "dt": True}
     assert read(document, sampling_s=0.002).spec.sampling_s == 0.002
+    assert read({**document, "dt": 0.001}, sampling_s=0.002).spec.sampling_s == 0.001
+    document.pop("dt")
+    assert read(document, sampling_s=0.002).spec.sampling_s == 0.002
+    continuous = {"num": [1], "den": [0.01, 1], "dt": 0}
+    assert read(continuous, sampling_s=0.002).spec.sampling_s is None
 
 
 @hypothesis_settings(deadline=None)

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 
 from models.errors import ModelError
 from models.identification.readers import ReadSettings, read_content, read_measurements
-from models.identification.types import FrequencyResponse, Spectrum
+from models.identification.synthetic import (
+    simulate_spectrum,
+    write_calibration_data,
+    write_resonances,
+)
+from models.identification.types import Excitation, FrequencyResponse, Spectrum
+from models.plants import PairsSpec, PolePair
 
 RATE_HZ = 3193.7
 
@@ -129,6 +135,27 @@ def test_spectrum_faults() -> None:
     text = table(header + ",accel_per_hz", PSD, "60.0")
     with pytest.raises(ModelError, match="the same in every line"):
         read(text[: text.rindex("60.0")] + "75.0\n")
+
+
+def test_simulated_tables_come_back(tmp_path: Path) -> None:
+    plant = PairsSpec(poles=(PolePair(f_hz=40, zeta=0.05),))
+    test = Excitation((0.0, 1.0), f_start_hz=5, f_end_hz=30)
+    rng = np.random.default_rng(4)
+    made = simulate_spectrum({"y": plant}, test, rng=rng)
+    curve = {"mzv(52.2)": np.zeros(len(made.f_hz))}
+    for path, above_hz in (
+        (write_resonances(made, tmp_path), -1.0),
+        (write_calibration_data(made, tmp_path, "1"), 5.0),
+        (write_calibration_data(made, tmp_path, "2", shapers=curve), 5.0),
+    ):
+        (read_back,) = read_measurements(path)
+        assert isinstance(read_back, Spectrum)
+        assert read_back.axis == "y"
+        used = read_back.f_hz > above_hz
+        start = len(made.f_hz) - len(read_back.f_hz)
+        np.testing.assert_allclose(read_back.f_hz, made.f_hz[start:], atol=0.01)
+        for name, psd in made.psd.items():
+            np.testing.assert_allclose(read_back.psd[name][used], psd[start:][used], rtol=0.01)
 
 
 @pytest.mark.shared
