@@ -56,7 +56,7 @@ class Compensator(Protocol):
         ...
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is when the next piece begins; it stands still."""
+        """Say where the machine is during the next piece; it stands still now."""
         ...
 
     def compensate(

@@ -30,6 +30,7 @@ from compensation.preview_axis import (
     Rung,
     changes,
     designs,
+    functions_within,
 )
 from compensation.sliding import balanced_weights, slide
 from compensation.window_problem import Bounds
@@ -84,7 +85,8 @@ class PreviewFbf:
         What X and Y are designed for: plants and their weights.
     along : float
     rungs : tuple of int
-        Steps of `LADDER` that the last command took, X and Y.
+        Steps of the ladders (`LADDER`, within the models' bands) that the last command took, X and
+        Y.
 
     Raises
     ------
@@ -133,7 +135,11 @@ class PreviewFbf:
         self.rungs: tuple[int, ...] = ()
         sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
         chosen = _chosen(sets, robust, dt_s, window, update, basis, along)
-        made = [designs(plants, weights, window, update, basis) for plants, weights in chosen]
+        bands_hz = [machine.axes["x"].band_hz, machine.axes["y"].band_hz]
+        made = [
+            designs(*one, window, update, basis, functions_within(band_hz, dt_s))
+            for one, band_hz in zip(chosen, bands_hz, strict=True)
+        ]
         for one in made:
             one.check()
         self.lifted = tuple(one.lifted for one in made)
@@ -222,7 +228,7 @@ class PreviewFbf:
     def _ladder(self, axis: PreviewAxis, task: AxisTask) -> tuple[AxisCommand, int, frozenset[int]]:
         """Command, rung and windows solved within bounds."""
         dt, bounds = self._dt_s, task.bounds
-        rung, last = axis.rung, len(LADDER) - 1
+        rung, last = axis.rung, axis.last_rung
         careful: frozenset[int] = frozenset()
         rounds = 0
         asked = ""

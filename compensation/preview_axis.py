@@ -19,6 +19,7 @@ from models.plants import DiscretePlant
 from models.response_kernels import dense_response
 
 __all__ = [
+    "BAND_MARGIN",
     "GENTLE_RUNG",
     "LADDER",
     "WEIGHT_REST",
@@ -30,6 +31,7 @@ __all__ = [
     "Rung",
     "changes",
     "designs",
+    "functions_within",
 ]
 
 Array = NDArray[np.float64]
@@ -51,6 +53,9 @@ LADDER = (
 """Designs from the most accurate to the gentlest."""
 GENTLE_RUNG = 3
 """The last one with all functions: further down smoothness costs accuracy."""
+BAND_MARGIN = 1.2
+"""How far above its model's band a command may reach. Prices slope the cut-off: what is left beyond
+the band is little, and functions that end right at it would cost accuracy within."""
 
 REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
@@ -103,10 +108,20 @@ class AxisCommand:
 
 
 class Designs:
-    """The designs of an axis, made when first asked for."""
+    """The designs of an axis, made when first asked for.
 
-    def __init__(self, lifted: LiftedWindow, basis: str) -> None:
+    Attributes
+    ----------
+    lifted : LiftedWindow
+    ladder : tuple of Rung
+        `LADDER` with at most so many functions as the model's band allows; rungs that become the
+        same are one.
+    """
+
+    def __init__(self, lifted: LiftedWindow, basis: str, most: int = 300) -> None:
         self.lifted = lifted
+        capped = (Rung(min(rung.n, most), rung.price) for rung in LADDER)
+        self.ladder = tuple(dict.fromkeys(capped))
         self._basis = basis
         self._made: dict[tuple[int, float], PreviewDesign] = {}
         self._set = lifted.lifted_set()
@@ -114,7 +129,7 @@ class Designs:
 
     def design(self, rung: int, most: int = 300) -> PreviewDesign:
         """Return the design of a rung, with at most so many functions per 300 samples."""
-        step = LADDER[rung]
+        step = self.ladder[rung]
         n = self._scaled(min(step.n, most))
         if (n, step.price) not in self._made:
             psi = self._psi(n)
@@ -124,7 +139,7 @@ class Designs:
     def check(self) -> None:
         """Raise the DesignError of the first rung if every rung refuses itself."""
         refusals = []
-        for rung in range(len(LADDER)):
+        for rung in range(len(self.ladder)):
             try:
                 self.design(rung)
             except DesignError as error:
@@ -134,7 +149,7 @@ class Designs:
         raise refusals[0]
 
     def _psi(self, n: int) -> Array:
-        size = self._scaled(max(rung.n for rung in LADDER)) if self._basis in _NESTED else n
+        size = self._scaled(self.ladder[0].n) if self._basis in _NESTED else n
         if size not in self._functions:
             self._functions[size] = self._made_for(size)
         return self._functions[size]
@@ -162,9 +177,18 @@ def designs(
     window: int,
     update: int,
     basis: str,
+    most: int = 300,
 ) -> Designs:
     """Designs of an axis, kept as long as the process works with this machine revision."""
-    return Designs(lifted_window(plants, weights, window, update), basis)
+    return Designs(lifted_window(plants, weights, window, update), basis, most)
+
+
+def functions_within(band_hz: tuple[float, float] | None, dt_s: float) -> int:
+    """Most functions per 300 samples with which a command stays within the band of its model.
+
+    n functions over a window T span frequencies up to n / (2 T).
+    """
+    return 300 if band_hz is None else max(4, int(2 * 300 * dt_s * BAND_MARGIN * band_hz[1]))
 
 
 class PreviewAxis:
@@ -174,6 +198,8 @@ class PreviewAxis:
     ----------
     rung, next_rung : int
         Where the ladder starts for this piece, and for the next one once this is committed.
+    last_rung : int
+        The gentlest design.
     members : int
         Plants that the designs look at.
     """
@@ -184,6 +210,7 @@ class PreviewAxis:
         self._plants = designs.lifted.plants
         self.members = len(self._plants)
         self.rung = self.next_rung = 0
+        self.last_rung = len(designs.ladder) - 1
         self.reset(0.0)
 
     def reset(self, position: float) -> None:
@@ -233,7 +260,7 @@ class PreviewAxis:
         Parameters
         ----------
         rung : int
-            Index into `LADDER`.
+            Index into `Designs.ladder`.
         task : AxisTask
         careful : set of int
             Windows in which the bounds are kept.

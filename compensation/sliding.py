@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from compensation._sliding_kernels import contour_square, move_targets
 from compensation.lifted_window import lifted_window
 from compensation.preview_axis import (
-    LADDER,
     WEIGHT_TRAVEL,
     AxisCommand,
     AxisTask,
@@ -108,7 +107,7 @@ def _within_bounds(
         if not outside:
             return command, (rung, careful)
         if outside <= careful:
-            rung, careful = min(rung + 1, len(LADDER) - 1), frozenset()
+            rung, careful = min(rung + 1, axis.last_rung), frozenset()
         else:
             careful |= outside
     return None, choice

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from compensation.base import DesignError
 from compensation.basis import BASES, ZERO
-from compensation.fbf import LADDER, ROBUST, PreviewFbf
+from compensation.fbf import ROBUST, PreviewFbf
 from compensation.lifted import LiftedSet, integrated, lift, lifted_set
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.metrics import (
@@ -26,7 +26,7 @@ from compensation.metrics import (
     robust_error_of_spread,
 )
 from compensation.nominal import two_step
-from compensation.preview_axis import Designs, designs
+from compensation.preview_axis import Designs, designs, functions_within
 from compensation.shapers import SHAPERS
 from models.machine import Machine
 from models.plants import DiscretePlant, PlantSet, plant_set
@@ -116,7 +116,8 @@ def design_report(
         lifted = lifted_window(plants.members, plants.weights, window, round(update_s / dt_s))
     # What the product refuses as a whole, no rung of it can be used for.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
-    ladder = _ladder(plants, lifted, basis, dt_s, whole)
+    most = functions_within(machine.axes["x" if axis == "x" else "y"].band_hz, dt_s)
+    ladder = _ladder(plants, lifted, basis, dt_s, whole, most)
     names = [f"n {rung.n}, price {rung.price:g}" for rung in ladder]
 
     trial = Trial(machine, axis, dt_s, motion, errors_percent)
@@ -276,7 +277,12 @@ def _increments(members: Sequence[DiscretePlant], weights: Array, window: int) -
 
 
 def _ladder(
-    plants: PlantSet, lifted: LiftedWindow, basis: str, dt_s: float, refused: str | None
+    plants: PlantSet,
+    lifted: LiftedWindow,
+    basis: str,
+    dt_s: float,
+    refused: str | None,
+    most: int,
 ) -> tuple[RungFigures, ...]:
     window = lifted.window
     nominal = _increments((plants.nominal,), np.ones(1), window)
@@ -285,8 +291,9 @@ def _ladder(
         every = _increments(plants.members, plants.weights, window)
     # The very designs that the product uses.
     weights = tuple(lifted.weights.tolist())
-    table = designs(lifted.plants, weights, window, lifted.update, basis)
-    return tuple(_rung(k, table, dt_s, nominal, every, refused) for k in range(len(LADDER)))
+    table = designs(lifted.plants, weights, window, lifted.update, basis, most)
+    rungs = range(len(table.ladder))
+    return tuple(_rung(k, table, dt_s, nominal, every, refused) for k in rungs)
 
 
 def _rung(
@@ -297,7 +304,7 @@ def _rung(
     every: LiftedSet | None,
     refused: str | None,
 ) -> RungFigures:
-    rung, lifted = LADDER[number], table.lifted
+    rung, lifted = table.ladder[number], table.lifted
     n = max(4, round(rung.n * lifted.window / 300))
     cutoff_hz = n / (2 * lifted.window * dt_s)
     try:

@@ -90,7 +90,7 @@ class PieceCompensator:
         ----------
         piece : Piece
         point : OperatingPoint
-            Where the machine is when the piece begins; without schedules it does not matter.
+            Where the machine is meanwhile; without schedules it does not matter.
 
         Raises
         ------

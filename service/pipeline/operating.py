@@ -49,7 +49,10 @@ class Operation:
         self._used: dict[str, tuple[float, float]] = {}
 
     def at(self, moves: Moves) -> OperatingPoint:
-        """Return the point at which these moves begin; its height is where they first print."""
+        """Return where the machine is while these moves run, which come next.
+
+        The mass is that at half of their filament, the position where they first print.
+        """
         if not self._machine.schedules:
             return self._point
         known = np.flatnonzero(moves.known == _ALL_KNOWN)
@@ -59,21 +62,16 @@ class Operation:
             prints = (travel[:, 3] > 0.0) & np.any(travel[:, :2] != 0.0, axis=1)
             x, y, z = moves.start_mm[known[np.argmax(prints)], :3].tolist()
             position = (x, y, z)
-        self._point = OperatingPoint(self.printed_kg, *position)
+        laid_mm, _ = self._laid(moves)
+        half_kg = 0.5 * self._kg_per_mm * laid_mm
+        self._point = OperatingPoint(self.printed_kg + half_kg, *position)
         self._note_range()
         return self._point
 
     def passed(self, moves: Moves) -> None:
         """Count the filament of moves that are done."""
-        if self._kg_per_mm == 0.0 or len(moves) == 0:
-            return
-        if self._furthest_mm is None:
-            self._furthest_mm = float(moves.start_mm[0, 3])
-        fed = moves.end_mm[:, 3]
-        furthest = np.maximum.accumulate(np.append(self._furthest_mm, fed))
-        moving = np.any(moves.end_mm[:, :2] != moves.start_mm[:, :2], axis=1)
-        self.printed_kg += self._kg_per_mm * float(np.sum(np.diff(furthest)[moving]))
-        self._furthest_mm = float(furthest[-1])
+        laid_mm, self._furthest_mm = self._laid(moves)
+        self.printed_kg += self._kg_per_mm * laid_mm
 
     def notes(self) -> list[str]:
         """Return what the plants followed, in words."""
@@ -94,6 +92,15 @@ class Operation:
                 text += f": its lowest resonance was between {low:.1f} and {high:.1f} Hz"
             notes.append(f"{text}.")
         return notes
+
+    def _laid(self, moves: Moves) -> tuple[float, float | None]:
+        """Filament that the moves lay down, and the extruder's furthest position behind them."""
+        if self._kg_per_mm == 0.0 or len(moves) == 0:
+            return 0.0, self._furthest_mm
+        start_mm = moves.start_mm[0, 3] if self._furthest_mm is None else self._furthest_mm
+        furthest = np.maximum.accumulate(np.append(start_mm, moves.end_mm[:, 3]))
+        moving = np.any(moves.end_mm[:, :2] != moves.start_mm[:, :2], axis=1)
+        return float(np.sum(np.diff(furthest)[moving])), float(furthest[-1])
 
     def _note_range(self) -> None:
         level = self._grid.level(self._point)
