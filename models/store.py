@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -11,7 +12,14 @@ from pydantic import ValidationError
 from models.errors import ModelError
 from models.machine import Machine
 
-__all__ = ["builtin_machines", "load_machine", "read_machine"]
+__all__ = [
+    "builtin_machines",
+    "explain",
+    "load_machine",
+    "names_a_file",
+    "no_such_machine",
+    "read_machine",
+]
 
 _LIBRARY = Path(__file__).parent / "library"
 _LARGEST_BYTES = 4_000_000
@@ -33,17 +41,29 @@ def load_machine(name_or_path: str | Path) -> Machine:
         If there is no such machine or file, or the document is not a valid machine.
     """
     text = str(name_or_path)
-    if isinstance(name_or_path, Path) or text.endswith(".json") or "/" in text or "\\" in text:
+    if isinstance(name_or_path, Path) or names_a_file(text):
         return _from_file(Path(name_or_path))
-    names = builtin_machines()
-    if text not in names:
-        near = difflib.get_close_matches(text.lower().replace("_", "-"), names, n=3, cutoff=0.5)
-        hint = f"did you mean {', '.join(near)}? " if near else ""
-        raise ModelError(
-            f"no machine is called {text!r}; {hint}Built in are {', '.join(names)}; "
-            "a file of your own is given by its path, ending in .json"
-        )
+    if text not in builtin_machines():
+        raise no_such_machine(text)
     return _from_file(_LIBRARY / f"{text}.json")
+
+
+def names_a_file(text: str) -> bool:
+    """Return whether `text` is the path of a file rather than a machine's name."""
+    return text.endswith(".json") or "/" in text or "\\" in text
+
+
+def no_such_machine(name: str, own: Sequence[str] = ()) -> ModelError:
+    """Return the error for a name that neither the library nor the user's store (`own`) knows."""
+    names = builtin_machines()
+    wanted = name.lower().replace("_", "-")
+    near = difflib.get_close_matches(wanted, [*own, *names], n=3, cutoff=0.5)
+    hint = f"did you mean {', '.join(near)}? " if near else ""
+    yours = f"your own are {', '.join(own)}; " if own else ""
+    return ModelError(
+        f"no machine is called {name!r:.80}; {hint}{yours}Built in are {', '.join(names)}; "
+        "a file of your own is given by its path, ending in .json"
+    )
 
 
 def read_machine(document: str | bytes, source: str = "machine") -> Machine:
@@ -61,7 +81,22 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
     try:
         return Machine.model_validate(parsed)
     except ValidationError as error:
-        raise ModelError(f"{source}: {_explain(error)}") from None
+        raise ModelError(f"{source}: {explain(error)}") from None
+
+
+def explain(error: ValidationError) -> str:
+    """Return the first complaint about a document in one line, with the number of further ones."""
+    complaints = error.errors(include_url=False)
+    # An unfitting branch of a union complains too; the deepest complaint is the one meant.
+    first = max(complaints, key=lambda c: len(c["loc"]))
+    where = ".".join(str(part) for part in first["loc"]) or "document"
+    message = first["msg"].removeprefix("Value error, ")
+    given = first["input"]
+    shown = "" if isinstance(given, (dict, list, tuple)) else f" (given: {given!r:.80})"
+    if first["type"] == "missing":
+        shown = ""
+    more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
+    return f"{where}: {message}{shown}{more}"
 
 
 def _from_file(path: Path) -> Machine:
@@ -75,18 +110,3 @@ def _from_file(path: Path) -> Machine:
             f"{', '.join(builtin_machines())}"
         ) from None
     return read_machine(document, str(path))
-
-
-def _explain(error: ValidationError) -> str:
-    """Tell the first complaint in one line, with the number of further ones."""
-    complaints = error.errors(include_url=False)
-    # An unfitting branch of a union complains too; the deepest complaint is the one meant.
-    first = max(complaints, key=lambda c: len(c["loc"]))
-    where = ".".join(str(part) for part in first["loc"]) or "document"
-    message = first["msg"].removeprefix("Value error, ")
-    given = first["input"]
-    shown = "" if isinstance(given, (dict, list, tuple)) else f" (given: {given!r:.80})"
-    if first["type"] == "missing":
-        shown = ""
-    more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
-    return f"{where}: {message}{shown}{more}"

@@ -15,6 +15,7 @@ import typer
 
 from service.environment import prepare_environment
 from service.interruption import Interrupted
+from service.machines import commands as machines
 
 __all__ = ["app", "main", "run"]
 
@@ -25,6 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.add_typer(machines.app, name="machines")
 
 _INTERRUPTED = 130
 _METHODS = (
@@ -142,7 +144,8 @@ def compensate(
     from service.pipeline.road import compensate_file
 
     with progress_shown("stillpath") as progress:
-        result = compensate_file(source, target, found, options, progress=progress)
+        result = compensate_file(source, target, found.machine, options, progress=progress)
+    result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)
 
@@ -165,7 +168,7 @@ def plan(
     from service.pipeline.road import plan_file
 
     with progress_shown("stillpath") as progress:
-        plan_file(source, target, found, rate_hz=rate, progress=progress)
+        plan_file(source, target, found.machine, rate_hz=rate, progress=progress)
 
 
 @app.command()
@@ -185,7 +188,8 @@ def simulate(
     from service.pipeline.road import simulate_file
 
     with progress_shown("stillpath") as progress:
-        result = simulate_file(source, found, progress=progress)
+        result = simulate_file(source, found.machine, progress=progress)
+    result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)
 
@@ -202,7 +206,7 @@ def design(
 ) -> None:
     """Look at the design for one axis: plant, metrics, ladder, and what errors of it cost."""
     _check_folder(report)
-    found = _machine(machine)
+    found = machines.open_machines().to_look_at(machine, files=True).machine
 
     from service.design.design import design_report
     from service.design.page import write_design
@@ -212,25 +216,6 @@ def design(
     if report is not None:
         write_design(made, report)
     print_design(made)
-
-
-@app.command()
-def machines(
-    name: Annotated[str | None, typer.Argument(help="Show this one, as JSON.")] = None,
-) -> None:
-    """List the built-in machines, or print one as a JSON document to start from."""
-    from models.store import builtin_machines
-
-    if name is not None:
-        typer.echo(_machine(name).model_dump_json(indent=1))
-        return
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("name", "machine", "kinematics", "revision", box=None, pad_edge=False)
-    for entry in map(_machine, builtin_machines()):
-        table.add_row(entry.name, entry.title, entry.kinematics, entry.revision)
-    Console(highlight=False).print(table)
 
 
 @app.command()
@@ -296,9 +281,8 @@ def _first_field(error: Any) -> str:
 
 
 def _machine(name: str) -> Any:
-    from models.store import load_machine
-
-    return load_machine(name)
+    """Find the machine for a job, with warnings about it."""
+    return machines.open_machines().for_job(name, files=True)
 
 
 def _check_input(source: Path) -> None:

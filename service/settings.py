@@ -9,16 +9,36 @@ from typing import Annotated
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-__all__ = ["Settings", "is_loopback"]
+__all__ = ["MachineSettings", "Settings", "is_loopback"]
 
 
-class Settings(BaseSettings):
+class MachineSettings(BaseSettings):
+    """Settings of the user's machines, for the command line and the service.
+
+    Attributes
+    ----------
+    data_dir : Path, optional
+        Machines lie in its folder `machines`; by default in the user's folder for data.
+    require_approval : bool
+        Jobs use approved revisions of machines only.
+    max_age_days : float
+        An older measurement of a machine is warned of.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="STILLPATH_", extra="forbid", frozen=True)
+
+    data_dir: Path | None = None
+    require_approval: bool = False
+    max_age_days: Annotated[float, Field(gt=0)] = 180.0
+
+
+class Settings(MachineSettings):
     """Settings of one service.
 
     Attributes
     ----------
     data_dir : Path
-        Database, uploads and results; made on first use.
+        Database, uploads, results and machines; made on first use.
     max_upload_bytes : int
         A larger upload is refused with status 413.
     workers : int
@@ -31,8 +51,6 @@ class Settings(BaseSettings):
         Serve other computers than this one. There are no keys yet: only behind something that
         checks who is calling.
     """
-
-    model_config = SettingsConfigDict(env_prefix="STILLPATH_", extra="forbid", frozen=True)
 
     data_dir: Path = Path("stillpath-data")
     max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30

@@ -10,11 +10,13 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from service.api import designs, jobs, machines, problems
+from service.api import designs, health, jobs, machines, problems
 from service.api.guard import Guard
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
 from service.jobs.worker import Runner, run_task
+from service.machines.resolve import Resolver
+from service.machines.store import MachineStore
 from service.settings import Settings
 from service.version import __version__
 
@@ -79,11 +81,17 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     )
     app.state.settings = settings
     app.state.designs = designs.Designs()
+    app.state.machines = Resolver(
+        MachineStore(settings.data_dir / "machines"),
+        require_approval=settings.require_approval,
+        max_age_days=settings.max_age_days,
+    )
     app.add_middleware(Guard, allow_remote=settings.allow_remote)
     problems.install(app)
     app.include_router(jobs.router)
     app.include_router(machines.router)
     app.include_router(designs.router)
+    app.include_router(health.router)
 
     @app.get("/", include_in_schema=False)
     def page() -> FileResponse:

@@ -13,8 +13,7 @@ from starlette.responses import HTMLResponse, Response
 from compensation.base import DesignError
 from models.errors import ModelError
 from models.machine import Machine
-from models.store import load_machine
-from service.api.machines import read_machine
+from service.api.machines import look_up
 from service.api.problems import Problem, responses
 from service.design.figures import DesignReport
 from service.pipeline.options import BasisName, RobustMode
@@ -58,10 +57,10 @@ async def _asked(
     basis: BasisName = "ce-opt",
     robust: RobustMode = "off",
 ) -> DesignReport:
-    read_machine(name)  # answers 404 for names that are not in the library
+    machine = await run_in_threadpool(look_up, request, name)
     designs: Designs = request.app.state.designs
     try:
-        return await designs.get(load_machine(name), (axis, basis, robust))
+        return await designs.get(machine, (axis, basis, robust))
     except (DesignError, ModelError) as error:
         raise Problem(422, "No such design", str(error)) from error
 

@@ -11,13 +11,15 @@ from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from models.store import builtin_machines
+from models.errors import ModelError
 from service.api.problems import Problem, responses
 from service.api.schemas import JobView
 from service.api.uploads import receive_upload
 from service.jobs.state import Job, JobState
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
+from service.machines.resolve import PinnedMachine, Resolver
+from service.machines.revision import NotApproved, UnknownMachine
 from service.pipeline.options import DEFAULT_TOLERANCE_UM, BasisName, Options, RobustMode
 from service.settings import Settings
 
@@ -109,12 +111,7 @@ async def create_job(
     del name  # read by receive_upload
     settings: Settings = request.app.state.settings
     store: JobStore = request.app.state.store
-    if machine not in builtin_machines():
-        raise Problem(
-            422,
-            "Unknown machine",
-            f"No machine is called {machine!r}. Known: {', '.join(builtin_machines())}.",
-        )
+    pinned = await run_in_threadpool(_pinned, request.app.state.machines, machine)
     options = Options(
         method=method, basis=basis, robust=robust, along=along, tolerance_um=tolerance_um
     )
@@ -131,7 +128,7 @@ async def create_job(
             source_bytes=upload.size,
             created_at=time.time(),
         )
-        await run_in_threadpool(_enqueue, store, job, incoming)
+        await run_in_threadpool(_enqueue, store, job, incoming, pinned)
     finally:
         incoming.unlink(missing_ok=True)
     supervisor: Supervisor = request.app.state.supervisor
@@ -207,10 +204,25 @@ def delete_job(request: Request, job_id: str) -> Response:
     return Response(status_code=204)
 
 
-def _enqueue(store: JobStore, job: Job, incoming: Path) -> None:
+def _pinned(machines: Resolver, name: str) -> PinnedMachine:
+    try:
+        return machines.for_job(name)
+    except UnknownMachine:
+        known = ", ".join(machines.names())
+        detail = f"No machine is called {name[:80]!r}. Known: {known}."
+        raise Problem(422, "Unknown machine", detail) from None
+    except NotApproved as error:
+        raise Problem(422, "Machine not approved", str(error)) from None
+    except ModelError as error:
+        raise Problem(422, "The machine cannot be used", str(error)) from None
+
+
+def _enqueue(store: JobStore, job: Job, incoming: Path, pinned: PinnedMachine) -> None:
     """Move the stored upload to its place, then make the job known: never the other way."""
-    source = store.files(job.id).source(job.source_name)
+    files = store.files(job.id)
+    source = files.source(job.source_name)
     source.parent.mkdir(parents=True)
+    pinned.write(files.machine)
     incoming.rename(source)
     store.add(job)
 

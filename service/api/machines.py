@@ -1,59 +1,319 @@
-"""Routes of machines and health."""
+"""Routes of machines: the library, the user's own with their revisions, approval."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import date
+from typing import Annotated, Any
 
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from models.errors import ModelError
 from models.machine import Machine
-from models.store import builtin_machines, load_machine
+from models.store import builtin_machines, load_machine, read_machine
+from service.api.machine_views import (
+    DiffView,
+    HistoryView,
+    MachineSummary,
+    RevisionDocument,
+    RevisionView,
+)
 from service.api.problems import Problem, responses
-from service.api.schemas import Health, MachineSummary
-from service.jobs.supervisor import Supervisor
-from service.version import __version__
+from service.api.uploads import receive_document
+from service.machines.diff import diff
+from service.machines.drift import drift
+from service.machines.resolve import Resolver
+from service.machines.revision import Conflict, Revision, UnknownMachine
+from service.machines.store import MachineStore
 
-__all__ = ["router"]
+__all__ = ["look_up", "router"]
 
-router = APIRouter()
+_LARGEST_BYTES = 4_000_000
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "The machine document; `name` must be that of the address.",
+        "content": {"application/json": {"schema": {"$ref": "#/components/schemas/Machine"}}},
+    }
+}
+_ETAG = {"headers": {"ETag": {"schema": {"type": "string"}, "description": "The revision."}}}
+
+Author = Annotated[
+    str,
+    Query(min_length=1, max_length=100, description="Who does it, as the caller says."),
+]
+Message = Annotated[str, Query(max_length=2000, description="Why.")]
+Number = Annotated[int, Path(ge=1, le=999_999, description="Number of a revision.")]
+IfMatch = Annotated[
+    str | None, Header(description="ETag of the machine that the change was made on, or `*`.")
+]
+
+router = APIRouter(prefix="/v1/machines", tags=["machines"])
 
 
-@router.get("/v1/machines", tags=["machines"], summary="List the machines")
-def list_machines() -> list[MachineSummary]:
-    """Return the machines a job can name."""
-    return [_summary(load_machine(name)) for name in builtin_machines()]
+def look_up(request: Request, name: str) -> Machine:
+    """Return the newest state of a machine, approved or not; raise `Problem` if there is none."""
+    with _as_problems():
+        return _machines(request).to_look_at(name).machine
+
+
+@router.get("", summary="List the machines")
+def list_machines(request: Request) -> list[MachineSummary]:
+    """Return the machines a job can name: the library, then the user's own."""
+    store = _store(request)
+    own = [_own_summary(store, name) for name in store.names()]
+    return [*(MachineSummary.of(load_machine(name)) for name in builtin_machines()), *own]
 
 
 @router.get(
-    "/v1/machines/{name}", tags=["machines"], responses=responses(404), summary="Show one machine"
+    "/{name}",
+    response_model=Machine,
+    responses={200: _ETAG, 304: {"description": "Not Modified"}, **responses(404, 422)},
+    summary="Show one machine",
 )
-def read_machine(name: str) -> Machine:
+def show_machine(
+    request: Request,
+    response: Response,
+    name: str,
+    if_none_match: Annotated[str | None, Header()] = None,
+) -> Any:
     """Return the whole document of a machine: travel, limits, firmware, plants."""
-    # A name only: a path must not reach the loader from outside.
-    if name not in builtin_machines():
-        known = ", ".join(builtin_machines())
-        raise Problem(404, "Unknown machine", f"No machine is called {name!r}. Known: {known}.")
-    return load_machine(name)
+    machine = look_up(request, name)
+    response.headers["ETag"] = _etag(machine)
+    if if_none_match is not None and _names(if_none_match, machine):
+        return Response(status_code=304, headers={"ETag": _etag(machine)})
+    return machine
 
 
-@router.get("/healthz", tags=["health"], summary="Is the process alive?")
-def healthz() -> Health:
-    """Answer as long as the process can."""
-    return Health(status="ok", version=__version__)
+@router.put(
+    "/{name}",
+    response_model=RevisionView,
+    responses={
+        200: {"description": "The new revision", **_ETAG},
+        201: {"description": "The first revision of a new machine", "model": RevisionView, **_ETAG},
+        **responses(403, 409, 412, 413, 422, 428),
+    },
+    openapi_extra=_BODY,
+    summary="Add or change a machine",
+)
+async def put_machine(
+    request: Request,
+    response: Response,
+    name: str,
+    author: Author = "unknown",
+    message: Message = "",
+    if_match: IfMatch = None,
+) -> RevisionView:
+    """Make a document the machine's current state, as a new revision.
+
+    To change a machine say by `If-Match` which state the change was made on. A document that
+    changes nothing makes no revision.
+    """
+    store = _store(request)
+    expected = await run_in_threadpool(_expected, store, name, if_match)
+    content = await receive_document(request, max_bytes=_LARGEST_BYTES)
+    with _as_problems():
+        machine = read_machine(content)
+        made = await run_in_threadpool(
+            store.add_revision, name, machine, author=author, message=message, expected=expected
+        )
+    if expected == 0:
+        response.status_code = 201
+        response.headers["Location"] = f"/v1/machines/{name}"
+    return await run_in_threadpool(_changed, store, response, made)
 
 
-@router.get("/readyz", tags=["health"], responses=responses(503), summary="Are jobs being done?")
-def readyz(request: Request) -> Health:
-    """Answer `ok` while workers take jobs, else 503."""
-    supervisor: Supervisor = request.app.state.supervisor
-    if not supervisor.is_ready:
-        raise Problem(503, "Not ready", "No worker takes jobs; the service's log says why.")
-    return Health(status="ok", version=__version__)
+@router.delete(
+    "/{name}",
+    status_code=204,
+    responses=responses(403, 404, 409, 412),
+    summary="Delete a machine",
+)
+def delete_machine(request: Request, name: str, if_match: IfMatch = None) -> Response:
+    """Move a machine with its history to the trash of the data directory.
+
+    `stillpath machines restore NAME` brings it back.
+    """
+    store = _store(request)
+    with _as_problems():
+        _check_state(store, name, if_match)
+        store.delete(name)
+    return Response(status_code=204)
 
 
-def _summary(machine: Machine) -> MachineSummary:
-    return MachineSummary(
-        name=machine.name,
-        title=machine.title,
-        kinematics=machine.kinematics,
-        revision=machine.revision,
-        source=machine.source,
-    )
+@router.get("/{name}/revisions", responses=responses(404, 409, 422), summary="List the revisions")
+def list_revisions(
+    request: Request,
+    name: str,
+    since: Annotated[
+        date | None, Query(description="Look for drift from this day on (after a rebuild).")
+    ] = None,
+) -> HistoryView:
+    """Return who changed a machine when and why, and whether its resonances moved."""
+    store = _store(request)
+    with _as_problems():
+        _check_own(name)
+        history, approvals = store.history(name), store.approvals(name)
+        return HistoryView(
+            revisions=[RevisionView.of(r, approvals.get(r.number)) for r in history],
+            drift=drift(history, since=since),
+        )
+
+
+@router.get(
+    "/{name}/revisions/{number}", responses=responses(404, 409, 422), summary="Show one revision"
+)
+def show_revision(request: Request, name: str, number: Number) -> RevisionDocument:
+    """Return a state of a machine with its document."""
+    store = _store(request)
+    with _as_problems():
+        _check_own(name)
+        found = store.revision(name, number)
+        return RevisionDocument(revision=_view(store, found), machine=found.machine)
+
+
+@router.get("/{name}/diff", responses=responses(404, 409, 422), summary="Compare two revisions")
+def show_diff(
+    request: Request,
+    name: str,
+    before: Annotated[int, Query(alias="from", ge=1)],
+    after: Annotated[int, Query(alias="to", ge=1)],
+) -> DiffView:
+    """Return what revision `to` changed against `from`, in words and figures."""
+    store = _store(request)
+    with _as_problems():
+        _check_own(name)
+        old, new = store.revision(name, before), store.revision(name, after)
+        return DiffView(before=before, after=after, changes=diff(old.machine, new.machine))
+
+
+@router.post(
+    "/{name}/revisions/{number}/approve",
+    responses=responses(403, 404, 409, 422),
+    summary="Approve a revision",
+)
+def approve_revision(
+    request: Request, name: str, number: Number, author: Author = "unknown", message: Message = ""
+) -> RevisionView:
+    """Say that a revision may be used for jobs. An approval that stands already stays."""
+    store = _store(request)
+    with _as_problems():
+        _check_own(name)
+        store.approve(name, number, author=author, message=message)
+        return _view(store, store.revision(name, number))
+
+
+@router.post(
+    "/{name}/revisions/{number}/rollback",
+    responses={200: _ETAG, **responses(403, 404, 409, 412, 422)},
+    summary="Go back to a revision",
+)
+def roll_back(
+    request: Request,
+    response: Response,
+    name: str,
+    number: Number,
+    author: Author = "unknown",
+    message: Message = "",
+    if_match: IfMatch = None,
+) -> RevisionView:
+    """Bring an earlier state back, as a new revision."""
+    store = _store(request)
+    with _as_problems():
+        expected = _check_state(store, name, if_match)
+        made = store.roll_back(name, number, author=author, message=message, expected=expected)
+        return _changed(store, response, made)
+
+
+def _machines(request: Request) -> Resolver:
+    machines: Resolver = request.app.state.machines
+    return machines
+
+
+def _store(request: Request) -> MachineStore:
+    return _machines(request).store
+
+
+def _own_summary(store: MachineStore, name: str) -> MachineSummary:
+    try:
+        return MachineSummary.own(store.current(name), store.approvals(name))
+    except ModelError as error:
+        return MachineSummary.damaged(name, error)
+
+
+def _view(store: MachineStore, revision: Revision) -> RevisionView:
+    approvals = store.approvals(revision.machine.name)
+    return RevisionView.of(revision, approvals.get(revision.number))
+
+
+def _changed(store: MachineStore, response: Response, made: Revision) -> RevisionView:
+    response.headers["ETag"] = _etag(made.machine)
+    return _view(store, made)
+
+
+def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
+    """Return the revision that a PUT is made on, 0 for a new machine; check its precondition."""
+    with _as_problems():
+        _check_own(name)
+        if name not in store:
+            if if_match is not None:
+                raise _failed(f"There is no machine {name!r:.80}; add it without If-Match.")
+            return 0
+        if if_match is None:
+            raise Problem(
+                428,
+                "Precondition required",
+                f"Machine {name!r} exists. Send its ETag as If-Match, so that nobody's change is "
+                "lost.",
+            )
+        return _check_state(store, name, if_match)
+
+
+def _check_state(store: MachineStore, name: str, if_match: str | None) -> int:
+    """Return the current revision's number if it is the one that If-Match names, if it does."""
+    _check_own(name)
+    current = store.current(name)
+    if if_match is not None and not _names(if_match, current.machine):
+        raise _failed(
+            f"Machine {name!r} is at {_etag(current.machine)} (revision {current.number}), not "
+            f"{if_match[:80]}. Fetch it, make the change on that, and try again."
+        )
+    return current.number
+
+
+def _check_own(name: str) -> None:
+    if name in builtin_machines():
+        raise Problem(
+            409,
+            "Built in",
+            f"{name!r} is a built-in machine: it has no revisions and cannot be changed. PUT its "
+            "document under another name.",
+        )
+
+
+def _etag(machine: Machine) -> str:
+    return f'"{machine.revision}"'
+
+
+def _names(header: str, machine: Machine) -> bool:
+    """Return whether a list of entity tags (RFC 9110, 13.1) holds the machine's."""
+    tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
+    return "*" in tags or _etag(machine) in tags
+
+
+def _failed(detail: str) -> Problem:
+    return Problem(412, "Precondition failed", detail)
+
+
+@contextmanager
+def _as_problems() -> Iterator[None]:
+    try:
+        yield
+    except UnknownMachine as error:
+        raise Problem(404, "Unknown machine", str(error)) from None
+    except Conflict as error:
+        raise _failed(str(error)) from None
+    except ModelError as error:
+        raise Problem(422, "The machine cannot be used", str(error)) from None

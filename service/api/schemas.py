@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.jobs.state import Job, JobState
 
-__all__ = ["Health", "JobView", "Links", "MachineSummary"]
+__all__ = ["Health", "JobView", "Links"]
 
 
 class Links(BaseModel):
@@ -104,16 +104,6 @@ class JobView(BaseModel):
                 report_json=f"{here}/report.json" if done else None,
             ),
         )
-
-
-class MachineSummary(BaseModel):
-    """One line of the machine list."""
-
-    name: str
-    title: str
-    kinematics: str
-    revision: str
-    source: str
 
 
 class Health(BaseModel):

@@ -19,7 +19,7 @@ from service.api.problems import Problem
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Upload", "receive_upload", "safe_name"]
+__all__ = ["Upload", "receive_document", "receive_upload", "safe_name"]
 
 _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
@@ -71,6 +71,17 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
             "(curl --data-binary @part.gcode) or as a form's file.",
         )
     return Upload(safe_name(name), sink.size)
+
+
+async def receive_document(request: Request, *, max_bytes: int) -> bytes:
+    """Return the body of a request that is to be read as a whole.
+
+    Raises
+    ------
+    Problem
+        413 if the body is too large.
+    """
+    return b"".join([chunk async for chunk in _limited(request, max_bytes)])
 
 
 def safe_name(name: str) -> str:
@@ -198,8 +209,8 @@ def _too_large(max_bytes: int) -> Problem:
     return Problem(
         413,
         "File too large",
-        f"The upload is larger than {max_bytes} bytes, the limit of this service "
-        "(STILLPATH_MAX_UPLOAD_BYTES).",
+        f"The upload is larger than {max_bytes} bytes, the limit of this service (of files: "
+        "STILLPATH_MAX_UPLOAD_BYTES).",
         headers={"Connection": "close"},
     )
 

@@ -54,7 +54,7 @@ class Job:
     ----------
     id : str
     machine : str
-        Name of a machine of the library.
+        Name of a machine; the document it stood for is kept in the job's folder.
     options : dict
         The fields of `service.pipeline.options.Options`.
     source_name, result_name : str

@@ -59,6 +59,11 @@ class JobFiles:
         """Return the place of the uploaded file."""
         return self.folder / "source" / name
 
+    @property
+    def machine(self) -> Path:
+        """Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`)."""
+        return self.folder / "machine.json"
+
     def result(self, name: str) -> Path:
         """Return the place of the written file."""
         return self.folder / "result" / name

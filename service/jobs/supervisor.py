@@ -107,6 +107,7 @@ class Supervisor:
             job_id=job.id,
             attempt=job.attempt,
             machine=job.machine,
+            machine_file=files.machine,
             options=job.options,
             source=files.source(job.source_name),
             target=files.result(job.result_name),

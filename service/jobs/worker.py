@@ -32,11 +32,12 @@ _REPORT_EVERY_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One attempt at a job."""
+    """One attempt at a job; `machine_file` holds the machine that it was accepted with."""
 
     job_id: str
     attempt: int
     machine: str
+    machine_file: Path
     options: dict[str, Any]
     source: Path
     target: Path
@@ -69,7 +70,7 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> None:
     The report is made beside its place and moved there whole; the result likewise (see
     `service.pipeline.road`).
     """
-    from models.store import load_machine
+    from service.machines.resolve import PinnedMachine
     from service.pipeline.options import Options
     from service.pipeline.road import compensate_file
     from service.reports import write_report
@@ -77,14 +78,16 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> None:
     # A worker that was killed may have left half a file.
     shutil.rmtree(task.target.parent, ignore_errors=True)
     task.target.parent.mkdir(parents=True)
+    pinned = PinnedMachine.read(task.machine_file, task.machine)
     result = compensate_file(
         task.source,
         task.target,
-        load_machine(task.machine),
+        pinned.machine,
         Options.model_validate(task.options),
         cache_dir=task.cache_dir,
         progress=progress,
     )
+    result.warnings.extend(pinned.warnings)
     fresh = task.report.with_name(f"{task.report.name}.{task.attempt}.part")
     write_report(result, fresh)
     shutil.rmtree(task.report, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""The user's machines: revisions, differences, checks before a job."""

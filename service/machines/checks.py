@@ -1,0 +1,220 @@
+"""What to look at before a job: how old the measurement is, whether the printer was changed."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from models.errors import ModelError
+from models.machine import Machine
+from models.store import explain
+from service.machines.klipper_config import Fact, PrinterConfig, facts
+
+__all__ = [
+    "Difference",
+    "age_warnings",
+    "check_before_job",
+    "differences",
+    "machine_from_config",
+]
+
+_DEFAULT_HZ = 50.0
+_DEFAULT_ZETA = 0.07
+_FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
+_DAMPING_SCALE = (0.5, 1.0, 1.5)
+_RELATIVE = 1e-6
+
+
+class Difference(BaseModel):
+    """The printer's configuration says one thing, the machine document another."""
+
+    model_config = ConfigDict(frozen=True)
+
+    section: str
+    option: str
+    place: str
+    machine: Any
+    printer: Any
+
+    @property
+    def text(self) -> str:
+        """One line: section, option, both values, remedy."""
+        where = f"[{self.section}] {self.option}".rstrip()
+        return (
+            f"{where}: the printer has {_word(self.printer)}, the machine {_word(self.machine)}; "
+            f"put {_word(self.printer)} at {self.place} of the machine, or set the printer back"
+        )
+
+
+def check_before_job(
+    machine: Machine,
+    now: datetime,
+    *,
+    max_age_days: float,
+    config: PrinterConfig | None = None,
+) -> list[str]:
+    """Return what speaks against using a machine now, one line each; nothing is all well.
+
+    Parameters
+    ----------
+    machine : Machine
+    now : datetime
+    max_age_days : float
+        How long a measurement counts.
+    config : PrinterConfig, optional
+        The printer's configuration as it is now.
+    """
+    warnings = age_warnings(machine, now, max_age_days)
+    if config is None:
+        return warnings
+    found = [difference.text for difference in differences(machine, config)]
+    return [*warnings, *found, *_not_followed(config)]
+
+
+def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:
+    """Return a line for each axis whose plants are old, undated or were never measured.
+
+    Axes without provenance (the built-in machines) are not judged.
+    """
+    found = []
+    for axis in ("x", "y"):
+        known = machine.axes[axis].provenance
+        start = f"axis {axis} of {machine.name}"
+        if known is None:
+            continue
+        if known.kind == "typed in":
+            found.append(f"{start}: its plants were typed in, not measured; measure the machine")
+        elif known.measured_on is None:
+            found.append(f"{start}: nobody knows when it was measured; measure it again")
+        elif (age := (now.date() - known.measured_on).days) > max_age_days:
+            found.append(
+                f"{start}: measured on {known.measured_on}, {age} days ago (limit "
+                f"{max_age_days:g}, STILLPATH_MAX_AGE_DAYS); measure it again"
+            )
+    return found
+
+
+def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
+    """Return where a configuration and a machine disagree.
+
+    Raises
+    ------
+    ModelError
+        If the configuration lacks what Klipper requires, or holds words for numbers.
+    """
+    document = machine.model_dump(mode="json")
+    extruder = document["firmware"]["extruder"]
+    if extruder["max_extrude_cross_section_mm2"] is None:
+        extruder["max_extrude_cross_section_mm2"] = 4.0 * extruder["nozzle_diameter_mm"] ** 2
+    found = []
+    for fact in facts(config):
+        stands = _at(document, fact.place)
+        if not _same(stands, fact.value):
+            found.append(
+                Difference(
+                    section=fact.section,
+                    option=fact.option,
+                    place=fact.place,
+                    machine=stands,
+                    printer=fact.value,
+                )
+            )
+    return found
+
+
+def machine_from_config(
+    config: PrinterConfig,
+    name: str,
+    *,
+    title: str = "",
+    f_hz: tuple[float | None, float | None] = (None, None),
+    zeta: float = _DEFAULT_ZETA,
+) -> Machine:
+    """Return a machine with the facts of a printer.cfg and plants that were not measured.
+
+    The plants are one resonance each with a wide set around it, marked as typed in; a measurement
+    takes their place.
+
+    Parameters
+    ----------
+    config : PrinterConfig
+    name, title : str
+    f_hz : tuple of float
+        Resonances of x and y; by default the input shaper's frequencies, else 50 Hz.
+    zeta : float
+        Damping ratio of both.
+
+    Raises
+    ------
+    ModelError
+        If the configuration lacks something or is not of a machine we know.
+    """
+    document: dict[str, Any] = {
+        "name": name,
+        "title": title or name,
+        "source": f"{config.name}; the plants were not measured",
+        "axes": {
+            axis: _typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
+            for axis, given in zip("xy", f_hz, strict=True)
+        },
+    }
+    for fact in facts(config):
+        _put(document, fact)
+    try:
+        return Machine.model_validate(document)
+    except ValidationError as error:
+        hint = f"; {'; '.join(_not_followed(config))}" if config.includes else ""
+        raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
+
+
+def _typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
+    mode = {"f_hz": f_hz or _DEFAULT_HZ, "zeta": zeta}
+    return {
+        "nominal": {"kind": "modes", "modes": [mode]},
+        "members": {"frequency_scale": _FREQUENCY_SCALE, "damping_scale": _DAMPING_SCALE},
+        "provenance": {"kind": "typed in"},
+    }
+
+
+def _not_followed(config: PrinterConfig) -> list[str]:
+    return [
+        f"[include {name}] in {config.name}: not followed; what stands there was not looked at"
+        for name in config.includes
+    ]
+
+
+def _at(document: Any, place: str) -> Any:
+    for part in place.split("."):
+        if document is None:
+            return None
+        document = document[part]
+    return document
+
+
+def _put(document: dict[str, Any], fact: Fact) -> None:
+    *parts, last = fact.place.split(".")
+    for part in parts:
+        document = document.setdefault(part, {})
+    document[last] = fact.value
+
+
+def _same(stands: Any, value: Any) -> bool:
+    if isinstance(stands, float) and isinstance(value, float):
+        return abs(stands - value) <= _RELATIVE * max(abs(stands), abs(value))
+    return bool(stands == value)
+
+
+def _word(value: Any) -> str:
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return "on" if value else "off"
+        case float():
+            return f"{value:g}"
+        case dict():
+            return ", ".join(f"{key} {_word(entry)}" for key, entry in value.items())
+        case _:
+            return str(value)

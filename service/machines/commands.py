@@ -1,0 +1,337 @@
+"""The sub-commands of `stillpath machines`. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from models.errors import ModelError
+
+if TYPE_CHECKING:
+    from service.machines.resolve import Resolver
+    from service.machines.revision import Revision
+
+__all__ = ["app", "open_machines"]
+
+
+class _Group(TyperGroup):
+    """`machines NAME` without a command shows that machine."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """See `typer.core.TyperGroup`."""
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            args = ["show", *args]
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Group,
+    help="Machines: the built-in library and your own, each change of which is a revision.",
+    rich_markup_mode=None,
+)
+
+Name = Annotated[str, typer.Argument(metavar="NAME")]
+Number = Annotated[
+    int | None, typer.Option("--revision", min=1, help="A revision. [default: the newest]")
+]
+By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you]")]
+Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
+
+
+def open_machines() -> Resolver:
+    """Return the machines of this user, by the environment's settings."""
+    from pydantic import ValidationError
+
+    from models.store import explain
+    from service.machines.resolve import Resolver, user_data_dir
+    from service.machines.store import MachineStore
+    from service.settings import MachineSettings
+
+    try:
+        settings = MachineSettings()
+    except ValidationError as error:
+        raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
+    store = MachineStore((settings.data_dir or user_data_dir()) / "machines")
+    return Resolver(
+        store,
+        require_approval=settings.require_approval,
+        max_age_days=settings.max_age_days,
+    )
+
+
+@app.callback(invoke_without_command=True)
+def machines(context: typer.Context) -> None:
+    """List the machines: the built-in library and your own."""
+    if context.invoked_subcommand is not None:
+        return
+    from models.store import builtin_machines, load_machine
+
+    store = open_machines().store
+    table = _table("name", "machine", "kinematics", "content", "revision", "approved")
+    for machine in map(load_machine, builtin_machines()):
+        table.add_row(machine.name, machine.title, machine.kinematics, machine.revision, "built in")
+    for name in store.names():
+        try:
+            current, approved = store.current(name), store.approvals(name)
+        except ModelError as error:
+            table.add_row(name, str(error))
+            continue
+        machine = current.machine
+        table.add_row(
+            name,
+            machine.title,
+            machine.kinematics,
+            machine.revision,
+            str(current.number),
+            str(max(approved)) if approved else "none",
+        )
+    _print(table)
+
+
+@app.command()
+def show(name: Name, revision: Number = None) -> None:
+    """Print a machine as a JSON document, to start from."""
+    resolver = open_machines()
+    if revision is None:
+        machine = resolver.to_look_at(name, files=True).machine
+    else:
+        machine = resolver.store.revision(name, revision).machine
+    typer.echo(machine.model_dump_json(indent=1))
+
+
+@app.command()
+def history(
+    name: Name,
+    since: Annotated[
+        str | None,
+        typer.Option(metavar="DATE", help="Look for drift from this day on (after a rebuild)."),
+    ] = None,
+) -> None:
+    """List the revisions of a machine, and say if its resonances have moved."""
+    from service.machines.drift import drift
+
+    store = open_machines().store
+    revisions, approved = store.history(name), store.approvals(name)
+    day = None if since is None else _day(since)
+    table = _table("revision", "when", "who", "content", "approved by", "why")
+    for revision in revisions:
+        approval = approved.get(revision.number)
+        table.add_row(
+            str(revision.number),
+            f"{revision.when:%Y-%m-%d %H:%M}",
+            revision.author,
+            revision.machine.revision,
+            approval.author if approval else "",
+            revision.message,
+        )
+    _print(table)
+    for entry in drift(revisions, since=day):
+        typer.echo(entry.text)
+
+
+@app.command()
+def diff(
+    name: Name,
+    a: Annotated[int, typer.Argument(min=1, metavar="A", help="A revision.")],
+    b: Annotated[int, typer.Argument(min=1, metavar="B", help="Another one.")],
+) -> None:
+    """Tell what revision B changed against A."""
+    from service.machines.diff import diff as compare
+
+    store = open_machines().store
+    changes = compare(store.revision(name, a).machine, store.revision(name, b).machine)
+    for change in changes:
+        typer.echo(change.text)
+    if not changes:
+        typer.echo("no difference")
+
+
+@app.command()
+def approve(name: Name, revision: Number = None, by: By = None, message: Message = "") -> None:
+    """Say that a revision may be used for jobs."""
+    store = open_machines().store
+    number = revision or store.current(name).number
+    approval = store.approve(name, number, author=_who(by), message=message)
+    typer.echo(f"{name} revision {number}: approved by {approval.author}")
+
+
+@app.command()
+def rollback(
+    name: Name,
+    to: Annotated[int, typer.Argument(min=1, metavar="REVISION", help="Goes back to it.")],
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Bring an earlier revision back, as a new one."""
+    store = open_machines().store
+    _told(store.roll_back(name, to, author=_who(by), message=message))
+
+
+@app.command()
+def export(
+    name: Name,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE")],
+    revision: Number = None,
+    with_history: Annotated[
+        bool, typer.Option("--history", help="All revisions, with who, when and why.")
+    ] = False,
+) -> None:
+    """Write a machine to a JSON file: the document, or its history."""
+    from service.machines.revision import document_text
+    from service.machines.transfer import export_history
+    from service.pipeline.files import replacing
+
+    if with_history and revision is not None:
+        raise ModelError("give either --history or --revision")
+    resolver = open_machines()
+    if with_history:
+        text = export_history(resolver.store, name)
+    elif revision is not None:
+        text = document_text(resolver.store.revision(name, revision).machine)
+    else:
+        text = document_text(resolver.to_look_at(name).machine)
+    with replacing(output.resolve()) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A machine, or a history.")],
+    name: Annotated[str | None, typer.Option("--as", metavar="NAME", help="Another name.")] = None,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Add a machine from a JSON file, under a name that is free."""
+    from service.machines.transfer import import_file
+
+    store = open_machines().store
+    _told(import_file(store, file, author=_who(by), message=message, name=name))
+
+
+@app.command()
+def put(
+    file: Annotated[Path, typer.Argument(metavar="FILE")], by: By = None, message: Message = ""
+) -> None:
+    """Make the machine document in a file the new revision of its machine."""
+    from models.store import load_machine
+    from service.machines.revision import source_file
+
+    machine = load_machine(file)
+    store = open_machines().store
+    _told(
+        store.add_revision(
+            machine.name,
+            machine,
+            author=_who(by),
+            message=message or f"from {file.name}",
+            sources=[source_file(file.name, file.read_bytes())],
+        )
+    )
+
+
+@app.command()
+def delete(name: Name) -> None:
+    """Move a machine with its history to the trash."""
+    open_machines().store.delete(name)
+    typer.echo(f"{name}: deleted; `stillpath machines restore {name}` brings it back")
+
+
+@app.command()
+def restore(name: Name) -> None:
+    """Bring back the machine that was deleted last under a name."""
+    _told(open_machines().store.restore(name))
+
+
+@app.command()
+def check(
+    name: Name,
+    printer_cfg: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Klipper's configuration as it is now.")
+    ] = None,
+) -> None:
+    """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
+    from service.machines.checks import check_before_job
+    from service.machines.klipper_config import read_printer_config
+
+    resolver = open_machines()
+    found = check_before_job(
+        resolver.to_look_at(name, files=True).machine,
+        datetime.now(UTC),
+        max_age_days=resolver.max_age_days,
+        config=None if printer_cfg is None else read_printer_config(printer_cfg),
+    )
+    for line in found:
+        typer.echo(line)
+    if found:
+        raise typer.Exit(2)
+    typer.echo(f"{name}: nothing speaks against it")
+
+
+@app.command("from-config")
+def from_config(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Klipper's printer.cfg.")],
+    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
+    title: Annotated[str, typer.Option(help="What people call it.")] = "",
+    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
+    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
+    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
+    by: By = None,
+) -> None:
+    """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
+    from service.machines.checks import machine_from_config
+    from service.machines.klipper_config import read_printer_config
+    from service.machines.revision import source_file
+
+    config = read_printer_config(file)
+    machine = machine_from_config(config, name, title=title, f_hz=(fx, fy), zeta=zeta)
+    revision = open_machines().store.add_revision(
+        name,
+        machine,
+        author=_who(by),
+        message=f"from {file.name}; plants typed in",
+        sources=[source_file(file.name, file.read_bytes())],
+        expected=0,
+    )
+    _told(revision)
+    for entry in config.includes:
+        typer.echo(f"[include {entry}]: not followed")
+
+
+def _who(by: str | None) -> str:
+    if by is not None:
+        return by
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # a container's user may have no name
+        return "unknown"
+
+
+def _day(text: str) -> Any:
+    from datetime import date
+
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise ModelError(f"--since {text!r}: give a day like 2026-03-02") from None
+
+
+def _told(revision: Revision) -> None:
+    typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
+
+
+def _table(*columns: str) -> Any:
+    from rich.table import Column, Table
+
+    return Table(Column(columns[0], no_wrap=True), *columns[1:], box=None, pad_edge=False)
+
+
+def _print(table: Any) -> None:
+    from rich.console import Console
+
+    Console(highlight=False, markup=False).print(table)

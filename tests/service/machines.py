@@ -1,0 +1,30 @@
+"""Machines that look like measured ones, for the tests of the store and what lies around it."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import Any
+
+from models.machine import Machine
+from models.plants import PlantSetSpec
+from models.store import load_machine
+
+__all__ = ["make_machine", "make_plants"]
+
+
+def make_plants(
+    f_hz: float = 52.3, zeta: float = 0.05, *, kind: str = "raw log", on: date | None = None
+) -> PlantSetSpec:
+    return PlantSetSpec.model_validate(
+        {
+            "nominal": {"kind": "modes", "modes": [{"f_hz": f_hz, "zeta": zeta}]},
+            "members": {"frequency_scale": (0.98, 1.0, 1.02), "damping_scale": (0.8, 1.2)},
+            "provenance": {"kind": kind, "measured_on": on, "residual": 0.004},
+        }
+    )
+
+
+def make_machine(name: str = "mine", **changes: Any) -> Machine:
+    """A CoreXY machine; `changes` are fields of the document."""
+    document = load_machine("generic-corexy").model_dump() | {"name": name, "title": "My printer"}
+    return Machine.model_validate(document | changes)

@@ -1,0 +1,243 @@
+"""Machines over HTTP: revisions with ETags, differences, approval, and what a job remembers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from models.machine import Machine
+from models.store import builtin_machines
+from service.api import create_app
+from service.jobs.worker import Task, run_task
+from service.machines.resolve import PinnedMachine, Resolver
+from service.machines.store import MachineStore
+from service.settings import Settings
+from tests.service.machines import make_machine, make_plants
+from tests.service.runners import pretend
+from tests.service.test_api import assert_problem, over, until
+
+MINE = "/v1/machines/mine"
+
+
+def open_client(folder: Path, **settings: Any) -> TestClient:
+    app = create_app(Settings(data_dir=folder, **settings), runner=pretend)
+    return TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    with open_client(tmp_path) as opened:
+        yield opened
+
+
+def put(client: TestClient, machine: Machine, where: str = MINE, **headers: str) -> Any:
+    return client.put(
+        where,
+        content=machine.model_dump_json(),
+        params={"author": "anna", "message": "why"},
+        headers=headers,
+    )
+
+
+def changed(f_hz: float) -> Machine:
+    plants = make_plants(f_hz, on=date(2026, 3, 2))
+    return make_machine(axes={"x": plants, "y": plants})
+
+
+def test_a_machine_from_birth_to_deletion(client: TestClient):
+    first = put(client, changed(52.3))
+    assert first.status_code == 201, first.text
+    assert first.headers["location"] == MINE
+    document = first.json()
+    assert (document["number"], document["author"], document["message"]) == (1, "anna", "why")
+    assert document["provenance"]["x"]["residual"] == 0.004
+    shown = client.get(MINE)
+    assert Machine.model_validate(shown.json()) == changed(52.3)
+    assert shown.headers["etag"] == first.headers["etag"] == f'"{changed(52.3).revision}"'
+
+    second = put(client, changed(49.8), **{"If-Match": shown.headers["etag"]})
+    assert (second.status_code, second.json()["number"]) == (200, 2)
+    assert client.get(MINE).headers["etag"] == second.headers["etag"] != first.headers["etag"]
+    found = client.get(f"{MINE}/diff", params={"from": 1, "to": 2}).json()
+    assert [c["text"] for c in found["changes"]] == [
+        "X mode 52.3 -> 49.8 Hz (-4.8 %), zeta 0.050 -> 0.050",
+        "Y mode 52.3 -> 49.8 Hz (-4.8 %), zeta 0.050 -> 0.050",
+    ]
+
+    back = client.post(f"{MINE}/revisions/1/rollback", params={"author": "bob"})
+    assert (back.json()["number"], back.json()["restored"]) == (3, 1)
+    assert back.headers["etag"] == first.headers["etag"]
+    history = client.get(f"{MINE}/revisions").json()
+    assert [r["number"] for r in history["revisions"]] == [1, 2, 3]
+    assert "X fell from 52.3 to 49.8 Hz" in history["drift"][0]["text"]
+    one = client.get(f"{MINE}/revisions/2").json()
+    assert Machine.model_validate(one["machine"]) == changed(49.8)
+
+    assert client.delete(MINE).status_code == 204
+    assert_problem(client.get(MINE), 404, "mine")
+    assert_problem(client.delete(MINE), 404)
+
+
+def test_nobody_loses_a_change(client: TestClient):
+    assert_problem(put(client, changed(50.0), **{"If-Match": '"abc"'}), 412, "without If-Match")
+    old = put(client, changed(50.0)).headers["etag"]
+    assert_problem(put(client, changed(51.0)), 428, "If-Match")
+    assert put(client, changed(51.0), **{"If-Match": f'"other", {old}'}).status_code == 200
+    stale = {"If-Match": old}
+    assert_problem(put(client, changed(52.0), **stale), 412, "revision 2", old.strip('"'))
+    assert_problem(client.post(f"{MINE}/revisions/1/rollback", headers=stale), 412)
+    assert_problem(client.delete(MINE, headers=stale), 412)
+    assert put(client, changed(52.0), **{"If-Match": "*"}).json()["number"] == 3
+    assert len(client.get(f"{MINE}/revisions").json()["revisions"]) == 3
+
+
+def test_what_has_not_changed_is_not_sent_again(client: TestClient):
+    for where in ("/v1/machines/ender3", MINE):
+        put(client, changed(50.0))
+        tag = client.get(where).headers["etag"]
+        again = client.get(where, headers={"If-None-Match": tag})
+        assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+        assert client.get(where, headers={"If-None-Match": '"x"'}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("where", "body", "status", "words"),
+    [
+        (MINE, b"{", 422, ["not JSON"]),
+        (MINE, b"", 422, ["not JSON"]),
+        (MINE, b"[" * 100_000, 422, ["not JSON"]),
+        (MINE, b"{}", 422, ["missing", "Field required"]),
+        (MINE, b" " * 4_000_001, 413, ["4000000 bytes"]),
+        ("/v1/machines/yours", None, 422, ["'mine', not 'yours'"]),
+        ("/v1/machines/ender3", None, 409, ["built-in", "another name"]),
+        ("/v1/machines/Mine", None, 422, ["cannot be a machine's name"]),
+        ("/v1/machines/.trash", None, 422, ["cannot be a machine's name"]),
+        (f"{MINE}?author=", None, 422, ["author"]),
+    ],
+)
+def test_bad_documents_leave_nothing(
+    client: TestClient, tmp_path: Path, where: str, body: bytes | None, status: int, words
+):
+    content = make_machine().model_dump_json() if body is None else body
+    document = assert_problem(client.put(where, content=content), status)
+    assert any(word in document["detail"] for word in words)
+    assert not (tmp_path / "machines").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/v1/machines/nope/revisions", 404),
+        ("GET", "/v1/machines/ender3/revisions", 409),
+        ("GET", "/v1/machines/ender3/diff?from=1&to=1", 409),
+        ("DELETE", "/v1/machines/ender3", 409),
+        ("DELETE", "/v1/machines/..%2Fjobs", 404),
+        ("POST", "/v1/machines/ender3/revisions/1/approve", 409),
+        ("POST", "/v1/machines/nope/revisions/1/rollback", 404),
+        ("GET", "/v1/machines/mine/revisions/7", 404),
+        ("GET", "/v1/machines/mine/revisions/0", 422),
+        ("GET", "/v1/machines/mine/diff?from=1", 422),
+        ("GET", "/v1/machines/mine/diff?from=1&to=9", 404),
+    ],
+)
+def test_what_is_not_there(client: TestClient, method: str, path: str, status: int):
+    put(client, changed(50.0))
+    assert_problem(client.request(method, path), status)
+
+
+def test_the_list_shows_own_machines_and_damaged_ones(client: TestClient, tmp_path: Path):
+    put(client, changed(50.0))
+    put(client, make_machine("spoiled"), "/v1/machines/spoiled")
+    client.post(f"{MINE}/revisions/1/approve", params={"author": "bob"})
+    (tmp_path / "machines" / "spoiled" / "000001.json").write_text("{")
+    listed = {m["name"]: m for m in client.get("/v1/machines").json()}
+    assert list(listed) == [*builtin_machines(), "mine", "spoiled"]
+    assert (listed["mine"]["origin"], listed["mine"]["number"]) == ("own", 1)
+    assert listed["mine"]["approved"] == 1
+    assert "000001.json" in listed["spoiled"]["problem"]
+    assert_problem(client.get("/v1/machines/spoiled"), 422, "000001.json")
+    assert_problem(client.post("/v1/jobs?machine=spoiled", content=b"G1 X1"), 422, "damaged")
+
+
+def test_only_approved_revisions_where_that_is_switched_on(tmp_path: Path):
+    with open_client(tmp_path, require_approval=True) as client:
+        put(client, changed(50.0))
+        jobs = "/v1/jobs?machine=mine"
+        assert_problem(client.post(jobs, content=b"G1 X1"), 422, "approve mine --revision 1")
+        approved = client.post(f"{MINE}/revisions/1/approve", params={"author": "bob"}).json()
+        assert approved["approval"]["author"] == "bob"
+        put(client, changed(60.0), **{"If-Match": "*"})
+        job = client.post(jobs, content=b"G1 X1").json()
+        assert pinned(tmp_path, job).machine == changed(50.0)
+        assert client.post("/v1/jobs?machine=ender3", content=b"G1 X1").status_code == 202
+
+
+def pinned(folder: Path, job: dict[str, Any]) -> PinnedMachine:
+    return PinnedMachine.read(folder / "jobs" / job["id"] / "machine.json", job["machine"])
+
+
+def test_a_job_keeps_the_machine_it_was_accepted_with(tmp_path: Path):
+    with open_client(tmp_path) as client:
+        put(client, changed(50.0))
+        slow = client.post("/v1/jobs?machine=ender3", content=b"slow").headers["location"]
+        until(client, slow, lambda job: job["state"] == "running")
+        waiting = client.post("/v1/jobs?machine=mine", content=b"G1 X1")
+        put(client, changed(60.0), **{"If-Match": "*"})
+        client.delete(MINE)
+        kept = pinned(tmp_path, waiting.json())
+        assert (kept.machine, kept.number) == (changed(50.0), 1)
+        # Measured in March 2026 or typed in: warned of by the clock of the day.
+        assert all("measure it again" in warning for warning in kept.warnings)
+        client.delete(slow)
+        assert until(client, waiting.headers["location"], over)["state"] == "done"
+
+
+@pytest.mark.slow
+def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
+    """With the real road, but a method that changes nothing."""
+    store = MachineStore(tmp_path / "machines")
+    old = make_plants(50.0, on=date(2020, 1, 31))
+    store.add_revision("mine", make_machine(axes={"x": old, "y": make_plants()}), author="anna")
+    task = Task(
+        job_id="a" * 32,
+        attempt=1,
+        machine="mine",
+        machine_file=tmp_path / "machine.json",
+        options={"method": "none"},
+        source=tmp_path / "upload.gcode",
+        target=tmp_path / "result" / "out.gcode",
+        report=tmp_path / "report",
+        cache_dir=tmp_path / "cache",
+    )
+    task.source.write_text("G28\nG1 X50 Y50 F6000\nG1 X60 Y50 E1\nG1 X60 Y70 E2\n")
+    Resolver(store).for_job("mine").write(task.machine_file)
+    store.delete("mine")
+    run_task(task, lambda progress: None)
+    warnings = json.loads((task.report / "report.json").read_text())["warnings"]
+    assert any("axis x of mine: measured on 2020-01-31" in warning for warning in warnings)
+    assert any("axis y of mine: nobody knows when" in warning for warning in warnings)
+
+
+@pytest.mark.slow
+def test_designs_of_own_machines(client: TestClient):
+    plants = make_plants(50.0)
+    put(client, make_machine(axes={"x": plants, "y": plants}))
+    answer = client.get(f"{MINE}/design?axis=x")
+    assert answer.status_code == 200, answer.text
+    assert_problem(client.get("/v1/machines/nope/design?axis=x"), 404, "nope")
+
+
+def test_the_description_names_bodies_tags_and_problems(client: TestClient):
+    paths = client.get("/openapi.json").json()["paths"]
+    change = paths["/v1/machines/{name}"]["put"]
+    schema = change["requestBody"]["content"]["application/json"]["schema"]
+    assert schema["$ref"].endswith("/Machine")
+    assert set(change["responses"]) >= {"200", "201", "409", "412", "413", "422", "428"}
+    assert "ETag" in change["responses"]["200"]["headers"]
+    assert "/v1/machines/{name}/revisions/{number}/approve" in paths
