@@ -35,7 +35,9 @@ from models.diagrams import Block
 from models.loops import Loop
 
 __all__ = [
+    "Around",
     "QFilter",
+    "Shape",
     "add_on_blocks",
     "design_q",
     "fmsdob",

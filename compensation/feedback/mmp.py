@@ -240,13 +240,13 @@ def mmp(
         if alpha is None
         else predictor(targets_hz, sensor.every, nominal.dt_s, alpha, sensor.delay_samples)
     )
+    distance = singular_distance_hz(targets_hz, sensor.every * nominal.dt_s)
     if made.noise_gain > noise_gain:
         raise Refusal(
             "singular",
             f"mmp on {nominal.name!r}: the predictor multiplies sensor noise by "
-            f"{made.noise_gain:.3g} (at most {noise_gain:g}); the tones lie "
-            f"{singular_distance_hz(targets_hz, sensor.every * nominal.dt_s):.3g} Hz from tones "
-            "that look alike. Raise alpha, or change the sensor's rate",
+            f"{made.noise_gain:.3g} (at most {noise_gain:g}); the tones lie {distance:.3g} Hz "
+            "from tones that look alike. Raise alpha, or change the sensor's rate",
         )
     q = design_q(nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz)
     f = frequency_grid(nominal.dt_s, targets_hz, (bandwidth_hz,) * len(targets_hz))
@@ -277,10 +277,8 @@ def mmp(
         },
         notes=(
             "noise gain: of the predictor, per slow sample",
-            "sensitivity: the part at the disturbance's own frequency; aliases of other "
-            "frequencies are left out",
-            f"the tones lie {singular_distance_hz(targets_hz, sensor.every * nominal.dt_s):.4g} Hz "
-            "from the singular set",
+            "sensitivity: at the disturbance's own frequency, aliases of others left out",
+            f"the tones lie {distance:.4g} Hz from the singular set",
         ),
     )
 
