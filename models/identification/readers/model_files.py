@@ -13,11 +13,11 @@ from pydantic import TypeAdapter, ValidationError
 from models.errors import ModelError
 from models.identification.readers.matlab import matlab_variables
 from models.identification.readers.settings import ReadSettings
+from models.identification.readers.state_spaces import zeros_poles_gain
 from models.identification.types import PlantModel
 from models.plant_specs import PlantSpec, TfSpec
-from models.realisation import transmission_zeros
 from models.repair import printed_decimals, repair_rounded
-from models.roots import dc_gain, frequency_and_damping
+from models.roots import frequency_and_damping
 
 __all__ = ["read_json_models", "read_matlab_models"]
 
@@ -271,28 +271,16 @@ def _complex(given: Any) -> Any:
 
 
 def _from_matrices(lower: Mapping[str, Any], dt_s: float | None) -> dict[str, Any]:
-    """Return zeros, poles and gain of a state space with one input and one output."""
-    a = _matrix(lower["a"], "A")
-    n = len(a)
-    b, c = _matrix(lower["b"], "B").reshape(-1), _matrix(lower["c"], "C").reshape(-1)
+    b, c = (_matrix(lower[name], name.upper()).reshape(-1) for name in ("b", "c"))
     d = _matrix(lower.get("d", 0.0), "D").reshape(-1)
-    if a.shape != (n, n) or len(b) != n or len(c) != n or len(d) != 1 or n == 0:
-        raise ModelError(
-            f"A {a.shape}, B ({len(b)}), C ({len(c)}), D ({len(d)}) do not fit together: one input "
-            "and one output, and A square of their length"
-        )
-    poles = np.linalg.eigvals(a).astype(complex)
-    zeros = _conjugated(transmission_zeros(a, b, c, float(d[0])))
-    # Zeros far outside everything are at infinity, but for rounding.
-    zeros = zeros[np.abs(zeros) < 1e6 * max(1e-3, np.abs(poles).max())]
-    at = 0.0 if dt_s is None else 1.0
-    scale = dc_gain(zeros, poles, dt_s)
-    at_dc = float(c @ np.linalg.solve(at * np.eye(n) - a, b) + d[0])
+    if len(d) != 1:
+        raise ModelError(f"D has {len(d)} entries; one input and one output, please")
+    zeros, poles, gain = zeros_poles_gain(_matrix(lower["a"], "A"), b, c, float(d[0]), dt_s)
     return {
         "kind": "zpk",
         "zeros": [(float(z.real), float(z.imag)) for z in zeros],
         "poles": [(float(p.real), float(p.imag)) for p in poles],
-        "gain": at_dc / scale if scale else None,
+        "gain": gain,
         "dt_s": dt_s,
     }
 
@@ -307,13 +295,6 @@ def _matrix(given: Any, name: str) -> NDArray[np.float64]:
     if values.ndim > 2 or values.size > _MOST_NUMBERS**2 or not np.isfinite(values).all():
         raise ModelError(f"{name} is not a finite matrix of at most {_MOST_NUMBERS} rows")
     return values
-
-
-def _conjugated(roots: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the roots of a real matrix exactly closed under conjugation."""
-    real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
-    upper = roots[roots.imag > 1e-9 * np.abs(roots)]
-    return np.concatenate([real.astype(complex), upper, upper.conj()])
 
 
 def _divided(document: dict[str, Any], gain: float) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.errors import ModelError
+from models.identification.readers.state_spaces import zeros_poles_gain
 from models.plants import PlantSpec, ZpkSpec, discretise, frequency_response
 
 __all__ = ["resampled"]
@@ -43,7 +44,8 @@ def resampled(
     if own is not None and abs(own - dt_s) <= 1e-9 * dt_s:
         return spec, 0.0
     plant = discretise(spec, dt_s)
-    changed = ZpkSpec(zeros=_pairs(plant.zeros()), poles=_pairs(plant.poles()), dt_s=dt_s)
+    zeros, poles, _ = zeros_poles_gain(plant.a, plant.b, plant.c, plant.d, dt_s)
+    changed = ZpkSpec(zeros=_pairs(zeros), poles=_pairs(poles), dt_s=dt_s)
     limit_hz = 0.5 / max(dt_s, own or 0.0)
     if band_hz is not None and band_hz <= 0:
         raise ModelError(f"band_hz {band_hz} must be positive")
@@ -53,10 +55,4 @@ def resampled(
 
 
 def _pairs(roots: NDArray[np.complex128]) -> tuple[tuple[float, float], ...]:
-    """Return real roots and pairs, exactly conjugate whatever rounding left."""
-    real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)
-    upper = roots[~real & (roots.imag > 0)]
-    return tuple(
-        [(float(r.real), 0.0) for r in roots[real]]
-        + [(float(r.real), sign * float(r.imag)) for r in upper for sign in (1, -1)]
-    )
+    return tuple((float(r.real), float(r.imag)) for r in roots)

@@ -10,6 +10,7 @@ import control
 import numpy as np
 import pytest
 import scipy.io
+import scipy.signal
 import scipy.sparse
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
@@ -228,6 +229,44 @@ def test_sampling_time_may_be_told() -> None:
     assert read(document, sampling_s=0.002).spec.sampling_s == 0.002
     continuous = {"num": [1], "den": [0.01, 1], "dt": 0}
     assert read(continuous, sampling_s=0.002).spec.sampling_s is None
+
+
+@hypothesis_settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(20, 150), st.floats(0.02, 0.3)), min_size=1, max_size=4),
+    st.lists(st.tuples(st.floats(20, 150), st.floats(-0.2, 0.3)), max_size=4),
+    st.sampled_from([None, "zoh", "foh"]),
+    st.integers(0, 2**32 - 1),
+)
+def test_state_space_in_any_scale_of_its_states(
+    poles: list[tuple[float, float]],
+    zeros: list[tuple[float, float]],
+    hold: str | None,
+    seed: int,
+) -> None:
+    """Companion forms of scipy, with entries up to 1e11, scaled at random."""
+    s = 2j * np.pi * F_HZ
+    num, den, expected = np.ones(1), np.ones(1), np.ones(len(F_HZ), complex)
+    for f, z in poles:
+        w = 2 * np.pi * f
+        den = np.polymul(den, [1 / w**2, 2 * z / w, 1])
+        expected /= 1 + 2 * z * s / w + (s / w) ** 2
+    for f, z in zeros[: len(poles)]:
+        w = 2 * np.pi * f
+        num = np.polymul(num, [1 / w**2, 2 * z / w, 1])
+        expected *= 1 + 2 * z * s / w + (s / w) ** 2
+    a, b, c, d = scipy.signal.tf2ss(num, den)
+    if hold:
+        a, b, c, d, _ = scipy.signal.cont2discrete((a, b, c, d), DT_S, hold)
+        at = np.exp(s * DT_S)[:, None, None] * np.eye(len(a)) - a
+        expected = (c @ np.linalg.solve(at, np.broadcast_to(b, (len(F_HZ), *b.shape))) + d)[:, 0, 0]
+    scale = np.exp(np.random.default_rng(seed).uniform(-3, 3, len(a)))
+    fields = {"A": a * scale[:, None] / scale, "B": b[:, 0] * scale, "C": c[0] / scale, "D": d}
+    model = read({**{k: v.tolist() for k, v in fields.items()}, "dt": DT_S if hold else 0})
+    peak = np.abs(expected).max()
+    np.testing.assert_allclose(
+        frequency_response(model.spec, F_HZ) / peak, expected / peak, atol=1e-6
+    )
 
 
 @hypothesis_settings(deadline=None)
