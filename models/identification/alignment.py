@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 _BAND_HZ = 10.0
 _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
+_APART_S = 2.0
 _LEAST_FRACTION = 0.95
 _LATEST_START_S = 0.5
 _LEAD_S = 0.5
@@ -87,12 +88,17 @@ def align(
     low_hz = 1.2 * excitation.f_start_hz
     band_hz = (low_hz, min(low_hz + _BAND_HZ, excitation.f_end_hz))
     _check_length(log, grid_s, excitation, band_hz[1])
-    start_s = _find_start(log, profile, excitation, grid_s, accel, band_hz)
+    start_s, other_s = _find_start(profile, excitation, grid_s, accel, band_hz)
 
     command = profile.cell_averages(grid_s - start_s, 1.0 / rate_hz)
     vector, correlation = _correlate(command, accel, rate_hz, band_hz)
     if correlation < _LEAST_CORRELATION:
         raise ModelError(_not_found(log, excitation, accel, correlation))
+    if other_s is not None:
+        raise ModelError(
+            f"{log.source}: the log holds more than one test: it fits at {start_s:.1f} s and as "
+            f"well at {other_s:.1f} s; give a log of one test"
+        )
     direction = vector / np.linalg.norm(vector)
     _check_direction(log, direction, sensor_direction)
     f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
@@ -136,12 +142,15 @@ def resample(log: AccelerationLog) -> tuple[Array, Array]:
     Raises
     ------
     ModelError
-        If nothing was recorded.
+        If nothing was recorded, or nothing that changes.
     """
     time_s = log.time_s
     recorded = ~np.isnan(log.accel_mm_s2).any(axis=0)
-    if len(time_s) < 16 or not recorded.any():
-        raise ModelError(f"{log.source}: no accelerations in the log; record the test again")
+    if len(time_s) < 16 or not np.ptp(log.accel_mm_s2[:, recorded], axis=0).any():
+        raise ModelError(
+            f"{log.source}: nothing that changes in {len(time_s)} samples: no axis of the sensor "
+            "was recorded, or it is dead; check its wiring and record the test again"
+        )
     rate_hz = float(round(1.0 / float(np.median(np.diff(time_s)))))
     count = int((time_s[-1] - time_s[0]) * rate_hz) + 1
     grid_s = time_s[0] + np.arange(count) / rate_hz
@@ -151,14 +160,16 @@ def resample(log: AccelerationLog) -> tuple[Array, Array]:
 
 
 def _find_start(
-    log: AccelerationLog,
     profile: VelocityProfile,
     excitation: Excitation,
     grid_s: Array,
     accel: Array,
     band_hz: tuple[float, float],
-) -> float:
-    """Return the time of the greatest norm of the cross-correlation, to a fraction of a sample."""
+) -> tuple[float, float | None]:
+    """Return the time of the greatest norm of the cross-correlation, to a fraction of a sample.
+
+    And the time of another peak of nearly that height, if there is one.
+    """
     h = float(grid_s[1] - grid_s[0])
     # Only the part of the sweep that passes the band takes part: 1 Hz more for its flanks.
     head_s = (band_hz[1] + 1.0 - excitation.f_start_hz) / excitation.hz_per_s
@@ -169,12 +180,15 @@ def _find_start(
     cross = rfft(accel, size, axis=0) * (passed * rfft(command, size).conj())[:, None]
     norm = np.linalg.norm(irfft(cross, size, axis=0), axis=1)
     best = int(np.argmax(norm))
-    _check_unique(log, norm, best, h)
     before, peak, after = norm[best - 1], norm[best], norm[(best + 1) % size]
     fraction = 0.5 * (before - after) / (before - 2 * peak + after)
     # The last `head` lags are negative ones: the log begins within the test.
-    lag = best - size if best >= len(accel) else best
-    return float(grid_s[0] + (lag + fraction) * h)
+    signed = np.where(np.arange(size) < len(accel), 0, -size) + np.arange(size)
+    start_s = float(grid_s[0] + (signed[best] + fraction) * h)
+    elsewhere = np.where(np.abs(signed - signed[best]) * h > _APART_S, norm, 0.0)
+    other = int(np.argmax(elsewhere))
+    rivals = norm[other] > _SECOND_PEAK * peak
+    return start_s, float(grid_s[0] + signed[other] * h) if rivals else None
 
 
 def _correlate(
@@ -224,17 +238,6 @@ def _check_length(
         )
 
 
-def _check_unique(log: AccelerationLog, norm: Array, best: int, h: float) -> None:
-    near = int(2.0 / h)
-    others = np.roll(norm, near - best)[2 * near + 1 :]
-    if len(others) and others.max() > _SECOND_PEAK * norm[best]:
-        away_s = (int(np.argmax(others)) + near + 1) * h
-        raise ModelError(
-            f"{log.source}: the test fits the log as well {away_s:.1f} s later as where it fits "
-            "best: more than one test, or none; give a log of one test"
-        )
-
-
 def _check_direction(
     log: AccelerationLog, direction: Array, sensor_direction: ArrayLike | None
 ) -> None:
@@ -263,7 +266,7 @@ def _check_ends(
         raise ModelError(
             f"{log.source}: the log begins {late_s:.1f} s after the start of the test, at "
             f"{excitation.f_start_hz + excitation.hz_per_s * late_s:.1f} Hz of the sweep; "
-            "record from before its start"
+            "record from before its start, or correct f_start_hz (min_freq in printer.cfg)"
         )
     lasted_s = float(grid_s[-1]) - start_s
     f_reached_hz = min(excitation.f_start_hz + excitation.hz_per_s * lasted_s, excitation.f_end_hz)
@@ -281,7 +284,13 @@ def _check_ends(
 def _not_found(
     log: AccelerationLog, excitation: Excitation, accel: Array, correlation: float
 ) -> str:
-    """Say why nothing correlates: nothing moved, or something else did."""
+    """Say why nothing correlates: an axis is dead, nothing moved, or something else did."""
+    dead = [name for name, v in zip("xyz", log.accel_mm_s2.T, strict=True) if np.ptp(v) == 0.0]
+    if dead:
+        return (
+            f"{log.source}: the test is not in the log, and accel_{dead[0]} is constant "
+            f"throughout: that axis of the sensor is dead; check its wiring and measure again"
+        )
     moved = float(np.sqrt(np.sum(np.var(accel, axis=0))))
     sent = excitation.accel_per_hz_mm_s * 0.5 * (excitation.f_start_hz + excitation.f_end_hz)
     if moved < 0.1 * sent:

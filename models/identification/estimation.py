@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -45,7 +46,10 @@ _STEP_HZ = 0.25
 _TAPER = 0.01
 _PLATEAU_HZ = (8.0, 15.0)
 _PLATEAU_TOLERANCE = 0.15
+_NOT_MOVING = 0.3
 _LEAST_COHERENCE = 0.95
+_LEAST_FOLLOWED = 0.4
+_LEVEL_UNKNOWN = "level not checked: nothing between 8 and 15 Hz follows the command"
 _WEAKEST_DRIVE = 1e-5
 _SEGMENTS = 12
 _MOST_POINTS = 4096
@@ -69,16 +73,19 @@ def estimate_response(
     Raises
     ------
     ModelError
-        If the test cannot be found in the log (`alignment.align`), or its level is not that of
-        `excitation` (`check_plateau`).
+        If the test cannot be found in the log (`alignment.align`), the log follows it only at few
+        frequencies, or its level is not that of `excitation` (`check_plateau`).
     """
     report = progress or _silent
     report("align", 0.0)
     aligned = align(log, excitation, sensor_direction=sensor_direction)
     report("align", 1.0)
     response = estimate_aligned(log, aligned, excitation, label=label)
+    _check_followed(response, excitation)
     check_plateau(response, excitation)
     report("estimate", 1.0)
+    if plateau_gain(response) is None:
+        return replace(response, notes=(*response.notes, _LEVEL_UNKNOWN))
     return response
 
 
@@ -132,11 +139,18 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
     """Raise ModelError if the gain towards 0 Hz is more than 15 % off 1.
 
     An axis without slip follows slow motion exactly, so any other level means that the command
-    was another one than `excitation` says, or that the sensor's scale is off.
+    was another one than `excitation` says, that the sensor's scale is off, or (below 0.3) that
+    the sensor sits elsewhere.
     """
     gain = plateau_gain(response)
     if gain is None or abs(gain - 1.0) <= _PLATEAU_TOLERANCE:
         return
+    if gain < _NOT_MOVING:
+        raise ModelError(
+            f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the sensor "
+            f"moved {gain:.2f} times as much as commanded: it does not sit on what moves (another "
+            "axis was measured, or only shaken along); measure at the part that the axis moves"
+        )
     stated = excitation.accel_per_hz_mm_s
     raise ModelError(
         f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the axis moved "
@@ -237,6 +251,18 @@ def estimate_welch(
     sd = np.abs(response) * np.sqrt((1.0 - coherence) / (coherence * independent))
     found = LocalResponse(response, np.asarray(sd, np.float64), coherence)
     return _driven_response(logs, np.asarray(f_hz[used], np.float64), found, label)
+
+
+def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None:
+    coherent = response.coherence >= _LEAST_COHERENCE
+    if np.mean(coherent) >= _LEAST_FOLLOWED:
+        return
+    raise ModelError(
+        f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
+        f"{np.mean(coherent):.0%} of its frequencies (coherence of at least {_LEAST_COHERENCE}; "
+        f"at least {_LEAST_FOLLOWED:.0%} are needed): the sweep was another one, see hz_per_sec "
+        "in printer.cfg, or the sensor is too noisy or loose"
+    )
 
 
 def _transformed(command: Array, measured: Array, rate_hz: float, *, taper: float) -> Transformed:

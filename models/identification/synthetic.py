@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 _GRAVITY_MM_S2 = np.array([0.0, 0.0, 9806.65])
 _STOP_MM_S2 = 3000.0
-_LARGEST_CONDITION = 1e9
+_LARGEST_CONDITION = 1e7
 _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 

@@ -1,0 +1,159 @@
+"""Finding Klipper's test in a log: start, direction, and what is wrong with a log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, correlate, sosfiltfilt
+
+from models.errors import ModelError
+from models.identification.alignment import align, check_pair, resample
+from models.identification.excitation import regenerate
+from models.identification.synthetic import ADXL345, LIS2DW, Sensor, simulate_log
+from models.identification.types import AccelerationLog, Excitation
+from models.plants import Mode, ModesSpec
+
+NEW = Excitation((1.0, 0.0))
+NEW_Y = Excitation((0.0, 1.0))
+LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)
+SHORT = Excitation((1.0, 0.0), 5.0, 25.0, 60.0, 1.0)
+PLANT = ModesSpec(modes=(Mode(f_hz=47, zeta=0.035, gain=0.8), Mode(f_hz=95, zeta=0.06, gain=0.2)))
+PLANTS = {"x": PLANT, "y": PLANT}
+SWAPPED = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+TURNED = ((2 / 3, -1 / 3, 2 / 3), (2 / 3, 2 / 3, -1 / 3), (-1 / 3, 2 / 3, 2 / 3))
+# Group delay of PLANT towards 0 Hz, sum of gain 2 zeta/w.
+SLOW_S = 0.8 * 0.035 / (np.pi * 47) + 0.2 * 0.06 / (np.pi * 95)
+
+
+def log_of(excitation: Excitation = SHORT, **options: object) -> AccelerationLog:
+    rng = np.random.default_rng(11)
+    return simulate_log(PLANTS, excitation, rng=rng, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("excitation", [NEW, LEGACY, NEW_Y])
+@pytest.mark.parametrize(
+    "sensor",
+    [ADXL345, LIS2DW, Sensor(rate_hz=3187.3, rotation=TURNED, delay_s=0.6e-3, jitter_s=2e-6)],
+)
+@pytest.mark.parametrize("offset_s", [-0.5, 0.37])
+def test_start_and_direction_are_found(
+    excitation: Excitation, sensor: Sensor, offset_s: float
+) -> None:
+    start_s = 100.0 + offset_s
+    aligned = align(log_of(excitation, sensor=sensor, start_s=start_s, lead_s=0.8), excitation)
+    # The start cannot be told from the delays of sensor and plant.
+    assert aligned.start_s == pytest.approx(start_s + sensor.delay_s + SLOW_S, abs=1e-4)
+    along = np.array([*excitation.direction, 0.0])
+    np.testing.assert_allclose(aligned.direction, np.array(sensor.rotation) @ along, atol=0.005)
+    assert aligned.correlation > 0.99
+    assert aligned.f_reached_hz == excitation.f_end_hz
+    assert len(aligned.command_mm_s2) == len(aligned.measured_mm_s2)
+    assert aligned.notes == ()
+
+
+def test_start_is_where_scipys_correlation_has_its_peak() -> None:
+    log = log_of(lead_s=3.0, start_s=40.0)
+    aligned = align(log, SHORT)
+    h = 1 / 3200
+    command = regenerate(SHORT).cell_averages(np.arange(0.0, 20.0, h), h)
+    band = butter(4, [6.0, 16.0], "bandpass", fs=3200, output="sos")
+    moved = log.accel_mm_s2[:, 0] - log.accel_mm_s2[:, 0].mean()
+    cross = correlate(sosfiltfilt(band, moved), sosfiltfilt(band, command), mode="full")
+    lag = int(np.argmax(cross)) - (len(command) - 1)
+    assert aligned.start_s == pytest.approx(log.time_s[0] + lag * h, abs=0.5e-3)
+
+
+def test_the_whole_log_is_searched() -> None:
+    aligned = align(log_of(lead_s=31.0, tail_s=17.0, start_s=500.0), SHORT)
+    assert aligned.start_s == pytest.approx(500.0, abs=1e-3)
+
+
+def test_resampling_keeps_a_slow_wave_and_takes_gravity_off() -> None:
+    rng = np.random.default_rng(12)
+    time_s = 10.0 + np.cumsum(rng.uniform(0.9, 1.1, 4000)) / 1344.3
+    wave = 1000 * np.sin(2 * np.pi * 60 * time_s)
+    accel = np.column_stack([wave, np.full(4000, np.nan), wave * 0 + 9806.65])
+    grid_s, found = resample(AccelerationLog(time_s, accel, "x", "a.csv"))
+    np.testing.assert_allclose(np.diff(grid_s), 1 / round(1 / np.median(np.diff(time_s))))
+    expected = 1000 * np.sin(2 * np.pi * 60 * grid_s)
+    expected -= np.median(expected)
+    np.testing.assert_allclose(found[10:-10, 0], expected[10:-10], atol=3.0)
+    np.testing.assert_allclose(found[:, 1:], 0.0, atol=1e-9)
+
+
+def test_a_little_may_be_missing_at_both_ends() -> None:
+    assert align(log_of(lead_s=-0.3), SHORT).start_s == pytest.approx(100.0, abs=1e-3)
+    aligned = align(log_of(tail_s=-0.5), SHORT)
+    assert aligned.f_reached_hz == pytest.approx(24.5, abs=0.05)
+    assert aligned.notes == ("the log ends at 24.5 Hz of the sweep",)
+
+
+def test_part_of_a_longer_sweep_can_be_used() -> None:
+    aligned = align(log_of(SHORT), replace(SHORT, f_end_hz=20.0))
+    assert aligned.f_reached_hz == 20.0
+
+
+def test_the_other_axis_measured_in_place_of_this_one_is_found_by_the_mounting() -> None:
+    log = replace(log_of(replace(SHORT, direction=(0.0, 1.0))), axis=None)
+    with pytest.raises(ModelError, match=r"moved along \(-?0.00, 1.00, .* not along \(1.00, 0.00"):
+        align(log, SHORT, sensor_direction=(1.0, 0.0, 0.0))
+
+
+def test_one_axis_measured_twice_is_found_by_the_pair() -> None:
+    across = replace(SHORT, direction=(0.0, 1.0))
+    x, y = align(log_of(SHORT), SHORT), align(log_of(across), across)
+    check_pair(x, y)
+    swapped = align(log_of(across, sensor=Sensor(rotation=SWAPPED)), across)
+    with pytest.raises(ModelError, match="same axis was measured twice"):
+        check_pair(x, swapped)
+
+
+def test_wrong_logs_have_their_own_messages() -> None:
+    good = log_of()
+    rng = np.random.default_rng(13)
+    shape = good.accel_mm_s2.shape
+    dead = good.accel_mm_s2.copy()
+    dead[:, 0] = 12.0
+    twice = AccelerationLog(
+        np.concatenate([good.time_s, good.time_s + good.time_s[-1] - good.time_s[0] + 1 / 3200]),
+        np.concatenate([good.accel_mm_s2, log_of(start_s=7.0).accel_mm_s2]),
+        "x",
+        "twice.csv",
+    )
+    cases = {
+        "nothing that changes": replace(good, accel_mm_s2=np.full(shape, np.nan)),
+        "no axis of the sensor was recorded, or it is dead": replace(
+            good, accel_mm_s2=np.ones(shape)
+        ),
+        "accel_x is constant": replace(good, accel_mm_s2=dead),
+        "does not move with the tested axis": replace(
+            good, accel_mm_s2=rng.normal(0.0, 30.0, shape)
+        ),
+        "the test is not in the log": replace(good, accel_mm_s2=rng.normal(0.0, 3000.0, shape)),
+        "the file is a test of axis y": replace(good, axis="y"),
+        "more than one test": twice,
+        "begins 3.0 s after the start of the test, at 8.0 Hz": log_of(lead_s=-3.0),
+        "at 19.0 Hz of 25 Hz.*give f_end_hz = 18 |at 19.0 Hz of 25 Hz.*give f_end_hz = 19 ": log_of(
+            tail_s=-6.0
+        ),
+        "too short to find": log_of(tail_s=-12.0),
+    }
+    for message, log in cases.items():
+        with pytest.raises(ModelError, match=message):
+            align(log, SHORT)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"hz_per_s": 2.0}, "the test is not in the log.*at 2 Hz/s.*check min_freq"),
+        ({"hz_per_s": 0.9}, "the test is not in the log"),
+        ({"f_start_hz": 4.0}, "correct f_start_hz"),
+        ({"f_end_hz": 40.0}, "record the whole test, or give f_end_hz = 25"),
+    ],
+)
+def test_wrong_settings_are_found(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        align(log_of(), replace(SHORT, **wrong))  # type: ignore[arg-type]

@@ -1,0 +1,270 @@
+"""Estimated frequency responses against the truth, scipy, python-control and a real recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import coherence, csd, welch
+
+from models.errors import ModelError
+from models.identification.alignment import align
+from models.identification.estimation import (
+    check_plateau,
+    estimate_aligned,
+    estimate_driven,
+    estimate_response,
+    estimate_welch,
+    plateau_gain,
+)
+from models.identification.local_model import Transformed, local_response
+from models.identification.synthetic import ADXL345, Sensor, simulate_log
+from models.identification.types import (
+    AccelerationLog,
+    DrivenLog,
+    Excitation,
+    FrequencyResponse,
+)
+from models.plants import Mode, ModesSpec, PairsSpec, PolePair, ZeroPair, frequency_response
+
+NEW = Excitation((1.0, 0.0))
+LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)
+SHORT = Excitation((1.0, 0.0), 5.0, 25.0, 60.0, 1.0)
+TURNED = ((2 / 3, -1 / 3, 2 / 3), (2 / 3, 2 / 3, -1 / 3), (-1 / 3, 2 / 3, 2 / 3))
+MODES = ModesSpec(
+    modes=(
+        Mode(f_hz=47, zeta=0.035, gain=0.7),
+        Mode(f_hz=95, zeta=0.06, gain=0.2),
+        Mode(f_hz=170, zeta=0.05, gain=0.1),
+    )
+)
+SHARP = PairsSpec(
+    poles=(PolePair(f_hz=38, zeta=0.015), PolePair(f_hz=61, zeta=0.02)),
+    zeros=(ZeroPair(f_hz=50, zeta=0.02),),
+)
+LIS2DW_LIKE = Sensor(rate_hz=1600.0)
+
+
+def measured(
+    plant: ModesSpec | PairsSpec, excitation: Excitation, seed: int = 21, **options: object
+) -> AccelerationLog:
+    rng = np.random.default_rng(seed)
+    return simulate_log({"x": plant, "y": plant}, excitation, rng=rng, **options)  # type: ignore[arg-type]
+
+
+def errors(
+    found: FrequencyResponse, plant: ModesSpec | PairsSpec, delay_s: float
+) -> NDArray[np.float64]:
+    """Relative error, the delay of the alignment put back."""
+    truth = frequency_response(plant, found.f_hz)
+    aligned = found.response * np.exp(-2j * np.pi * found.f_hz * delay_s)
+    return np.asarray(np.abs(aligned / truth - 1), np.float64)
+
+
+@pytest.mark.parametrize("excitation", [NEW, LEGACY])
+@pytest.mark.parametrize("plant", [MODES, SHARP])
+@pytest.mark.parametrize(
+    ("sensor", "median", "p95"),
+    [
+        (Sensor(rotation=TURNED), 0.0015, 0.0035),
+        (Sensor(rate_hz=3187.3, jitter_s=2e-6), 0.0015, 0.0035),
+        (LIS2DW_LIKE, 0.004, 0.011),
+    ],
+)
+def test_the_response_is_within_its_tolerances(
+    plant: ModesSpec | PairsSpec,
+    excitation: Excitation,
+    sensor: Sensor,
+    median: float,
+    p95: float,
+) -> None:
+    log = measured(plant, excitation, sensor=sensor, start_s=99.7, lead_s=0.4)
+    aligned = align(log, excitation)
+    found = estimate_aligned(log, aligned, excitation)
+    assert found.f_hz[0] == 6.0
+    assert found.f_hz[-1] == pytest.approx(excitation.f_end_hz - 1, abs=0.25)
+    assert found.coherence.min() > 0.95
+    error = errors(found, plant, aligned.start_s - 99.7)
+    assert np.median(error) < median
+    assert np.quantile(error, 0.95) < p95
+    assert error.max() < 0.02
+
+
+def test_the_standard_deviation_is_that_of_the_errors() -> None:
+    ratios = []
+    for seed in range(6):
+        sensor = Sensor(noise_mm_s2=200.0, lsb_mm_s2=0.0)
+        log = measured(MODES, NEW, seed, sensor=sensor)
+        aligned = align(log, NEW)
+        found = estimate_aligned(log, aligned, NEW)
+        error = errors(found, MODES, aligned.start_s - 100.0)
+        ratios.append(error * np.abs(frequency_response(MODES, found.f_hz)) / found.sd)
+    # Complex Gaussian errors: mean square 1, median sqrt(log 2).
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.1)
+    assert np.median(ratios) == pytest.approx(np.sqrt(np.log(2)), abs=0.06)
+
+
+def test_a_resonance_keeps_its_height() -> None:
+    quiet = Sensor(noise_mm_s2=1.0, lsb_mm_s2=0.0)
+    found = estimate_response(measured(SHARP, NEW, sensor=quiet), NEW)
+    truth = np.abs(frequency_response(SHARP, found.f_hz))
+    peak = int(np.argmax(truth))
+    assert np.abs(found.response[peak]) == pytest.approx(truth[peak], rel=3e-3)
+
+
+def test_the_response_carries_what_is_known_of_the_log() -> None:
+    stages: list[tuple[str, float]] = []
+    log = replace(measured(MODES, SHORT), notes=("of a file",), source="raw_data_x.csv")
+    found = estimate_response(
+        log, SHORT, label="75 mm/s", progress=lambda *stage: stages.append(stage)
+    )
+    assert (found.axis, found.label, found.source) == ("x", "75 mm/s", "raw_data_x.csv")
+    assert found.notes == ("of a file",)
+    assert stages[0] == ("align", 0.0)
+    assert stages[-1] == ("estimate", 1.0)
+    assert plateau_gain(found) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("f_hz", "zeta"), [(22.0, 0.05), (27.0, 0.29), (150.0, 0.02)])
+def test_the_plateau_is_1_below_low_and_high_resonances(f_hz: float, zeta: float) -> None:
+    plant = ModesSpec(modes=(Mode(f_hz=f_hz, zeta=zeta),))
+    for gain in (1.0, 0.93):
+        log = measured(plant, SHORT, sensor=Sensor(gain=gain))
+        assert plateau_gain(estimate_response(log, SHORT)) == pytest.approx(gain, abs=0.05)
+
+
+@pytest.mark.parametrize("true_level", [40.0, 75.0])
+def test_a_wrong_level_names_the_level_of_the_log(true_level: float) -> None:
+    log = measured(MODES, replace(SHORT, accel_per_hz_mm_s=true_level))
+    with pytest.raises(ModelError, match="accel_per_hz = 60; it must be 1") as caught:
+        estimate_response(log, SHORT)
+    told = str(caught.value).split("looks like accel_per_hz = ")[1]
+    assert float(told.split(":")[0]) == pytest.approx(true_level, rel=0.03)
+
+
+def test_a_sensor_that_is_only_shaken_along_has_its_own_message() -> None:
+    log = measured(MODES, SHORT, sensor=Sensor(gain=0.08))
+    with pytest.raises(ModelError, match="does not sit on what moves"):
+        estimate_response(log, SHORT)
+
+
+def test_a_sweep_that_drifts_away_has_its_own_message() -> None:
+    with pytest.raises(ModelError, match=r"follows a sweep at 0.985 Hz/s at only .* hz_per_sec"):
+        estimate_response(measured(MODES, NEW), replace(NEW, hz_per_s=0.985))
+
+
+def test_a_level_that_cannot_be_checked_is_noted() -> None:
+    high = replace(SHORT, f_start_hz=20.0, f_end_hz=60.0)
+    found = estimate_response(measured(MODES, high), high)
+    assert plateau_gain(found) is None
+    assert any("level not checked" in note for note in found.notes)
+    check_plateau(found, high)
+
+
+def driven_log(
+    samples: int, seed: int, *, noise: float = 0.05, rate_hz: float = 1000.0
+) -> tuple[DrivenLog, control.TransferFunction]:
+    """Coloured noise through a plant that python-control simulates; the start is cut off."""
+    rng = np.random.default_rng(seed)
+    w, zeta = 2 * np.pi * 47, 0.05
+    plant = control.sample_system(control.tf([w * w], [1, 2 * zeta * w, w * w]), 1 / rate_hz)
+    command = rng.normal(size=samples + 1000)
+    measured = control.forced_response(plant, inputs=command).outputs[1000:]
+    measured = measured + noise * rng.normal(size=samples)
+    time_s = 3.0 + np.arange(samples) / rate_hz
+    return DrivenLog(time_s, command[1000:], measured, "x", f"log{seed}.csv"), plant
+
+
+@pytest.mark.parametrize("estimate", [estimate_driven, estimate_welch])
+@pytest.mark.parametrize("logs", [1, 3])
+def test_recorded_drives_give_the_response_of_python_control(estimate, logs: int) -> None:  # type: ignore[no-untyped-def]
+    recorded = [driven_log(30_000, seed) for seed in range(logs)]
+    plant = recorded[0][1]
+    found = estimate([log for log, _ in recorded], label="noise")
+    truth = plant(np.exp(2j * np.pi * found.f_hz / 1000))
+    strong = np.abs(truth) > 0.3
+    error = np.abs(found.response - truth)
+    assert np.median(error[strong] / np.abs(truth[strong])) < 0.015
+    assert np.sqrt(np.mean((error / found.sd)[strong] ** 2)) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(found.coherence[strong] > 0.95) > 0.95
+    assert (found.axis, found.label) == ("x", "noise")
+    assert found.source.startswith("log0.csv")
+
+
+def test_welch_is_scipys() -> None:
+    log, _ = driven_log(20_000, 5)
+    found = estimate_welch(log, segment_s=2.0)
+    rate = (len(log.time_s) - 1) / (log.time_s[-1] - log.time_s[0])
+    f, cross = csd(log.command, log.measured, rate, nperseg=2000)
+    h1 = cross / welch(log.command, rate, nperseg=2000)[1]
+    gamma = coherence(log.command, log.measured, rate, nperseg=2000)[1]
+    at = np.searchsorted(f, found.f_hz - 1e-6)
+    np.testing.assert_allclose(f[at], found.f_hz, rtol=1e-9)
+    np.testing.assert_allclose(found.response, h1[at], rtol=1e-9)
+    np.testing.assert_allclose(found.coherence, gamma[at], rtol=1e-9)
+
+
+def test_more_logs_are_surer() -> None:
+    logs = [driven_log(20_000, seed)[0] for seed in range(4)]
+    sd = [np.median(estimate_welch(part, segment_s=2.0).sd) for part in (logs[:1], logs)]
+    assert sd[1] / sd[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_local_model_is_exact_for_one_pole_and_transients() -> None:
+    # A response with one pole near, and a start that is not at rest.
+    f = np.arange(0, 1001) * 0.1
+    rng = np.random.default_rng(6)
+    u = rng.normal(size=len(f)) + 1j * rng.normal(size=len(f))
+    truth = (1 + 0.2j * f) / (f - (40.0 + 0.3j))
+    y = truth * u + (2.0 - 1.0j) / (f - (40.0 + 0.3j))
+    at = np.arange(30.0, 50.0, 0.5)
+    found = local_response([Transformed(0.1, u, y)], at, 1.0, transient=True)
+    index = np.round(at / 0.1).astype(int)
+    np.testing.assert_allclose(found.response, truth[index], rtol=1e-6)
+    assert found.coherence.min() > 0.9999
+
+
+def test_wrong_drives_have_their_own_messages() -> None:
+    log, _ = driven_log(8000, 7)
+    rng = np.random.default_rng(8)
+    with pytest.raises(ModelError, match="follows the command at no frequency"):
+        estimate_welch(replace(log, measured=rng.normal(size=8000)))
+    with pytest.raises(ModelError, match="follows the command at no frequency"):
+        estimate_driven(replace(log, measured=rng.normal(size=8000)))
+    with pytest.raises(ModelError, match=r"logs of different axes \(x, y\)"):
+        estimate_driven([log, replace(log, axis="y")])
+    with pytest.raises(ModelError, match="different rates"):
+        estimate_welch([log, replace(log, time_s=log.time_s * 2)])
+    with pytest.raises(ModelError, match="at least one"):
+        estimate_welch([])
+    with pytest.raises(ModelError, match="too short"):
+        estimate_welch(log, segment_s=1e-3)
+    few = DrivenLog(log.time_s[:12], log.command[:12], log.measured[:12], "x", "few.csv")
+    with pytest.raises(ModelError, match=r"too (short|few)"):
+        estimate_driven(few)
+
+
+def test_a_log_that_ends_at_the_start_of_the_band_is_refused() -> None:
+    tiny = replace(SHORT, f_end_hz=7.5)
+    log = measured(MODES, SHORT, sensor=ADXL345)
+    with pytest.raises(ModelError, match=r"reaches 7\.5 Hz of the sweep only"):
+        estimate_response(log, tiny)
+
+
+@pytest.mark.shared
+def test_a_real_flexible_arm_has_its_two_modes(shared_dir: Path) -> None:
+    # ryanGT/systemid: swept sine 0-10 Hz, columns t n u v theta a.
+    logs = []
+    for path in sorted((shared_dir / "measurements" / "ryanGT_flexlink").glob("swept*.txt")):
+        table = np.loadtxt(path)
+        logs.append(DrivenLog(table[:, 0], table[:, 2], table[:, 5], None, path.name))
+    assert len(logs) == 3
+    found = estimate_driven(logs)
+    band = (found.f_hz > 0.4) & (found.f_hz < 9.6)
+    assert np.median(found.coherence[band]) > 0.99
+    peak = found.f_hz[band][np.argmax(np.abs(found.response[band]))]
+    assert peak == pytest.approx(2.12, abs=0.2)
