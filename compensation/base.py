@@ -104,6 +104,7 @@ class Memoryless:
 def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
     """Make the compensator `name` for a machine, at the sampling time `dt_s`.
 
+    ``NAME+ripple``, and ``none+ripple``, undo the machine's ripple as well (`compensation.ripple`).
     For a machine with schedules it follows the plants (`compensation.scheduled`).
 
     Raises
@@ -112,7 +113,11 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         If there is no such compensator or it cannot be designed for this machine.
     """
     made: Compensator
-    if machine.schedules:
+    if name.endswith("+ripple"):
+        from compensation.ripple import with_ripple
+
+        made = with_ripple(name.removesuffix("+ripple"), machine, dt_s, **settings)
+    elif machine.schedules:
         from compensation.scheduled import ScheduledCompensator
 
         made = ScheduledCompensator(

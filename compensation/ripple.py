@@ -17,20 +17,28 @@ whose command keeps the machine's limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import Compensator, DesignError, Memoryless
+from compensation.base import Compensator, DesignError, Memoryless, compensator
 from compensation.holds import stand_still
 from compensation.inversion import Inversion, invert
 from models.machine import Machine
 from models.plants import DiscretePlant, plant_set
-from models.ripple import AxisRipple, RippleTable
+from models.ripple import MachineRipple, RippleTable
+from models.schedule import OperatingPoint
 
-__all__ = ["PassThrough", "RippleCompensator", "input_command", "output_command", "wave_shares"]
+__all__ = [
+    "PassThrough",
+    "RippleCompensator",
+    "input_command",
+    "output_command",
+    "wave_shares",
+    "with_ripple",
+]
 
 Array = NDArray[np.float64]
 
@@ -43,8 +51,20 @@ _MOST_STEPS, _CLOSE_MM = 20, 1e-12
 _SLOWEST_ZERO = 0.97
 """Zeros of the plant nearer the unit circle are not cancelled: their inverse rings."""
 _EXTRA_TERMS = 3
-_MOTORS = np.array([[1.0, 1.0], [1.0, -1.0]])
-"""Motors A and B of CoreXY from X and Y."""
+
+
+def with_ripple(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
+    """Make `RippleCompensator` around the compensator `name`; ``none``: around the plan itself.
+
+    Raises
+    ------
+    DesignError
+        See `RippleCompensator` and `compensation.base.compensator`.
+    """
+    inner: Compensator = PassThrough()
+    if name != "none":
+        inner = compensator(name, machine, dt_s, **settings)
+    return RippleCompensator(inner, machine, dt_s)
 
 
 def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = None) -> Array:
@@ -154,33 +174,27 @@ class RippleCompensator:
     inner : Compensator
         What undoes the vibration: its command is what the axes shall receive.
     machine : Machine
+        With its ripple.
     dt_s : float
-    ripple : mapping of str to AxisRipple
-        By axis: x and y; input ripple of CoreXY belongs to its motors, a (x + y) and b (x - y).
 
     Raises
     ------
     DesignError
-        If there is nothing to undo, the axes are not the machine's, homing is so uncertain that
-        the table would do harm, or a plant has no inverse.
+        If there is nothing to undo, homing is so uncertain that the table would do harm, or a
+        plant has no inverse.
     """
 
-    def __init__(
-        self, inner: Compensator, machine: Machine, dt_s: float, ripple: Mapping[str, AxisRipple]
-    ) -> None:
+    def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
         self.name = f"{inner.name}+ripple"
         self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
         self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
-        corexy = machine.kinematics == "corexy"
-        self._to_motors = _MOTORS if corexy else np.eye(2)
-        motors = "ab" if corexy else "xy"
-        _check(ripple, motors, machine)
-        self._inputs = [_table(ripple, name, "input") for name in motors]
+        _check(machine)
+        self._ripple = MachineRipple(machine.kinematics, machine.ripple)
+        plants = [("x", machine.axes["x"]), ("y", machine.axes["y"])]
         self._outputs = [
-            None if (table := _table(ripple, axis, "output")) is None
-            else _inverted(axis, plant_set(machine.axes[axis], dt_s).nominal, table)
-            for axis in ("x", "y")
-        ]  # fmt: skip
+            _inverted(axis, plant_set(spec, dt_s).nominal, table) if len(table) else None
+            for (axis, spec), table in zip(plants, self._ripple.outputs, strict=True)
+        ]
         self._blend = max(2, round(_BLEND_S / dt_s))
         self.budget_mm_s2 = machine.command.accel_mm_s2
         """Of the last piece, for the acceleration of a wave; 0: no room, the ripple stays."""
@@ -196,6 +210,10 @@ class RippleCompensator:
     def commit(self) -> None:
         """See `compensation.base.Compensator.commit`."""
         self._inner.commit()
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """See `compensation.base.Compensator.operate_at`."""
+        self._inner.operate_at(point)
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -224,12 +242,12 @@ class RippleCompensator:
                     y_d[row], output.table, self._dt_s, self.budget_mm_s2, output.plant
                 )
                 aim[row] += output_command(y_d[row], output.table, output.inverse, share)
-        motors = self._to_motors @ aim
-        for row, table in enumerate(self._inputs):
-            if table is not None:
+        motors = self._ripple.to_motors @ aim
+        for row, table in enumerate(self._ripple.inputs):
+            if len(table):
                 share = wave_shares(motors[row], table, self._dt_s, self.budget_mm_s2)
                 motors[row] = input_command(motors[row], table, share)
-        return np.asarray(np.linalg.solve(self._to_motors, motors))
+        return np.asarray(np.linalg.solve(self._ripple.to_motors, motors))
 
     def _peaks(self, u: Array) -> tuple[float, float]:
         """Largest speed and acceleration of an axis."""
@@ -237,36 +255,22 @@ class RippleCompensator:
         return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
 
 
-def _check(ripple: Mapping[str, AxisRipple], motors: str, machine: Machine) -> None:
-    if not ripple:
+def _check(machine: Machine) -> None:
+    if not machine.ripple:
         raise DesignError(
             f"machine {machine.name}: no ripple is known; learn it from passes, or leave out "
             "+ripple"
         )
-    for axis, of_axis in ripple.items():
-        for side, fitting in (("input", motors), ("output", "xy")):
-            table = of_axis.table("input" if side == "input" else "output")
-            if len(table) == 0:
-                continue
-            if axis not in fitting:
-                raise DesignError(
-                    f"axis {axis}: {side} ripple of a {machine.kinematics} machine belongs to "
-                    f"{' or '.join(fitting)}"
-                )
-            left = table.residual_share(of_axis.homing_repeatability_mm)
+    for axis, ripple in machine.ripple.items():
+        loose_mm = ripple.homing_repeatability_mm
+        for table in (ripple.table("input"), ripple.table("output")):
+            left = table.residual_share(loose_mm)
             if left >= 1.0:
                 raise DesignError(
-                    f"axis {axis}: homing repeats within {of_axis.homing_repeatability_mm:g} mm, "
-                    f"where a table leaves {left:.0%} of the ripple (limit 100 %): it would do "
-                    "harm; home more exactly (endstop phase) or leave out +ripple"
+                    f"axis {axis}: homing repeats within {loose_mm:g} mm, where a table leaves "
+                    f"{left:.0%} of the ripple (limit 100 %): it would do harm; home more exactly "
+                    "(endstop phase) or leave out +ripple"
                 )
-
-
-def _table(ripple: Mapping[str, AxisRipple], axis: str, side: str) -> RippleTable | None:
-    if axis not in ripple:
-        return None
-    table = ripple[axis].table("input" if side == "input" else "output")
-    return table if len(table) else None
 
 
 def _inverted(axis: str, plant: DiscretePlant, table: RippleTable) -> _Output:

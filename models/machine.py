@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import ModelError
 from models.plants import PlantSetSpec
+from models.ripple import AxisRipple, MachineRipple, RippleAxis
 from models.schedule import AxisSchedule
 
 __all__ = [
@@ -139,6 +140,8 @@ class Machine(_Document):
     schedules : dict
         `x` and `y` to how the plants of that axis change during a print, if they do. Without a
         schedule, or where none is looked at, the plants are those of `axes`.
+    ripple : dict
+        `x`, `y` and the motors of CoreXY, `a` and `b`, to errors that repeat with position.
     """
 
     schema_version: Literal[1] = 1
@@ -153,6 +156,7 @@ class Machine(_Document):
     pressure_advance_s: NonNegative = 0.0
     mesh_slope: NonNegative = 0.0
     schedules: dict[Literal["x", "y"], AxisSchedule] = {}
+    ripple: dict[RippleAxis, AxisRipple] = {}
 
     @model_validator(mode="after")
     def _complete(self) -> Machine:
@@ -163,15 +167,17 @@ class Machine(_Document):
             if axis not in self.axes:
                 raise ValueError(f"plant of axis {axis} is missing")
         self._check_schedules()
+        MachineRipple(self.kinematics, self.ripple)
         return self
 
     @property
     def revision(self) -> str:
         """First 12 hex digits of the SHA-256 of the canonical JSON document."""
         content = self.model_dump(mode="json")
-        if not self.schedules:
-            # Machines from before there were schedules keep their revision.
-            del content["schedules"]
+        for added in ("schedules", "ripple"):
+            if not content[added]:
+                # Machines from before there were such fields keep their revision.
+                del content[added]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
 

@@ -20,7 +20,7 @@ elsewhere the next time has another ripple (`RippleTable.residual_share`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -28,11 +28,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["AxisRipple", "RippleHarmonic", "RippleSide", "RippleSource", "RippleTable"]
+from models.errors import ModelError
+
+__all__ = [
+    "AxisRipple",
+    "MachineRipple",
+    "RippleAxis",
+    "RippleHarmonic",
+    "RippleSide",
+    "RippleSource",
+    "RippleTable",
+]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 RippleSide = Literal["input", "output"]
+RippleAxis = Literal["x", "y", "a", "b"]
+"""X and Y, and the motors of CoreXY: a (x + y) and b (x - y)."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -181,3 +193,65 @@ class RippleTable:
             return 0.0
         left = 4 * np.sin(0.5 * self.wavenumber * offset_mm) ** 2
         return math.sqrt(float(power @ left / power.sum()))
+
+
+class MachineRipple:
+    """Ripple of a whole machine: at its motors on the input side, at X and Y on the output side.
+
+    Parameters
+    ----------
+    kinematics : str
+        Of the machine; ``corexy`` has motors a and b, all others x and y.
+    ripple : mapping of str to AxisRipple
+
+    Attributes
+    ----------
+    motors : tuple of str
+        Their names.
+    to_motors : ndarray, shape (2, 2)
+        Motor positions from X and Y.
+    inputs, outputs : tuple of RippleTable
+        Of both motors, of X and Y; may be empty tables.
+
+    Raises
+    ------
+    ModelError
+        If ripple is given for an axis where it cannot enter.
+    """
+
+    def __init__(self, kinematics: str, ripple: Mapping[RippleAxis, AxisRipple]) -> None:
+        corexy = kinematics == "corexy"
+        self.motors: tuple[RippleAxis, RippleAxis] = ("a", "b") if corexy else ("x", "y")
+        self.to_motors = np.array([[1.0, 1.0], [1.0, -1.0]]) if corexy else np.eye(2)
+        fitting: dict[RippleSide, tuple[RippleAxis, RippleAxis]] = {
+            "input": self.motors,
+            "output": ("x", "y"),
+        }
+        for axis, of_axis in ripple.items():
+            for side, names in fitting.items():
+                if len(of_axis.table(side)) and axis not in names:
+                    raise ModelError(
+                        f"axis {axis}: {side} ripple of a {kinematics} machine belongs to "
+                        f"{' or '.join(names)}"
+                    )
+        self.inputs = tuple(_table(ripple, name, "input") for name in self.motors)
+        self.outputs = tuple(_table(ripple, name, "output") for name in fitting["output"])
+
+    def received_mm(self, command_mm: Array) -> Array:
+        """Return what X and Y receive of a command, both of shape (2, n)."""
+        if not any(len(table) for table in self.inputs):
+            return command_mm
+        motors = self.to_motors @ command_mm
+        shifts = [t.deviation_mm(row) for t, row in zip(self.inputs, motors, strict=True)]
+        return np.asarray(command_mm + np.linalg.solve(self.to_motors, np.stack(shifts)))
+
+    def added_mm(self, path_mm: Array) -> Array:
+        """Return the deviation of the tool along a path, both of shape (2, n)."""
+        rows = zip(self.outputs, path_mm, strict=True)
+        return np.stack([table.deviation_mm(row) for table, row in rows])
+
+
+def _table(
+    ripple: Mapping[RippleAxis, AxisRipple], axis: RippleAxis, side: RippleSide
+) -> RippleTable:
+    return ripple[axis].table(side) if axis in ripple else RippleTable.of(())

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from models.machine import Machine
 from models.operating import OperatingGrid, machine_at
 from models.plants import discretise
+from models.ripple import MachineRipple
 from models.schedule import EMPTY, OperatingPoint
 from simulation.response import PlantStream
 
@@ -26,8 +27,9 @@ REMEMBERED_S = 4.0
 class MachineStream:
     """Answer of X and Y of a machine to a command that arrives in blocks.
 
-    The nominal plants answer; the machine stands still at the first sample pushed. Plants that
-    depend on x and y answer all, and count with the weights of the planned position.
+    The nominal plants answer, to a command with the machine's ripple; the machine stands still at
+    the first sample pushed. Plants that depend on x and y answer all, and count with the weights
+    of the planned position.
 
     Parameters
     ----------
@@ -39,6 +41,7 @@ class MachineStream:
 
     def __init__(self, machine: Machine, dt_s: float, point: OperatingPoint = EMPTY) -> None:
         self._machine, self._dt_s = machine, dt_s
+        self._ripple = MachineRipple(machine.kinematics, machine.ripple)
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
         self._past = np.zeros((2, 0))
@@ -67,8 +70,14 @@ class MachineStream:
         u_mm, path_mm : ndarray, shape (2, n)
             The command, and the planned positions that weigh the plants.
         """
+        received = self._ripple.received_mm(u_mm)
         if self._remembered:
-            self._past = np.concatenate([self._past, u_mm], axis=1)[:, -self._remembered :].copy()
+            past = np.concatenate([self._past, received], axis=1)
+            self._past = past[:, -self._remembered :].copy()
+        moved = self._answer(received, path_mm)
+        return moved + self._ripple.added_mm(path_mm) if self._machine.ripple else moved
+
+    def _answer(self, u_mm: Array, path_mm: Array) -> Array:
         if len(self._streams) == 1:
             return self._streams[0].push(u_mm)
         answers = [stream.push(u_mm) - u_mm for stream in self._streams]

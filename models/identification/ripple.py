@@ -342,7 +342,7 @@ def _steady(command: Array, plant: DiscretePlant) -> slice:
 
 def _speed(log: PassLog, steady: slice, dt_s: float) -> float:
     """Speed of the steady stretch, mm/s; 0 if there is none (positions do not need one)."""
-    length = steady.stop - steady.start
+    length = int(steady.stop - steady.start)
     if length < 2:
         if log.kind == "acceleration":
             raise ModelError(

@@ -73,9 +73,10 @@ class PieceCompensator:
         self, machine: Machine, options: Options, shaper: BestShaper | None = None
     ) -> None:
         settings: dict[str, object] = {}
-        if options.method == "fbf":
+        vibration = options.method.removesuffix("+ripple")
+        if vibration == "fbf":
             settings.update(basis=options.basis, robust=options.robust, along=options.along)
-        elif shaper is not None and options.method == f"shaper:{shaper.type}":
+        elif shaper is not None and vibration == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine
         self._tolerance_mm = 1e-3 * options.tolerance_um

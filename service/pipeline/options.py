@@ -18,8 +18,9 @@ class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name. `basis`, `robust` and `along` are settings of `fbf`: `along` is
-    the weight of the error along the path against that across it (None: as suits `robust`).
+    with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
+    `basis`, `robust` and `along` are settings of `fbf`: `along` is the weight of the error along
+    the path against that across it (None: as suits `robust`).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,7 +29,7 @@ class Options(BaseModel):
         str,
         Field(
             pattern=r"^(fbf|npz-ignore|zmetc|zpetc|ebzpetc|ts|none"
-            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))$"
+            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))(\+ripple)?$"
         ),
     ] = "fbf"
     basis: BasisName = "ce-opt"
