@@ -1,0 +1,1 @@
+"""Proof on metal: prints that show compensated beside planned motion, and logs read back."""
