@@ -21,7 +21,7 @@ class MachineSettings(BaseSettings):
         Machines lie in its folder `machines`; by default in the user's folder for data.
     require_approval : bool
         Jobs use approved revisions of machines only.
-    max_age_days : float
+    measurement_max_age_days : float
         An older measurement of a machine is warned of.
     """
 
@@ -29,7 +29,7 @@ class MachineSettings(BaseSettings):
 
     data_dir: Path | None = None
     require_approval: bool = False
-    max_age_days: Annotated[float, Field(gt=0)] = 180.0
+    measurement_max_age_days: Annotated[float, Field(gt=0)] = 180.0
 
 
 class Settings(MachineSettings):

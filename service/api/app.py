@@ -84,7 +84,7 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     app.state.machines = Resolver(
         MachineStore(settings.data_dir / "machines"),
         require_approval=settings.require_approval,
-        max_age_days=settings.max_age_days,
+        max_age_days=settings.measurement_max_age_days,
     )
     app.add_middleware(Guard, allow_remote=settings.allow_remote)
     problems.install(app)

@@ -18,6 +18,7 @@ __all__ = [
     "check_before_job",
     "differences",
     "machine_from_config",
+    "not_followed",
 ]
 
 _DEFAULT_HZ = 50.0
@@ -66,11 +67,8 @@ def check_before_job(
     config : PrinterConfig, optional
         The printer's configuration as it is now.
     """
-    warnings = age_warnings(machine, now, max_age_days)
-    if config is None:
-        return warnings
-    found = [difference.text for difference in differences(machine, config)]
-    return [*warnings, *found, *_not_followed(config)]
+    found = [] if config is None else differences(machine, config)
+    return [*age_warnings(machine, now, max_age_days), *(entry.text for entry in found)]
 
 
 def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:
@@ -91,7 +89,7 @@ def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[s
         elif (age := (now.date() - known.measured_on).days) > max_age_days:
             found.append(
                 f"{start}: measured on {known.measured_on}, {age} days ago (limit "
-                f"{max_age_days:g}, STILLPATH_MAX_AGE_DAYS); measure it again"
+                f"{max_age_days:g}, STILLPATH_MEASUREMENT_MAX_AGE_DAYS); measure it again"
             )
     return found
 
@@ -165,8 +163,16 @@ def machine_from_config(
     try:
         return Machine.model_validate(document)
     except ValidationError as error:
-        hint = f"; {'; '.join(_not_followed(config))}" if config.includes else ""
+        hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
+
+
+def not_followed(config: PrinterConfig) -> list[str]:
+    """Return a line for each file that the configuration includes: nobody looked into it."""
+    return [
+        f"[include {name}] in {config.name}: not followed; what stands there was not looked at"
+        for name in config.includes
+    ]
 
 
 def _typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
@@ -176,13 +182,6 @@ def _typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
         "members": {"frequency_scale": _FREQUENCY_SCALE, "damping_scale": _DAMPING_SCALE},
         "provenance": {"kind": "typed in"},
     }
-
-
-def _not_followed(config: PrinterConfig) -> list[str]:
-    return [
-        f"[include {name}] in {config.name}: not followed; what stands there was not looked at"
-        for name in config.includes
-    ]
 
 
 def _at(document: Any, place: str) -> Any:

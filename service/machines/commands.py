@@ -59,7 +59,7 @@ def open_machines() -> Resolver:
     return Resolver(
         store,
         require_approval=settings.require_approval,
-        max_age_days=settings.max_age_days,
+        max_age_days=settings.measurement_max_age_days,
     )
 
 
@@ -254,17 +254,19 @@ def check(
     ] = None,
 ) -> None:
     """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
-    from service.machines.checks import check_before_job
+    from service.machines.checks import check_before_job, not_followed
     from service.machines.klipper_config import read_printer_config
 
     resolver = open_machines()
+    config = None if printer_cfg is None else read_printer_config(printer_cfg)
     found = check_before_job(
         resolver.to_look_at(name, files=True).machine,
         datetime.now(UTC),
         max_age_days=resolver.max_age_days,
-        config=None if printer_cfg is None else read_printer_config(printer_cfg),
+        config=config,
     )
-    for line in found:
+    notes = [] if config is None else [f"note: {line}" for line in not_followed(config)]
+    for line in [*found, *notes]:
         typer.echo(line)
     if found:
         raise typer.Exit(2)
@@ -282,7 +284,7 @@ def from_config(
     by: By = None,
 ) -> None:
     """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
-    from service.machines.checks import machine_from_config
+    from service.machines.checks import machine_from_config, not_followed
     from service.machines.klipper_config import read_printer_config
     from service.machines.revision import source_file
 
@@ -297,8 +299,8 @@ def from_config(
         expected=0,
     )
     _told(revision)
-    for entry in config.includes:
-        typer.echo(f"[include {entry}]: not followed")
+    for line in not_followed(config):
+        typer.echo(f"note: {line}")
 
 
 def _who(by: str | None) -> str:

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from models.errors import ModelError
 from models.machine import Machine
 from models.provenance import SourceFile
+from models.store import explain
 
 __all__ = [
     "Approval",
@@ -22,9 +30,10 @@ __all__ = [
     "source_file",
 ]
 
-Who = Annotated[str, Field(min_length=1, max_length=100)]
-Message = Annotated[str, Field(max_length=2000)]
+Who = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,100}$")]
+Message = Annotated[str, Field(pattern=r"^[^\x00-\x08\x0b-\x1f\x7f]{0,2000}$")]
 Number = Annotated[int, Field(ge=1, le=999_999)]
+_Kind = TypeVar("_Kind", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
@@ -89,11 +98,15 @@ class Revision(_Document):
 
     @classmethod
     def of(cls, machine: Machine, **fields: Any) -> Revision:
-        """Return a revision of a machine; `fields` are the others, without the hash."""
+        """Return a revision of a machine; `fields` are the others, without the hash.
+
+        Raises
+        ------
+        ModelError
+            Naming the field that cannot be.
+        """
         document = machine.model_dump(mode="json")
-        return cls.model_validate(
-            {**fields, "machine": document, "content_sha256": _digest(document)}
-        )
+        return _checked(cls, {**fields, "machine": document, "content_sha256": _digest(document)})
 
 
 class Approval(_Document):
@@ -105,6 +118,12 @@ class Approval(_Document):
     author: Who
     message: Message = ""
 
+    @classmethod
+    def of(cls, revision: Revision, **fields: Any) -> Approval:
+        """Return the approval of a revision. See `Revision.of`."""
+        of_it = {"number": revision.number, "content_sha256": revision.content_sha256}
+        return _checked(cls, fields | of_it)
+
 
 def document_text(document: BaseModel) -> str:
     """Return a document as the store writes it; reading it back gives the same numbers."""
@@ -114,6 +133,13 @@ def document_text(document: BaseModel) -> str:
 def source_file(name: str, content: bytes) -> SourceFile:
     """Return the name (no folder) and hash of a file that was read."""
     return SourceFile(name=name, sha256=hashlib.sha256(content).hexdigest())
+
+
+def _checked(kind: type[_Kind], fields: dict[str, Any]) -> _Kind:
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        raise ModelError(explain(error)) from None
 
 
 def _digest(machine: dict[str, Any]) -> str:

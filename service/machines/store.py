@@ -224,12 +224,8 @@ class MachineStore:
     ) -> Approval:
         """Say that a revision may be used; an approval that stands already is returned."""
         revision = self.revision(name, number)
-        approval = Approval(
-            number=number,
-            content_sha256=revision.content_sha256,
-            when=when or datetime.now(UTC),
-            author=author,
-            message=message,
+        approval = Approval.of(
+            revision, when=when or datetime.now(UTC), author=author, message=message
         )
         file = _approval_file(self._root / name, number)
         try:
@@ -257,14 +253,7 @@ class MachineStore:
             made.mkdir()
             for revision in revisions:
                 publish(_revision_file(made, revision.number), document_text(revision))
-            try:
-                # Fails on a folder that holds a revision already, whoever put it there.
-                made.rename(self._root / name)
-            except OSError:
-                if name not in self:
-                    raise
-                raise _exists(name) from None
-        sync_folder(self._root)
+            self._move_in(made, name)
 
     def delete(self, name: str, *, when: datetime | None = None) -> None:
         """Move a machine with its history to the trash; `restore` brings it back."""
@@ -272,7 +261,10 @@ class MachineStore:
         trash = self._root / _TRASH / name
         trash.mkdir(parents=True, exist_ok=True)
         stamp = (when or datetime.now(UTC)).strftime("%Y%m%dT%H%M%S.%fZ")
-        (self._root / name).rename(trash / stamp)
+        try:
+            (self._root / name).rename(trash / stamp)
+        except FileNotFoundError:
+            raise _no_machine(name) from None
         sync_folder(self._root)
 
     def restore(self, name: str) -> Revision:
@@ -288,10 +280,7 @@ class MachineStore:
         found = sorted(trash.iterdir()) if trash.is_dir() else []
         if not found:
             raise UnknownMachine(f"no machine {name!r} is in the trash {self._root / _TRASH}")
-        if name in self:
-            raise Conflict(f"there is a machine {name!r} again; delete that first")
-        found[-1].rename(self._root / name)
-        sync_folder(self._root)
+        self._move_in(found[-1], name)
         return self.current(name)
 
     # Private
@@ -312,7 +301,10 @@ class MachineStore:
             last = numbers[-1] if numbers else 0
             if expected is not None and expected != last:
                 raise _changed(name, expected, last)
-            current = self._read_revision(name, last) if last else None
+            try:
+                current = self._read_revision(name, last) if last else None
+            except _Gone:
+                continue
             machine, fields = change(current)
             _check_own_name(name, machine)
             if current is not None and current.machine.revision == machine.revision:
@@ -325,13 +317,29 @@ class MachineStore:
                 **fields,
             )
             folder.mkdir(parents=True, exist_ok=True)
+            file = _revision_file(folder, revision.number)
             try:
-                publish(_revision_file(folder, revision.number), document_text(revision))
+                publish(file, document_text(revision))
             except (FileExistsError, FileNotFoundError):
                 continue  # somebody else was faster, or deleted the machine meanwhile
+            if last and not _revision_file(folder, last).exists():
+                # Deleted and made anew meanwhile: this is no revision of that one.
+                file.unlink(missing_ok=True)
+                continue
             sync_folder(self._root)
             return revision
         raise Conflict(f"machine {name!r} is being changed by others all the time; try again")
+
+    def _move_in(self, folder: Path, name: str) -> None:
+        """Make a folder of revisions the machine `name`, which must be new."""
+        try:
+            # Fails on a folder that holds a revision already, whoever put it there.
+            folder.rename(self._root / name)
+        except OSError:
+            if name not in self:
+                raise
+            raise _exists(name) from None
+        sync_folder(self._root)
 
     def _existing(self, name: str) -> list[int]:
         numbers = self._revision_numbers(name)
@@ -353,10 +361,15 @@ class MachineStore:
         return revision
 
 
+class _Gone(UnknownMachine):
+    """Deleted while it was read."""
+
+
 def _numbers(folder: Path, pattern: re.Pattern[str]) -> list[int]:
-    if not folder.is_dir():
+    try:
+        found = [pattern.fullmatch(path.name) for path in folder.iterdir()]
+    except (FileNotFoundError, NotADirectoryError):
         return []
-    found = (pattern.fullmatch(path.name) for path in folder.iterdir())
     return sorted(int(match[1]) for match in found if match)
 
 
@@ -371,6 +384,8 @@ def _approval_file(folder: Path, number: int) -> Path:
 def _read(file: Path, kind: type[_Kind]) -> _Kind:
     try:
         return kind.model_validate(json.loads(file.read_bytes()))
+    except FileNotFoundError:
+        raise _Gone(f"{file} is gone: the machine was deleted meanwhile") from None
     except ValidationError as error:
         raise _damaged(file, explain(error)) from None
     except (ValueError, RecursionError) as error:
@@ -412,8 +427,8 @@ def _no_machine(name: str) -> UnknownMachine:
 
 def _exists(name: str) -> Conflict:
     return Conflict(
-        f"there is a machine {name!r} already; import under another name (--as), or delete that "
-        f"one first (`stillpath machines delete {name}`, which can be undone)"
+        f"there is a machine {name!r} already; take another name (--as), or delete that one "
+        f"first (`stillpath machines delete {name}`, which can be undone)"
     )
 
 

@@ -119,6 +119,8 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
         ("/v1/machines/Mine", None, 422, ["cannot be a machine's name"]),
         ("/v1/machines/.trash", None, 422, ["cannot be a machine's name"]),
         (f"{MINE}?author=", None, 422, ["author"]),
+        (f"{MINE}?author=%1b[31m", None, 422, ["author"]),
+        (f"{MINE}?message=%00", None, 422, ["message"]),
     ],
 )
 def test_bad_documents_leave_nothing(

@@ -148,6 +148,7 @@ def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
         ("approve ender3", "ender3"),
         ("import {folder}/none.json", "none.json"),
         ("put {folder}/none.json", "none.json"),
+        ("from-config {folder}/none.cfg --name ../x", "none.cfg"),
         ("export nope -o {folder}/x.json", "nope"),
         ("export ender3 -o {folder}/x.json --history --revision 1", "either"),
         ("check ender3 --printer-cfg {folder}/none.cfg", "none.cfg"),
@@ -159,6 +160,21 @@ def test_refusals(store: MachineStore, tmp_path: Path, capsys, arguments: str, w
     assert words in one_line(capsys)
     assert list(tmp_path.iterdir()) == []
     assert store.names() == []
+
+
+@pytest.mark.parametrize(
+    ("by", "message", "field"),
+    [("", "", "author"), ("a\x1b[31m", "", "author"), ("anna", "x" * 2001, "message")],
+)
+def test_who_and_why_are_text(store: MachineStore, tmp_path: Path, capsys, by, message, field):
+    file = tmp_path / "m.json"
+    file.write_text(make_machine().model_dump_json())
+    assert machines("import", file, "--by", by, "-M", message) == 2
+    assert field in one_line(capsys)
+    assert machines("import", file) == 0
+    assert machines("approve", "mine", "--by", by, "-M", message) == 2
+    assert field in one_line(capsys)
+    assert store.approvals("mine") == {}
 
 
 def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
@@ -181,7 +197,7 @@ def test_what_a_printer_cfg_says(config: Path):
 
 def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys):
     assert machines("from-config", config, "--name", "mine", "--title", "My Voron") == 0
-    assert "[include mainsail.cfg]: not followed" in capsys.readouterr().out
+    assert "note: [include mainsail.cfg] in printer.cfg: not followed" in capsys.readouterr().out
     machine = store.current("mine").machine
     assert (machine.title, machine.kinematics) == ("My Voron", "corexy")
     planner, extruder = machine.firmware.planner, machine.firmware.extruder
@@ -283,7 +299,10 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     store.update_axis("mine", {"x": fresh, "y": fresh}, author="anna")
     capsys.readouterr()
     assert machines("check", "mine", "--printer-cfg", config) == 0
-    assert "nothing speaks against it" in capsys.readouterr().out
+    assert capsys.readouterr().out == "mine: nothing speaks against it\n"
+    config.write_text(CONFIG)  # what is included was not looked at: said, but no difference
+    assert machines("check", "mine", "--printer-cfg", config) == 0
+    assert "note: [include mainsail.cfg]" in capsys.readouterr().out
     assert machines("check", "ender3") == 0
 
 
@@ -317,7 +336,7 @@ def test_a_job_uses_the_users_machine_and_hears_of_its_age(
     assert "warning: axis x of mine: measured on 2020-01-31" in capsys.readouterr().out
     written = json.loads((report / "report.json").read_text())["warnings"]
     assert any("measured on 2020-01-31" in warning for warning in written)
-    monkeypatch.setenv("STILLPATH_MAX_AGE_DAYS", "1e6")
+    monkeypatch.setenv("STILLPATH_MEASUREMENT_MAX_AGE_DAYS", "1e6")
     assert compensate(source, "-o", str(out), "-m", "mine") == 0
     assert "measured on" not in capsys.readouterr().out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import multiprocessing
@@ -178,7 +179,7 @@ def test_the_last_one_deleted_comes_back(store: MachineStore):
         store.add_revision("mine", make_machine(), author=author)
         store.delete("mine")
     assert store.restore("mine").author == "bob"
-    with pytest.raises(Conflict, match="again"):
+    with pytest.raises(Conflict, match="already"):
         store.restore("mine")
     with pytest.raises(UnknownMachine, match="trash"):
         store.restore("other")
@@ -252,9 +253,9 @@ def measure_many(root: Path, axis: str, count: int) -> None:
         store.update_axis("mine", {axis: make_plants(50.0 + 0.01 * k)}, author=axis)  # type: ignore[dict-item]
 
 
-def run_together(target, arguments: list[tuple]) -> None:
+def run_together(*tasks: tuple) -> None:
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=target, args=each) for each in arguments]
+    processes = [context.Process(target=target, args=args) for target, *args in tasks]
     for process in processes:
         process.start()
     for process in processes:
@@ -265,7 +266,7 @@ def run_together(target, arguments: list[tuple]) -> None:
 @pytest.mark.slow
 def test_two_writers_lose_nothing(store: MachineStore, tmp_path: Path):
     root = tmp_path / "machines"
-    run_together(write_many, [(root, 1, 20), (root, 2, 20)])
+    run_together((write_many, root, 1, 20), (write_many, root, 2, 20))
     history = store.history("mine")
     assert [revision.number for revision in history] == [*range(1, 41)]
     assert [revision.parent for revision in history] == [None, *range(1, 40)]
@@ -279,11 +280,28 @@ def test_two_writers_lose_nothing(store: MachineStore, tmp_path: Path):
 @pytest.mark.slow
 def test_two_measurements_at_once_do_not_undo_each_other(store: MachineStore, tmp_path: Path):
     store.add_revision("mine", make_machine(), author="anna")
-    run_together(measure_many, [(tmp_path / "machines", axis, 15) for axis in ("x", "y")])
+    run_together(*[(measure_many, tmp_path / "machines", axis, 15) for axis in ("x", "y")])
     last = store.current("mine")
     assert last.number == 31
     for axis in ("x", "y"):
         assert last.machine.axes[axis] == make_plants(50.14)  # type: ignore[index]
+
+
+def delete_and_restore(root: Path, count: int) -> None:
+    store = MachineStore(root)
+    for k in range(count):
+        with contextlib.suppress(UnknownMachine, Conflict):
+            store.delete("mine")
+            if k % 2:
+                store.restore("mine")
+
+
+@pytest.mark.slow
+def test_writers_beside_somebody_who_deletes(store: MachineStore, tmp_path: Path):
+    root = tmp_path / "machines"
+    run_together((write_many, root, 1, 60), (delete_and_restore, root, 60))
+    history = store.history("mine") if "mine" in store else []
+    assert [r.number for r in history] == [*range(1, len(history) + 1)]
 
 
 @pytest.mark.slow
@@ -399,6 +417,23 @@ def test_rollback_then_diff_is_empty(
     assert store.history("mine")[: len(before)] == before
 
 
+@pytest.mark.parametrize(
+    "nominal",
+    [
+        {"kind": "fir", "taps": [0.25, 0.5, 0.25], "dt_s": 1e-3},
+        {"kind": "tf", "num": [0.1], "den": [1.0, -0.9], "dt_s": 1e-3},
+        {"kind": "zpk", "poles": [[-300.0, 0.0]]},
+    ],
+)
+def test_plants_without_modes_are_compared_and_do_not_drift(nominal: dict):
+    plants = make_plants().model_dump() | {"nominal": nominal, "members": ()}
+    old = make_machine(axes={"x": make_plants(), "y": make_plants()})
+    new = make_machine(axes={"x": plants, "y": make_plants()})
+    assert diff(old, new)
+    assert diff(new, old)
+    assert drift([revision(1, make_plants()), revision(2, plants)]) == ()
+
+
 @pytest.mark.parametrize("name", builtin_machines())
 def test_every_kind_of_plant_can_be_compared(name: str):
     old, new = load_machine(name), load_machine("ender3")
@@ -469,7 +504,7 @@ def test_history_survives_a_journey(store: MachineStore, tmp_path: Path):
     import_file(other, file, author="carl")
     assert other.history("mine") == store.history("mine")
     assert other.approvals("mine") == {}  # whoever runs this store approves himself
-    with pytest.raises(Conflict, match=r"already; import under another name \(--as\)"):
+    with pytest.raises(Conflict, match=r"already; take another name \(--as\)"):
         import_file(other, file, author="carl")
     copied = import_file(other, file, author="carl", name="copy")
     assert (copied.number, copied.machine.name) == (1, "copy")
