@@ -16,6 +16,10 @@ __all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
 
 _UNITS = {"mm/s^2": 1.0, "m/s^2": 1000.0, "g": 9806.65}
 _LEAST_SAMPLES = 64
+_NO_TEST = (
+    "RepRapFirmware has no resonance test of its own: tell which motion was commanded, or record "
+    "command and acceleration together"
+)
 _KLIPPER = ("accel_x", "accel_y", "accel_z")
 _TRAILER = re.compile(r"rate\s+([\d.]+)\s*,?\s*overflows\s+(\d+)", re.IGNORECASE)
 _OVERFLOWS = re.compile(r"overflows\W{0,4}(\d+)", re.IGNORECASE)
@@ -78,7 +82,7 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
     for i, name in enumerate(table.names[1:], start=1):
         accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
     notes = check_alive(dict(zip("xyz", accel.T, strict=True)), table, axis, settings.sensor_axis)
-    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, notes)
+    return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (_NO_TEST, *notes))
 
 
 def _rate_hz(table: Table) -> float:

@@ -48,13 +48,13 @@ def read_responses(
     frequency = _needed(table, _FREQUENCY)
     f_hz = table.numbers([frequency])[:, 0]
     response = _response(table, settings)
-    coherence = _optional(table, _COHERENCE)
-    outside = np.flatnonzero((coherence < 0) | (coherence > 1))
-    if len(outside):
-        raise table.at(
-            int(outside[0]), f"coherence {coherence[outside[0]]:g} is not between 0 and 1"
-        )
-    sd = _optional(table, _DEVIATION)
+    coherence, sd = _optional(table, _COHERENCE), _optional(table, _DEVIATION)
+    for name, column, most in (("coherence", coherence, 1.0), ("sd", sd, np.inf)):
+        outside = np.flatnonzero((column < 0) | (column > most))
+        if len(outside):
+            raise table.at(
+                int(outside[0]), f"{name} {column[outside[0]]:g} is not between 0 and {most:g}"
+            )
     labels, axes = _texts(table, _LABEL), _texts(table, ("axis",))
     results = []
     for label, own in dict.fromkeys(zip(labels, axes, strict=True)):

@@ -48,6 +48,8 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
     values = table.numbers(["freq", *names, *([_PER_HZ] if has_per_hz else [])])
     f_hz, psd = values[:, 0], values[:, 1 : 1 + len(names)]
     check_rising(f_hz, table, "freq")
+    if f_hz[0] < 0:
+        raise table.at(0, f"freq {f_hz[0]:g} is negative")
     below = np.argwhere(psd < 0)
     if len(below):
         row, column = below[0]

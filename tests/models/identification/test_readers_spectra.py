@@ -132,6 +132,8 @@ def test_spectrum_faults() -> None:
         read("\n".join(table(header, PSD).split("\n")[:9]) + "\n")
     with pytest.raises(ModelError, match="does not rise"):
         read(table(header, PSD).replace("\n6.2,", "\n2.2,"))
+    with pytest.raises(ModelError, match=r"line 2: freq -0\.1 is negative"):
+        read(table(header, PSD).replace("\n0.0,", "\n-0.1,"))
     text = table(header + ",accel_per_hz", PSD, "60.0")
     with pytest.raises(ModelError, match="the same in every line"):
         read(text[: text.rindex("60.0")] + "75.0\n")
@@ -226,6 +228,8 @@ def test_response_faults() -> None:
         read_content(text("freq_hz,mag,coherence", "3,1"), "f.csv")
     with pytest.raises(ModelError, match=r"coherence 1\.2 is not between"):
         read_content(text("freq_hz,mag,phase_deg,coherence", "3,1,1.2"), "f.csv")
+    with pytest.raises(ModelError, match="sd -1 is not between 0"):
+        read_content(text("freq_hz,mag,phase_deg,sd", "3,1,-1"), "f.csv")
     with pytest.raises(ModelError, match="column 'imag' is missing"):
         read_content(text("freq_hz,real", "3"), "f.csv")
     with pytest.raises(ModelError, match="dB is beyond"):
