@@ -16,6 +16,7 @@ import typer
 from service.environment import prepare_environment
 from service.interruption import Interrupted
 from service.machines import commands as machines
+from service.proof import commands as proof
 
 __all__ = ["app", "main", "run"]
 
@@ -258,6 +259,9 @@ def serve(
             "127.0.0.1, or say --allow-remote if something before it checks who is calling"
         )
     serve_forever(settings, host, port)
+
+
+proof.register(app)
 
 
 def _options(**values: Any) -> Any:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from service.machines.commands import open_machines
+
 if TYPE_CHECKING:
-    from models.machine import Machine
     from service.proof.program import PrintSettings
 
 __all__ = ["register"]
@@ -59,15 +60,15 @@ def coupon(
 ) -> None:
     """Write a first print: its left half as planned, its right half compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
-    found = _machine(machine)
+    found = open_machines().for_job(machine, files=True)
 
     from service.console import progress_shown
     from service.proof.coupon import write_coupon
     from service.proof.tables import print_proof
 
     with progress_shown("stillpath") as progress:
-        made = write_coupon(found, _target(output), settings, progress=progress)
-    print_proof(made)
+        made = write_coupon(found.machine, _target(output), settings, progress=progress)
+    print_proof(made, found.warnings)
 
 
 def tower(
@@ -85,15 +86,17 @@ def tower(
 ) -> None:
     """Write a ringing tower, each band half as planned and half compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
-    found = _machine(machine)
+    found = open_machines().for_job(machine, files=True)
 
     from service.console import progress_shown
     from service.proof.tables import print_proof, print_tower
     from service.proof.tower import write_tower
 
     with progress_shown("stillpath") as progress:
-        made = write_tower(found, axis, _target(output), settings, count=bands, progress=progress)
-    print_proof(made.written, lines=3)
+        made = write_tower(
+            found.machine, axis, _target(output), settings, count=bands, progress=progress
+        )
+    print_proof(made.written, found.warnings, lines=3)
     print_tower(made)
 
 
@@ -113,7 +116,7 @@ def verify(
     ] = None,
 ) -> None:
     """Compare an accelerometer log of a print with what the model says of that print."""
-    found = _machine(machine)
+    found = open_machines().to_look_at(machine, files=True).machine
 
     from service.console import progress_shown
     from service.proof.page import write_readback
@@ -167,9 +170,3 @@ def _target(output: Path) -> Path:
     if not target.parent.is_dir():
         raise typer.BadParameter(f"the folder {target.parent} does not exist; make it first")
     return target
-
-
-def _machine(name: str) -> Machine:
-    from models.store import load_machine
-
-    return load_machine(name)

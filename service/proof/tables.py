@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.console import Console
 from rich.table import Table
 
@@ -12,12 +14,18 @@ from service.proof.tower import Tower
 __all__ = ["print_proof", "print_readback", "print_tower"]
 
 
-def print_proof(made: ProofPrint, console: Console | None = None, lines: int | None = None) -> None:
-    """Print the legend (its first lines) and the warnings of a print."""
+def print_proof(
+    made: ProofPrint,
+    warnings: Sequence[str] = (),
+    console: Console | None = None,
+    *,
+    lines: int | None = None,
+) -> None:
+    """Print the legend (its first lines) and all warnings about a print and its machine."""
     console = console or Console(highlight=False, soft_wrap=True)
     for line in made.legend[:lines]:
         console.print(line, markup=False)
-    for warning in made.warnings:
+    for warning in (*warnings, *made.warnings):
         console.print(f"warning: {warning}", markup=False)
 
 
