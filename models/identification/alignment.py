@@ -25,12 +25,11 @@ Array = NDArray[np.float64]
 _BAND_HZ = 10.0
 _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
-_APART_S = 2.0
-_LEAST_FRACTION = 0.95
+_APART_S = 2.0  # beyond the side lobes of one peak
+_LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
 _LATEST_START_S = 0.5
 _LEAD_S = 0.5
-_LARGEST_TURN = 0.7
-_SAME_DIRECTION = 0.7
+_LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +76,8 @@ def align(
     Raises
     ------
     ModelError
-        If the test is not in the log (another sweep, a sensor that does not move with the axis),
+        If the test is not in the log (another sweep, a sensor that does not move with the axis, a
+        resonance within 10 Hz above the start of the sweep, where the axis must still follow),
         is there twice, lacks its start or its end, or if the axis is not the one that was asked
         for.
     """
@@ -122,7 +122,7 @@ def check_pair(x: AlignedLog, y: AlignedLog) -> None:
     The machine's axes are perpendicular; two logs that move alike are of the same axis.
     """
     cosine = abs(float(x.direction @ y.direction))
-    if cosine > _SAME_DIRECTION:
+    if cosine > _LEAST_COSINE:
         raise ModelError(
             "the logs of X and Y both show motion along the sensor direction "
             f"{_vector(x.direction)}: the same axis was measured twice; measure the other one"
@@ -217,7 +217,7 @@ def _check_axis(log: AccelerationLog, excitation: Excitation) -> None:
     if named is None:
         return
     cosine = abs(float(np.dot(named, excitation.direction)))
-    if cosine < _SAME_DIRECTION:
+    if cosine < _LEAST_COSINE:
         raise ModelError(
             f"{log.source}: the file is a test of axis {log.axis}, but the direction "
             f"({excitation.direction[0]:g}, {excitation.direction[1]:g}) was asked for; "
@@ -245,7 +245,7 @@ def _check_direction(
         return
     expected = np.asarray(sensor_direction, np.float64)
     cosine = abs(float(direction @ expected)) / float(np.linalg.norm(expected))
-    if cosine < _LARGEST_TURN:
+    if cosine < _LEAST_COSINE:
         raise ModelError(
             f"{log.source}: the sensor moved along {_vector(direction)}, not along "
             f"{_vector(expected)} as its mounting says: another axis was measured, or the sensor "
@@ -289,7 +289,7 @@ def _not_found(
     if dead:
         return (
             f"{log.source}: the test is not in the log, and accel_{dead[0]} is constant "
-            f"throughout: that axis of the sensor is dead; check its wiring and measure again"
+            "throughout: that axis of the sensor is dead; check its wiring and measure again"
         )
     moved = float(np.sqrt(np.sum(np.var(accel, axis=0))))
     sent = excitation.accel_per_hz_mm_s * 0.5 * (excitation.f_start_hz + excitation.f_end_hz)
@@ -303,7 +303,7 @@ def _not_found(
         f"{log.source}: the test is not in the log: the greatest correlation with a sweep from "
         f"{excitation.f_start_hz:g} to {excitation.f_end_hz:g} Hz at {excitation.hz_per_s:g} Hz/s "
         f"is {correlation:.2f}; check min_freq, max_freq, hz_per_sec and the Klipper version "
-        "against printer.cfg"
+        "against printer.cfg (a resonance below 16 Hz would hide it too)"
     )
 
 

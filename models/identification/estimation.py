@@ -156,7 +156,8 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
         f"{response.source}: between {_PLATEAU_HZ[0]:g} and {_PLATEAU_HZ[1]:g} Hz the axis moved "
         f"{gain:.2f} times as much as commanded with accel_per_hz = {stated:g}; it must be 1 "
         f"within {_PLATEAU_TOLERANCE:.0%}. The log looks like accel_per_hz = {stated * gain:.3g}: "
-        "check printer.cfg [resonance_tester] and the sensor's scale"
+        "check [resonance_tester] in printer.cfg (default 75 before 2024-12, 60 since) and the "
+        "sensor's scale"
     )
 
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.signal import butter, correlate, sosfiltfilt
 
 from models.errors import ModelError
@@ -51,6 +53,21 @@ def test_start_and_direction_are_found(
     assert aligned.f_reached_hz == excitation.f_end_hz
     assert len(aligned.command_mm_s2) == len(aligned.measured_mm_s2)
     assert aligned.notes == ()
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(0.0, 1e5), st.floats(-0.4, 8.0), st.floats(0.0, 6.0), st.integers(0, 2**32 - 1))
+def test_any_start_is_found(start_s: float, lead_s: float, tail_s: float, seed: int) -> None:
+    log = simulate_log(
+        PLANTS,
+        SHORT,
+        sensor=LIS2DW,
+        start_s=start_s,
+        lead_s=lead_s,
+        tail_s=tail_s,
+        rng=np.random.default_rng(seed),
+    )
+    assert align(log, SHORT).start_s == pytest.approx(start_s + SLOW_S, abs=2e-4)
 
 
 def test_start_is_where_scipys_correlation_has_its_peak() -> None:
