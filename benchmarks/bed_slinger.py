@@ -1,9 +1,9 @@
 """A bed that grows heavier: a fixed model against one that follows the printed mass.
 
 A bed slinger of moving mass .8 kg (35 Hz with the bed empty) prints a block of .5 kg; Y falls to
-27.4 Hz. The print is made here: squares with zigzag infill and a ring, layer on layer, of a filament
-ten times as dense as PLA, so that half a kilogram takes 13 minutes (17 m of filament, 43 mm high)
-instead of two hours. The mass grows ten times as fast as it would, which is the harder case.
+27.4 Hz. The print is made here: squares with zigzag infill and a ring, layer on layer, of a
+filament ten times as dense as PLA, so that half a kilogram takes 13 minutes (17 m of filament, 43
+mm high) instead of two hours. The mass grows ten times as fast as it would: the harder case.
 
 The file is compensated with the model of the empty bed, and with the mass schedule. The judge reads
 the written files back at 10 kHz and integrates m(t) y'' + c y' + k y = k u with position and speed

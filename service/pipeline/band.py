@@ -20,7 +20,8 @@ class BandContent:
     """Spectrum of the planned motion of X and Y while it prints.
 
     Blocks of 1024 samples (Welch 1967, Hann window, no overlap) of the planned acceleration, from
-    which a position's slow travel does not leak; |Y(f)| = |A(f)| / (2 pi f)^2.
+    which a position's slow travel does not leak; |Y(f)| = |A(f)| / (2 sin(pi f dt) / dt)^2, as
+    second differences have it.
 
     Parameters
     ----------
@@ -63,7 +64,8 @@ class BandContent:
         f = np.fft.rfftfreq(BLOCK, self._dt_s)
         above = f > f_hz
         scale = 2.0 / (BLOCK * np.sum(self._window**2) * max(self._blocks, 1))
-        square = self._power[:, above] @ (2.0 * np.pi * f[above]) ** -4.0
+        second = (2.0 * np.sin(np.pi * f[above] * self._dt_s) / self._dt_s) ** 2
+        square = self._power[:, above] @ second**-2.0
         return np.asarray(1e3 * np.sqrt(scale * square))
 
     def warnings(self) -> list[str]:
