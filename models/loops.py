@@ -181,11 +181,13 @@ class Loop:
     def varied(self, gain: float = 1.0, delay_samples: float = 0.0) -> Loop:
         """Return the loop with another plant gain and more delay, its controller unchanged.
 
-        A fraction of a sample is a first-order all-pass (Thiran), exact at low frequency.
+        A fraction of a sample, in steps of .001, is a first-order all-pass (Thiran), exact at
+        low frequency.
         """
         whole = math.floor(delay_samples)
-        a = (1 - (delay_samples - whole)) / (1 + (delay_samples - whole))
-        allpass = ((a, 1.0), (1.0, a)) if delay_samples > whole else ((1.0,), (1.0,))
+        fraction = round(delay_samples - whole, 3)
+        a = (1 - fraction) / (1 + fraction)
+        allpass = ((a, 1.0), (1.0, a)) if fraction else ((1.0,), (1.0,))
         num = np.convolve(gain * np.asarray(self.plant_num), allpass[0])
         return replace(
             self,

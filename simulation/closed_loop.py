@@ -92,7 +92,7 @@ class ClosedLoop:
         """
         given = dict(inputs)
         if self._generator is not None and self._noise_rms > 0:
-            samples = len(np.atleast_1d(np.asarray(next(iter(given.values())))))
+            samples = max((np.size(x) for x in given.values()), default=0)
             noise = self._noise_rms * self._generator.standard_normal(samples)
             given["n"] = noise + np.asarray(given.get("n", 0.0), float)
         return self._running.push(given, watch)

@@ -133,6 +133,8 @@ class AdaptiveFmsdob:
         self._idle = tuple(top * (i + 1) / (tones + 1) for i in range(tones))
         self._tuned: tuple[float, ...] = ()
         self._last: tuple[float, ...] = ()
+        self._judged: tuple[float, ...] = ()
+        self._refused: tuple[float, ...] = ()
 
     @property
     def targets_hz(self) -> tuple[float, ...]:
@@ -147,18 +149,11 @@ class AdaptiveFmsdob:
     def hear(self, dhat: Array) -> Retuning | None:
         """Return what to change after the samples `dhat`, None for nothing."""
         found = self.tracker.push(dhat)
-        settled = (
-            len(found) == len(self._last)
-            and len(found) > 0
-            and max(abs(a - b) for a, b in zip(found, self._last, strict=True))
-            < 0.25 * self._bandwidth_hz
-        )
-        self._last = found
-        if not settled:
-            return self._retuned(()) if self._tuned and self.tracker.jumped else None
-        if self._tuned and max(
-            abs(a - b) for a, b in zip(found, self._tuned, strict=True)
-        ) <= 1e-13 * max(found):
+        moved, self._last = _apart(found, self._last), found
+        if moved > 0.25 * self._bandwidth_hz:
+            return self._retuned(()) if self.tracker.jumped else None
+        near = 0.5 * self._bandwidth_hz
+        if _apart(found, self._tuned) <= 1e-13 * max(found) or _apart(found, self._refused) <= near:
             return None
         return self._retuned(found)
 
@@ -183,18 +178,17 @@ class AdaptiveFmsdob:
         if not targets:
             return Retuning(self._silent().blocks("dhat", "c"), reset=True)
         try:
+            if _apart(targets, self._judged) > 0.5 * self._bandwidth_hz:
+                self.controller()
+                self._judged = targets
             q = design_q(
                 self._loops[0], targets, bandwidth_hz=self._bandwidth_hz, around=self._around
             )
         except DesignError:
-            # Two tones not told apart yet: stay as it was and hear on.
-            self._tuned = before
+            # Two tones not told apart yet, or a member would be unstable: leave it until they move.
+            self._tuned, self._refused = before, targets
             return None
-        far = (
-            not before
-            or max(abs(a - b) for a, b in zip(targets, before, strict=True))
-            > 0.5 * self._bandwidth_hz
-        )
+        far = _apart(targets, before) > 0.5 * self._bandwidth_hz
         return Retuning(q.blocks("dhat", "c"), reset=far)
 
     def _silent(self) -> QFilter:
@@ -235,6 +229,13 @@ def _cosines(theta: Array) -> Array:
     series = np.concatenate([theta[-1:], 2 * theta[-2::-1], [2.0]])
     roots = chebyshev.chebroots(series)
     return np.asarray(np.clip(np.real(roots), -1 + 1e-9, 1 - 1e-9), np.float64)
+
+
+def _apart(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Return the largest step between two lists of tones, infinite unless both have tones."""
+    if not a or not b:
+        return math.inf
+    return max(abs(x - y) for x, y in zip(a, b, strict=True))
 
 
 def _coefficients(cosines: Array) -> Array:

@@ -261,7 +261,7 @@ def judged(
             raise Refusal(
                 "unstable",
                 f"{method} on {loop.name!r}: not internally stable, largest |z| = {radius:.8f}; "
-                "use a narrower band pass, detune, or fewer targets",
+                "detune, drop the targets where the plant is least known, or identify it better",
             )
         radii.append(radius)
     if noise_gain is None:

@@ -17,7 +17,7 @@ __all__ = ["interpolating_fir", "inverse_and_slope"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-_LARGEST_CONDITION = 1e12
+_LARGEST_CONDITION = 1e10
 
 
 def inverse_and_slope(
