@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import firwin
 
 from compensation.base import Compensator, DesignError, Memoryless, compensator
 from compensation.holds import stand_still
@@ -46,6 +47,8 @@ _STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
 """Budgets of a wave's acceleration, in parts of the machine's limit."""
 _BAND = (0.30, 0.45)
 """Frequencies, times the sampling time, between which a wave fades away."""
+_CUTOFF = 0.2
+"""Of the output side's low-pass, times the sampling time; it goes with the root of the budget."""
 _BLEND_S = 0.02
 _MOST_STEPS, _CLOSE_MM = 20, 1e-12
 _SLOWEST_ZERO = 0.97
@@ -97,10 +100,18 @@ def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = No
 
 
 def output_command(
-    path_mm: Array, table: RippleTable, inverse: Inversion, share: Array | None = None
+    path_mm: Array,
+    table: RippleTable,
+    inverse: Inversion,
+    share: Array | None = None,
+    fir: Array | None = None,
 ) -> Array:
-    """Return -G^-1 d(s) along a path, shape (n,); see `input_command`."""
-    return -inverse.apply(table.deviation_mm(path_mm, share))
+    """Return -G^-1 d(s) along a path, shape (n,); see `input_command`.
+
+    At corners of the path the speed steps, and -G^-1 would answer with a blow: `fir`, symmetric of
+    odd length, takes out what lies above the waves.
+    """
+    return -inverse.apply(table.deviation_mm(path_mm, share), fir)
 
 
 def wave_shares(
@@ -236,12 +247,14 @@ class RippleCompensator:
 
     def _undone(self, wanted: Array, y_d: Array) -> Array:
         aim = wanted.copy()
+        room = self.budget_mm_s2 / self._limits.accel_mm_s2
+        fir = _lowpass(_CUTOFF * math.sqrt(room))
         for row, output in enumerate(self._outputs):
             if output is not None:
                 share = wave_shares(
                     y_d[row], output.table, self._dt_s, self.budget_mm_s2, output.plant
                 )
-                aim[row] += output_command(y_d[row], output.table, output.inverse, share)
+                aim[row] += output_command(y_d[row], output.table, output.inverse, share, fir)
         motors = self._ripple.to_motors @ aim
         for row, table in enumerate(self._ripple.inputs):
             if len(table):
@@ -279,6 +292,11 @@ def _inverted(axis: str, plant: DiscretePlant, table: RippleTable) -> _Output:
     except DesignError as error:
         raise DesignError(f"axis {axis}, output ripple: {error}") from None
     return _Output(table, plant, inverse)
+
+
+def _lowpass(cutoff: float) -> Array:
+    """Zero-phase low-pass, flat up to 0.8 of its cutoff (in units of the sampling rate)."""
+    return np.asarray(firwin(2 * math.ceil(4.0 / cutoff) + 1, 2.0 * cutoff))
 
 
 def _gain(plant: DiscretePlant, f_hz: Array) -> Array:
