@@ -146,7 +146,7 @@ class Machine(_Document):
 
     schema_version: Literal[1] = 1
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
-    title: str
+    title: Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
     source: str = ""
     kinematics: Literal["cartesian", "corexy"]
     travel: dict[Literal["x", "y", "z"], AxisTravel]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
+from pydantic_core import from_json
 
 from models.errors import ModelError
 from models.machine import Machine
@@ -75,8 +75,8 @@ def read_machine(document: str | bytes, source: str = "machine") -> Machine:
         Naming the first field that is wrong, its value and what it must be.
     """
     try:
-        parsed = json.loads(document)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        parsed = from_json(document)
+    except ValueError as error:
         raise ModelError(f"{source}: not JSON ({error})") from None
     try:
         return Machine.model_validate(parsed)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from service.machines.resolve import Resolver
     from service.machines.revision import Revision
 
-__all__ = ["app", "open_machines"]
+__all__ = ["app", "open_machines", "who"]
 
 
 class _Group(TyperGroup):
@@ -155,7 +155,7 @@ def approve(name: Name, revision: Number = None, by: By = None, message: Message
     """Say that a revision may be used for jobs."""
     store = open_machines().store
     number = revision or store.current(name).number
-    approval = store.approve(name, number, author=_who(by), message=message)
+    approval = store.approve(name, number, author=who(by), message=message)
     typer.echo(f"{name} revision {number}: approved by {approval.author}")
 
 
@@ -168,7 +168,7 @@ def rollback(
 ) -> None:
     """Bring an earlier revision back, as a new one."""
     store = open_machines().store
-    _told(store.roll_back(name, to, author=_who(by), message=message))
+    _told(store.roll_back(name, to, author=who(by), message=message))
 
 
 @app.command()
@@ -209,7 +209,7 @@ def import_(
     from service.machines.transfer import import_file
 
     store = open_machines().store
-    _told(import_file(store, file, author=_who(by), message=message, name=name))
+    _told(import_file(store, file, author=who(by), message=message, name=name))
 
 
 @app.command()
@@ -226,7 +226,7 @@ def put(
         store.add_revision(
             machine.name,
             machine,
-            author=_who(by),
+            author=who(by),
             message=message or f"from {file.name}",
             sources=[source_file(file.name, file.read_bytes())],
         )
@@ -293,7 +293,7 @@ def from_config(
     revision = open_machines().store.add_revision(
         name,
         machine,
-        author=_who(by),
+        author=who(by),
         message=f"from {file.name}; plants typed in",
         sources=[source_file(file.name, file.read_bytes())],
         expected=0,
@@ -303,7 +303,7 @@ def from_config(
         typer.echo(f"note: {line}")
 
 
-def _who(by: str | None) -> str:
+def who(by: str | None) -> str:
     if by is not None:
         return by
     import getpass

@@ -138,12 +138,16 @@ def _parse(
     sections: _Sections = {}
     includes: list[str] = []
     current: dict[str, Option] = {}
+    begun_at: int | None = None  # indentation of the option that deeper lines go on with
     for number, full in enumerate(lines, 1):
         if full.startswith("#*#") is not saved:
             continue
-        line = _COMMENT.sub("", full[len(_SAVED) :] if saved else full).rstrip()
-        if not line or line[0].isspace():
+        indented = _COMMENT.sub("", full[len(_SAVED) :] if saved else full).rstrip()
+        line = indented.lstrip()
+        indent = len(indented) - len(line)
+        if not line or (begun_at is not None and indent > begun_at):
             continue  # lines that go on, of macros and lists, say nothing about motion
+        begun_at = None
         if section := _SECTION.match(line):
             name = section["name"].strip()
             if name.startswith("include "):
@@ -152,6 +156,7 @@ def _parse(
                 current = sections.setdefault(name.lower(), {})
         elif option := _OPTION.match(line):
             current[option["name"].strip().lower()] = Option(option["value"], number)
+            begun_at = indent
     return sections, tuple(includes)
 
 

@@ -12,7 +12,6 @@ revision is the current one, and a process that is killed leaves the state befor
 
 from __future__ import annotations
 
-import json
 import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import from_json
 
 from models.errors import ModelError
 from models.machine import Machine
@@ -383,12 +383,12 @@ def _approval_file(folder: Path, number: int) -> Path:
 
 def _read(file: Path, kind: type[_Kind]) -> _Kind:
     try:
-        return kind.model_validate(json.loads(file.read_bytes()))
+        return kind.model_validate(from_json(file.read_bytes()))
     except FileNotFoundError:
         raise _Gone(f"{file} is gone: the machine was deleted meanwhile") from None
     except ValidationError as error:
         raise _damaged(file, explain(error)) from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise _damaged(file, f"not JSON ({error})") from None
 
 

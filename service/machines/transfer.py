@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import from_json
 
 from models.errors import ModelError
 from models.store import explain, read_machine
@@ -94,8 +94,8 @@ def _content(file: Path) -> bytes:
 def _as_history(content: bytes, file: Path) -> _History | None:
     """Return the history in a file, None if it is something else."""
     try:
-        document = json.loads(content)
-    except (ValueError, RecursionError):
+        document = from_json(content)
+    except ValueError:
         return None
     if not isinstance(document, dict) or "revisions" not in document:
         return None

@@ -114,6 +114,9 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
         (MINE, b"[" * 100_000, 422, ["not JSON"]),
         (MINE, b"{}", 422, ["missing", "Field required"]),
         (MINE, b" " * 4_000_001, 413, ["4000000 bytes"]),
+        (MINE, b'{"title": "\\ud800"}', 422, ["not JSON"]),
+        (MINE, b'{"title": "\xff"}', 422, ["not JSON"]),
+        (MINE, make_machine().model_dump_json().replace("My", "\\u001b["), 422, ["title"]),
         ("/v1/machines/yours", None, 422, ["'mine', not 'yours'"]),
         ("/v1/machines/ender3", None, 409, ["built-in", "another name"]),
         ("/v1/machines/Mine", None, 422, ["cannot be a machine's name"]),
@@ -124,7 +127,7 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
     ],
 )
 def test_bad_documents_leave_nothing(
-    client: TestClient, tmp_path: Path, where: str, body: bytes | None, status: int, words
+    client: TestClient, tmp_path: Path, where: str, body: bytes | str | None, status: int, words
 ):
     content = make_machine().model_dump_json() if body is None else body
     document = assert_problem(client.put(where, content=content), status)

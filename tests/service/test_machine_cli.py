@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import json
 from datetime import date, timedelta
 from pathlib import Path
@@ -193,6 +194,20 @@ def test_what_a_printer_cfg_says(config: Path):
     assert found.text("input_shaper", "shaper_type_x") == "ei"  # the file's own wins
     assert found.number("input_shaper", "shaper_freq_x") == 61.2
     assert found.sections["printer"]["max_velocity"].line == 6
+
+
+def test_indentation_counts_as_in_configparser(tmp_path: Path):
+    file = tmp_path / "printer.cfg"
+    file.write_text(
+        "[printer]\n  max_velocity: 300\n\n  max_accel: 4000\n[gcode_macro A]\ngcode:\n\n"
+        "  [printer]\n  max_accel: 1\n[extruder]\n\tnozzle_diameter: 0.6\n"
+    )
+    found = read_printer_config(file)
+    theirs = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";", "#"))
+    theirs.read(file)
+    for section in ("printer", "extruder"):
+        options = {name: option.value for name, option in found.sections[section].items()}
+        assert options == dict(theirs[section])
 
 
 def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys):
