@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from datetime import date
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["MeasuredMode", "Provenance", "SourceFile"]
+__all__ = ["Kind", "MeasuredMode", "Provenance", "SourceFile"]
+
+Kind: TypeAlias = Literal[
+    "raw log", "spectrum", "frequency response", "recorded drive", "model file", "typed in"
+]
+"""What a model was made of."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -51,9 +56,7 @@ class Provenance(_Document):
         Above, the model may be far off although it fits (phase unknown, or not measured).
     """
 
-    kind: Literal[
-        "raw log", "spectrum", "frequency response", "recorded drive", "model file", "typed in"
-    ]
+    kind: Kind
     measured_on: date | None = None
     sources: tuple[SourceFile, ...] = ()
     residual: NonNegative | None = None

@@ -1,0 +1,135 @@
+"""One measurement out of repeats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.identification.types import FrequencyResponse, Spectrum
+
+__all__ = ["aligned_to", "low_frequency_delay", "mean_response", "mean_spectrum", "on_grid"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_FLAT = 0.2
+"""Logarithm of the modulus that a mode must add before its phase counts."""
+
+
+def mean_response(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
+    """Return the mean weighted by 1/sd^2, on the frequencies that all share.
+
+    Delays that differ (each recording starts at its own instant) are made those of the first.
+    Its standard deviation is the larger of what the members' own say and of their scatter.
+
+    Raises
+    ------
+    ModelError
+        If there is no response, or the bands do not overlap.
+    """
+    if not responses:
+        raise ModelError("no frequency response to average: give one or more")
+    first = responses[0]
+    if len(responses) == 1:
+        return first
+    low = max(float(r.f_hz.min()) for r in responses)
+    high = min(float(r.f_hz.max()) for r in responses)
+    f = first.f_hz[(first.f_hz >= low) & (first.f_hz <= high)]
+    if len(f) < 2:
+        raise ModelError(
+            f"the {len(responses)} responses share no frequencies (the highest start is "
+            f"{low:.1f} Hz, the lowest end {high:.1f} Hz); fit them one by one"
+        )
+    moved = [on_grid(aligned_to(r, first), f) for r in responses]
+    h = np.stack([r.response for r in moved])
+    sd = np.stack([r.sd for r in moved])
+    known = np.isfinite(sd) & (sd > 0)
+    weight = np.where(known.all(axis=0), 1 / np.where(known, sd, 1.0) ** 2, 1.0)
+    share = weight / weight.sum(axis=0)
+    mean = (share * h).sum(axis=0)
+    propagated = np.where(known.all(axis=0), np.sqrt(1 / weight.sum(axis=0)), np.nan)
+    scatter = np.sqrt((share * np.abs(h - mean) ** 2).sum(axis=0) / (len(h) - 1))
+    return replace(
+        first,
+        f_hz=f,
+        response=mean,
+        sd=np.fmax(propagated, scatter),
+        coherence=np.mean([r.coherence for r in moved], axis=0),
+        label=f"mean of {len(responses)}",
+        notes=tuple(dict.fromkeys(n for r in responses for n in r.notes)),
+    )
+
+
+def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
+    """Return the mean of the logarithms of the columns that all share, on the first's grid.
+
+    Raises
+    ------
+    ModelError
+        If there is no spectrum, or no column is in all of them.
+    """
+    if not spectra:
+        raise ModelError("no spectrum to average: give one or more")
+    first = spectra[0]
+    if len(spectra) == 1:
+        return first
+    shared = [name for name in first.psd if all(name in s.psd for s in spectra)]
+    if not shared:
+        raise ModelError(
+            f"the {len(spectra)} spectra share no column (the first has {', '.join(first.psd)}); "
+            "fit them one by one"
+        )
+    f = first.f_hz[first.f_hz <= min(float(s.f_hz.max()) for s in spectra)]
+    tiny = np.finfo(float).tiny
+    logs = {
+        name: np.mean(
+            [np.interp(f, s.f_hz, np.log(np.maximum(s.psd[name], tiny))) for s in spectra], axis=0
+        )
+        for name in shared
+    }
+    return replace(
+        first,
+        f_hz=f,
+        psd={name: np.exp(log) for name, log in logs.items()},
+        notes=tuple(dict.fromkeys(n for s in spectra for n in s.notes)),
+    )
+
+
+def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> FrequencyResponse:
+    """Return the response with the delay of the reference at low frequency."""
+    shift = low_frequency_delay(response.f_hz, response.response) - low_frequency_delay(
+        reference.f_hz, reference.response
+    )
+    turned = response.response * np.exp(2j * np.pi * response.f_hz * shift)
+    return replace(response, response=turned)
+
+
+def low_frequency_delay(f_hz: Array, response: ComplexArray) -> float:
+    """Return the delay [s] that the phase's slope shows where the modulus is still flat.
+
+    There the modes add little, each only 2 zeta/w.
+    """
+    size = np.abs(response)
+    leaves = np.abs(np.log(size / np.median(size[:3]))) > _FLAT
+    few = max(6, int(np.argmax(leaves)) if leaves.any() else len(size))
+    phase = np.unwrap(np.angle(response[:few]))
+    slope = np.polyfit(f_hz[:few], phase, 1)[0] if len(phase) > 1 else 0.0
+    return float(-slope / (2 * np.pi))
+
+
+def on_grid(response: FrequencyResponse, f_hz: Array) -> FrequencyResponse:
+    """Return the response at `f_hz`, linear between its points."""
+    own = response.f_hz
+    if np.array_equal(own, f_hz):
+        return response
+    return replace(
+        response,
+        f_hz=f_hz,
+        response=np.interp(f_hz, own, response.response),
+        sd=np.interp(f_hz, own, response.sd),
+        coherence=np.interp(f_hz, own, response.coherence),
+    )

@@ -1,0 +1,342 @@
+"""A plant from a measured frequency response.
+
+Sanathanan-Koerner over a range of delays gives starts, nonlinear least squares on pairs of poles
+and zeros polishes them; the number of pairs rises while the residual falls clearly and is not yet
+explained by the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from models.identification.averaging import mean_response
+from models.identification.mode_estimates import (
+    band_warnings,
+    filler_poles,
+    mode_estimates,
+    robust_covariance,
+)
+from models.identification.pair_structure import PairStructure
+from models.identification.response_data import ResponseData, response_data
+from models.identification.sanathanan_koerner import (
+    pairs_of,
+    polynomial_basis,
+    sanathanan_koerner,
+)
+from models.identification.types import Fit, FrequencyResponse, OrderTrial
+
+__all__ = ["fit_response", "refit_response"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_CLEARLY = 0.7
+"""Each further pair must bring the residual below this share."""
+_EXPLAINED = 1.3
+"""A residual below this multiple of the noise is noise."""
+_NO_WORSE = 1.05
+"""What may be lost for a model that is minimum phase, or has a pair less."""
+_ZERO_BAND = 0.8
+"""Zeros above this share of the band trade off with the delay: taken as minimum phase."""
+_DELAY_SPAN_S = 1.5e-3
+_DELAY_STEP_S = 0.5e-3
+_MOST_DELAYS = 15
+_START_POINTS = 160
+_POLES_BAND = (0.5, 1.6)
+"""Poles and zeros may lie outside the band by these factors."""
+_ZETA = (3e-3, 3.0)
+
+
+def fit_response(
+    measured: FrequencyResponse | Sequence[FrequencyResponse],
+    *,
+    max_order: int = 4,
+    band_hz: tuple[float, float] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Fit:
+    """Fit a plant to a frequency response.
+
+    Parameters
+    ----------
+    measured : FrequencyResponse or sequence of them
+        Several are averaged first (`averaging.mean_response`).
+    max_order : int
+        Most pole pairs to try.
+    band_hz : (low, high), optional
+        Use only these frequencies.
+    progress : callable, optional
+        Told the share done, 0 to 1.
+
+    Returns
+    -------
+    Fit
+        Stable, DC gain 1; `residual` and `trials` hold NRMSE, the root of sum |model - H|^2 over
+        sum |H|^2.
+
+    Raises
+    ------
+    ModelError
+        If too few points are left to fit.
+    """
+    single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
+    data = response_data(single, band_hz)
+    tried: list[_Candidate] = []
+    # A fit keeps three complex numbers per pair of poles and zeros.
+    for order in range(1, max(1, min(max_order, len(data.f_hz) // 6)) + 1):
+        tried.append(_best_of_order(data, order, tried[-1] if tried else None))
+        if progress:
+            progress(order / max_order)
+        if tried[-1].nrmse < _EXPLAINED * data.noise:
+            break
+    chosen = _calm_beyond(data, _without_fillers(data, _by_the_knee(tried, data.noise)))
+    trials = tuple(OrderTrial(c.structure.poles, c.nrmse) for c in tried)
+    return replace(_as_fit(data, chosen), trials=trials)
+
+
+def refit_response(
+    measured: FrequencyResponse, like: Fit, *, band_hz: tuple[float, float] | None = None
+) -> Fit:
+    """Fit a plant with the pairs of `like`, starting from it: a member of its set.
+
+    A zero keeps its side of the imaginary axis.
+
+    Raises
+    ------
+    ModelError
+        If too few points are left to fit.
+    """
+    data = response_data(measured, band_hz)
+    structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
+    theta = structure.parameters(like.spec)
+    start = _candidate(data, structure, theta, data.delay_s)
+    fitted = _polished(data, start, _sides(start))
+    return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """Parameters [log gain, delay (unit 1/(2 pi unit_hz)), pairs ...] of a structure."""
+
+    structure: PairStructure
+    vector: Array
+    nrmse: float = np.inf
+    cost: float = np.inf
+
+    @property
+    def theta(self) -> Array:
+        return self.vector[2:]
+
+    def model(self, f_hz: Array) -> ComplexArray:
+        nuisance = np.exp(self.vector[0] - 1j * f_hz / self.structure.unit_hz * self.vector[1])
+        return np.asarray(nuisance * self.structure.response(self.theta, f_hz))
+
+    def gradient(self, f_hz: Array) -> ComplexArray:
+        """Return the derivatives of the model, shape (len(f_hz), len(vector))."""
+        delay = -1j * f_hz / self.structure.unit_hz
+        logs = [np.ones(len(f_hz)), delay, self.structure.log_gradient(self.theta, f_hz)]
+        return np.asarray(self.model(f_hz)[:, None] * np.column_stack(logs))
+
+
+def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -> _Candidate:
+    starts = _rational_starts(data, order)
+    if smaller is None:
+        peak = data.f_hz[np.argmax(np.abs(data.response))] / data.unit_hz
+        theta = np.array([0.0, np.log(peak), np.log(0.1)])
+        starts.append(_candidate(data, PairStructure(1, 0, data.unit_hz), theta, data.delay_s))
+    else:
+        starts.append(_grown(data, smaller))
+    best = min((_polished(data, s) for s in starts), key=lambda c: c.cost)
+    return _with_zeros_in_band(data, best)
+
+
+def _with_zeros_in_band(data: ResponseData, fit: _Candidate) -> _Candidate:
+    """Mirror the zeros right of the imaginary axis that the measurement does not prove."""
+    kept = np.zeros(fit.structure.size)
+    for _ in range(3):
+        beyond = (_sides(fit) < 0) & (_zero_hz(fit) > _ZERO_BAND * data.f_hz[-1])
+        if not beyond.any():
+            break
+        kept[beyond] = 1.0
+        fit = _mirrored(data, fit, kept)
+    sides = _sides(fit)
+    if (sides < 0).any():
+        minimum_phase = _mirrored(data, fit, np.abs(sides))
+        if minimum_phase.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise):
+            return minimum_phase
+    return fit
+
+
+def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
+    """Refit with the zeros kept at `sides` (+1: left half plane)."""
+    vector = fit.vector.copy()
+    vector[2:][sides > 0] = np.abs(vector[2:][sides > 0])
+    return _polished(data, replace(fit, vector=vector), sides)
+
+
+def _sides(fit: _Candidate) -> Array:
+    """Return +1 or -1 at the parameters whose sign is a zero's side (-1: right), else 0."""
+    sides = np.zeros(fit.structure.size)
+    signed = [0, *range(fit.structure.size - fit.structure.zeros, fit.structure.size)]
+    sides[signed] = np.where(fit.theta[signed] < 0, -1.0, 1.0)
+    return sides
+
+
+def _zero_hz(fit: _Candidate) -> Array:
+    """Return the frequency of the zero at each parameter that holds its side, else 0."""
+    structure = fit.structure
+    tau, _, _, log_fz, _ = structure.split(fit.theta)
+    out = np.zeros(structure.size)
+    out[0] = structure.unit_hz / max(abs(tau), 1e-9)
+    out[structure.size - structure.zeros :] = np.exp(log_fz) * structure.unit_hz
+    return out
+
+
+def _by_the_knee(tried: list[_Candidate], noise: float) -> _Candidate:
+    """Return the smallest order that no larger one betters clearly."""
+    chosen = tried[0]
+    for larger in tried[1:]:
+        pairs = larger.structure.poles - chosen.structure.poles
+        clearly = larger.nrmse < _CLEARLY**pairs * chosen.nrmse
+        if chosen.nrmse > _EXPLAINED * noise and clearly:
+            chosen = larger
+    return chosen
+
+
+def _without_fillers(data: ResponseData, fit: _Candidate) -> _Candidate:
+    """Drop the pairs that are no resonances, unless the measurement needs them."""
+    for pole in filler_poles(fit.structure, fit.theta) if fit.structure.poles > 1 else ():
+        structure, theta = fit.structure.without(fit.theta, pole)
+        delay = fit.vector[1] / (2 * np.pi * data.unit_hz)
+        smaller = _with_zeros_in_band(
+            data, _polished(data, _candidate(data, structure, theta, delay))
+        )
+        if smaller.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise):
+            return _without_fillers(data, smaller)
+    return fit
+
+
+def _calm_beyond(data: ResponseData, fit: _Candidate) -> _Candidate:
+    """Refit if a pole pair above the band rings more than the measurement can tell."""
+    least = fit.structure.least_damping(fit.theta, _ZETA[0], float(data.f_hz[-1]))
+    if np.all(np.exp(fit.structure.split(fit.theta)[2]) >= least):
+        return fit
+    return _polished(data, fit, _sides(fit), least)
+
+
+def _as_fit(data: ResponseData, found: _Candidate) -> Fit:
+    gradient = data.weight[:, None] * found.gradient(data.f_hz)
+    residual = data.weight * (found.model(data.f_hz) - data.response)
+    covariance = robust_covariance(gradient, residual)[2:, 2:]
+    modes = mode_estimates(found.structure, found.theta, covariance)
+    return Fit(
+        spec=found.structure.spec(found.theta),
+        residual=found.nrmse,
+        gain=float(np.exp(found.vector[0])),
+        delay_s=float(found.vector[1] / (2 * np.pi * data.unit_hz)),
+        band_hz=data.band_hz,
+        modes=modes,
+        notes=(*data.notes, *band_warnings(modes, data.band_hz)),
+    )
+
+
+def _rational_starts(data: ResponseData, order: int) -> list[_Candidate]:
+    """Return the two best Sanathanan-Koerner fits over the delays, made stable."""
+    some = data.thinned(_START_POINTS)
+    basis = polynomial_basis(np.asarray(1j * some.f_hz / data.unit_hz, np.complex128), 2 * order)
+    structure = PairStructure(order, order - 1, data.unit_hz)
+    found: list[_Candidate] = []
+    for delay in _delays(data):
+        h = some.response * np.exp(2j * np.pi * some.f_hz * delay)
+        b, a, _ = sanathanan_koerner(basis, h, some.weight, 2 * order - 1, 2 * order)
+        theta = _pairs_theta(structure, b, a)
+        if theta is not None:
+            found.append(_judged(some, _candidate(some, structure, theta, float(delay))))
+    return sorted(found, key=lambda c: c.cost)[:2]
+
+
+def _delays(data: ResponseData) -> Array:
+    """Return delays to try: around the phase's slope and, the plant having its own, around 0."""
+    low = min(data.delay_s, 0.0) - _DELAY_SPAN_S
+    high = max(data.delay_s, 0.0) + _DELAY_SPAN_S
+    count = min(_MOST_DELAYS, 1 + round((high - low) / _DELAY_STEP_S))
+    return np.linspace(low, high, count)
+
+
+def _pairs_theta(structure: PairStructure, b: Array, a: Array) -> Array | None:
+    """Turn polynomials into parameters, unstable poles mirrored; None if pairs are missing."""
+    poles, _ = pairs_of(a)
+    zeros, tau = pairs_of(b)
+    if len(poles) != structure.poles or len(zeros) < structure.zeros:
+        return None
+    # Of too many zeros the slowest matter within the band.
+    zeros = zeros[: structure.zeros]
+    return np.concatenate(
+        [
+            tau[:1] if len(tau) else [0.0],
+            np.log(poles[:, 0]),
+            np.log(np.clip(np.abs(poles[:, 1]), *_ZETA)),
+            np.log(zeros[:, 0]),
+            np.clip(zeros[:, 1], -1.5, 1.5),
+        ]
+    )
+
+
+def _grown(data: ResponseData, smaller: _Candidate) -> _Candidate:
+    """Add a pair where the residual is largest."""
+    error = np.abs(data.weight * (smaller.model(data.f_hz) - data.response))
+    at = data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))]
+    structure, theta = smaller.structure.extended(smaller.theta, float(at))
+    return _Candidate(structure, np.concatenate([smaller.vector[:2], theta]))
+
+
+def _candidate(
+    data: ResponseData, structure: PairStructure, theta: Array, delay_s: float
+) -> _Candidate:
+    """Put gain (by least squares) and delay in front of the parameters of the pairs."""
+    raw = _Candidate(structure, np.concatenate([[0.0, delay_s * 2 * np.pi * data.unit_hz], theta]))
+    shape = data.weight * raw.model(data.f_hz)
+    gain = float(np.vdot(shape, data.weight * data.response).real / np.vdot(shape, shape).real)
+    raw.vector[0] = np.log(max(gain, 1e-3))
+    return raw
+
+
+def _judged(data: ResponseData, candidate: _Candidate) -> _Candidate:
+    error = candidate.model(data.f_hz) - data.response
+    soft = np.sqrt(1 + np.abs(data.weight * error) ** 2) - 1
+    nrmse = float(np.linalg.norm(error) / np.linalg.norm(data.response))
+    return replace(candidate, nrmse=nrmse, cost=float(soft.sum()))
+
+
+def _polished(
+    data: ResponseData,
+    start: _Candidate,
+    sides: Array | None = None,
+    least_zeta: Array | None = None,
+) -> _Candidate:
+    """Minimise the weighted error, the zeros kept at `sides` (0: free)."""
+    structure, f = start.structure, data.f_hz
+    least = np.full(structure.poles, _ZETA[0]) if least_zeta is None else least_zeta
+    low, high = structure.bounds((_POLES_BAND[0] * f[0], _POLES_BAND[1] * f[-1]), (least, _ZETA[1]))
+    if sides is not None:
+        low[sides > 0], high[sides < 0] = 1e-3, -1e-3
+    turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 5e-3)
+    low, high = np.append([-7.0, -turns], low), np.append([7.0, turns], high)
+
+    def residual(vector: Array) -> Array:
+        error = data.weight * (replace(start, vector=vector).model(f) - data.response)
+        return np.concatenate([error.real, error.imag])
+
+    def jacobian(vector: Array) -> Array:
+        slope = data.weight[:, None] * replace(start, vector=vector).gradient(f)
+        return np.concatenate([slope.real, slope.imag])
+
+    inside = np.clip(start.vector, low + 1e-6, high - 1e-6)
+    solution = least_squares(
+        residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=60
+    )
+    return _judged(data, replace(start, vector=np.asarray(solution.x, np.float64)))

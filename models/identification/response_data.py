@@ -1,0 +1,114 @@
+"""Which points of a measured response are fitted, and how they weigh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.identification.averaging import low_frequency_delay
+from models.identification.types import FrequencyResponse
+
+__all__ = ["ResponseData", "response_data"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_LEAST_COHERENCE = 0.95
+_RELATIVE_FLOOR = 0.02
+"""Nonlinearity of a real axis: no point counts as better known than this share."""
+_LEAST_POINTS = 12
+_UNKNOWN_NOISE = 0.005
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResponseData:
+    """Points that are fitted, rising in frequency.
+
+    Attributes
+    ----------
+    noise : float
+        NRMSE that the noise alone leaves.
+    delay_s : float
+        First guess, right to a millisecond or so.
+    """
+
+    f_hz: Array
+    response: ComplexArray
+    weight: Array
+    noise: float
+    delay_s: float
+    notes: tuple[str, ...]
+
+    @property
+    def unit_hz(self) -> float:
+        """Centre of the band."""
+        return float(np.sqrt(self.f_hz[0] * self.f_hz[-1]))
+
+    @property
+    def band_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency."""
+        return float(self.f_hz[0]), float(self.f_hz[-1])
+
+    def thinned(self, points: int) -> ResponseData:
+        """Return about `points` of them, evenly."""
+        some = slice(None, None, max(1, len(self.f_hz) // points))
+        return ResponseData(
+            self.f_hz[some],
+            self.response[some],
+            self.weight[some],
+            self.noise,
+            self.delay_s,
+            self.notes,
+        )
+
+
+def response_data(
+    measured: FrequencyResponse, band_hz: tuple[float, float] | None = None
+) -> ResponseData:
+    """Choose the points with a coherence of 0.95 or more (or unknown) within `band_hz`.
+
+    Raises
+    ------
+    ModelError
+        If fewer than 12 are left.
+    """
+    f, h = measured.f_hz, measured.response
+    low, high = band_hz or (0.0, np.inf)
+    inside = (f > 0) & (f >= low) & (f <= high) & np.isfinite(h) & (np.abs(h) > 0)
+    unclear = inside & (measured.coherence < _LEAST_COHERENCE)
+    use = np.flatnonzero(inside & ~unclear)
+    if len(use) < _LEAST_POINTS:
+        raise ModelError(
+            f"{measured.source or measured.label or 'response'}: {len(use)} of {len(f)} "
+            f"frequencies can be fitted, at least {_LEAST_POINTS} are needed "
+            f"({int(unclear.sum())} have a coherence below {_LEAST_COHERENCE}); check that the "
+            "command belongs to this recording, or measure with more acceleration"
+        )
+    notes = []
+    if unclear.any():
+        notes.append(
+            f"{int(unclear.sum())} of {int(inside.sum())} frequencies left out (coherence below "
+            f"{_LEAST_COHERENCE}), {f[unclear].min():.1f} to {f[unclear].max():.1f} Hz"
+        )
+    use = use[np.argsort(f[use])]
+    f, h, sd = f[use], h[use], measured.sd[use]
+    delay = low_frequency_delay(f, h)
+    start = h[: max(3, len(f) // 20)] * np.exp(2j * np.pi * f[: max(3, len(f) // 20)] * delay)
+    if start.real.sum() < 0:
+        h = -h
+        notes.append("the response had the opposite sign (sensor turned round); turned back")
+    size, known = np.abs(h), np.isfinite(sd)
+    noise = np.where(known, sd, min(_roughness(h), _UNKNOWN_NOISE) * size)
+    weight = 1 / np.maximum(np.where(known, sd, 0.0), _RELATIVE_FLOOR * size)
+    share = float(np.linalg.norm(noise) / np.linalg.norm(size))
+    return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(notes))
+
+
+def _roughness(h: ComplexArray) -> float:
+    """Return the relative noise that third differences show, where no deviation is known."""
+    third = np.abs(np.diff(h, 3)) / np.abs(h[2:-1])
+    # Weights 1, 3, 3, 1; the median of a complex normal's modulus is sqrt(ln 2).
+    return float(np.median(third) / np.sqrt(20 * np.log(2.0)))

@@ -1,0 +1,304 @@
+"""What an axis may turn into: the set of plants that robust modes design for.
+
+Several measurements give their own members; a single one is varied by what experience says of
+such a measurement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import date
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.identification.averaging import mean_response, mean_spectrum
+from models.identification.fitting import fit_response, refit_response
+from models.identification.spectrum_fit import fit_spectrum, refit_spectrum
+from models.identification.types import (
+    AxisIdentification,
+    Excitation,
+    Fit,
+    FrequencyResponse,
+    Spectrum,
+)
+from models.plants import (
+    ParametricMembers,
+    PlantSetSpec,
+    PlantSpec,
+    WeightedMember,
+    frequency_response,
+)
+from models.provenance import Kind, MeasuredMode, Provenance, SourceFile
+
+__all__ = [
+    "PARAMETRIC_SPREAD",
+    "delay_warning",
+    "parametric_members",
+    "plant_set_from",
+    "provenance_of",
+    "response_set",
+    "spectrum_set",
+    "typed_in_set",
+]
+
+Array = NDArray[np.float64]
+
+PARAMETRIC_SPREAD: dict[str, tuple[float, float]] = {
+    "raw log": (0.02, 0.20),
+    "frequency response": (0.02, 0.20),
+    "recorded drive": (0.02, 0.20),
+    "spectrum": (0.03, 0.50),
+    "model file": (0.02, 0.20),
+    "typed in": (0.07, 0.50),
+}
+"""Relative spread of frequencies and of damping ratios where there is one measurement: repeats on
+real axes differ by 0.7 % and 12 % within a session, by 2 % over weeks; damping from a spectrum
+depends on the order that is fitted."""
+
+_MOST_MEMBERS = 15
+_SIGMAS = 3.0
+_NO_DIFFERENCE = 0.02
+"""Relative; at low frequency a delay and a zero beyond the band trade off by as much."""
+_BAD_MEMBER = 3.0
+_FEW_REPEATS = 1.25
+"""Two or three repeats show less scatter than there is."""
+_POINTS = 200
+_DELAYS_DIFFER_S = 0.2e-3
+_SPECTRUM_DAMPING = (0.5, 1.5)
+
+
+def response_set(
+    measured: Sequence[FrequencyResponse],
+    *,
+    axis: str,
+    kind: Kind = "raw log",
+    max_order: int = 4,
+    band_hz: tuple[float, float] | None = None,
+    sources: Sequence[SourceFile] = (),
+    measured_on: date | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> AxisIdentification:
+    """Identify an axis from one or more responses: repeats, amplitudes, positions, heights.
+
+    Nominal is the fit to their mean (weighted by 1/sd^2, delays aligned); members are fits of
+    the same structure. Responses with the same label are repeats: they count as one member and
+    show the scatter inside which others are dropped.
+
+    Raises
+    ------
+    ModelError
+        If there is no response, or one cannot be fitted.
+    """
+    if not measured:
+        raise ModelError(f"axis {axis}: no frequency response to identify from; give one or more")
+    groups = _by_label(measured)
+    means = [mean_response(group) for group in groups]
+    if len(means) > 1:
+        # The mean of shifted peaks has humps that no machine has: they must not add modes.
+        max_order = fit_response(means[0], max_order=max_order, band_hz=band_hz).order
+    fit = fit_response(measured, max_order=max_order, band_hz=band_hz, progress=progress)
+    fits = [refit_response(m, fit, band_hz=band_hz) for m in means] if len(means) > 1 else []
+    scatter = _noise_scatter(measured, fit)
+    for group, of_mean in zip(groups, fits, strict=False):
+        # Judged about their own mean, whose peaks are as rounded as the nominal plant's.
+        for repeat in group if len(group) > 1 else ():
+            around = _distance(refit_response(repeat, fit, band_hz=band_hz), of_mean)
+            scatter = np.maximum(scatter, _FEW_REPEATS * around)
+    kept = _outside_scatter(fits, fit, scatter)
+    plants = plant_set_from(fit, kept, kind=kind, sources=sources, measured_on=measured_on)
+    return AxisIdentification(
+        axis=axis,
+        plants=plants,
+        fit=fit,
+        measured=tuple(measured),
+        member_fits=tuple(kept),
+        warnings=(*fit.notes, *_set_notes([m.label or m.source for m in means], fits, kept, fit)),
+    )
+
+
+def spectrum_set(
+    spectra: Sequence[Spectrum],
+    excitation: Excitation | Sequence[Excitation],
+    *,
+    axis: str,
+    column: str | None = None,
+    max_order: int = 4,
+    sources: Sequence[SourceFile] = (),
+    measured_on: date | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> AxisIdentification:
+    """Identify an axis from one or more spectra of the same test.
+
+    Nominal is the fit to the mean of their logarithms; members are fits of the same structure,
+    and the nominal plant with other damping, which a spectrum shows poorly.
+
+    Parameters
+    ----------
+    excitation : Excitation, or one per spectrum
+        The mean of spectra of different tests cannot be taken.
+
+    Raises
+    ------
+    ModelError
+        If there is no spectrum, the tests differ, or a spectrum cannot be fitted.
+    """
+    tests = [excitation] if isinstance(excitation, Excitation) else list(excitation)
+    if any(test != tests[0] for test in tests):
+        raise ModelError(
+            f"axis {axis}: the spectra come from different tests (accel_per_hz, range or "
+            "direction), so they have no mean; identify from those of one test"
+        )
+    fit = fit_spectrum(
+        mean_spectrum(spectra), tests[0], column=column, max_order=max_order, progress=progress
+    )
+    each = [refit_spectrum(s, tests[0], fit, column=column) for s in spectra]
+    fits = each if len(each) > 1 else []
+    kept = _outside_scatter(fits, fit, np.full(_POINTS, _NO_DIFFERENCE))
+    plants = plant_set_from(fit, kept, kind="spectrum", sources=sources, measured_on=measured_on)
+    return AxisIdentification(
+        axis=axis,
+        plants=plants,
+        fit=fit,
+        measured=tuple(spectra),
+        member_fits=tuple(kept),
+        warnings=(*fit.notes, *_set_notes([s.source for s in spectra], fits, kept, fit)),
+    )
+
+
+def plant_set_from(
+    fit: Fit,
+    members: Sequence[Fit] = (),
+    *,
+    kind: Kind,
+    sources: Sequence[SourceFile] = (),
+    measured_on: date | None = None,
+) -> PlantSetSpec:
+    """Return the set of a nominal fit and the fits of its members.
+
+    Without members the nominal plant is varied by `PARAMETRIC_SPREAD`.
+    """
+    listed: tuple[WeightedMember, ...] | ParametricMembers = parametric_members(kind)
+    if members:
+        plants: list[PlantSpec] = [fit.spec, *(m.spec for m in members)]
+        if kind == "spectrum":
+            plants += [fit.spec.scaled(1.0, z) for z in _SPECTRUM_DAMPING]
+        listed = tuple(WeightedMember(plant=p) for p in plants)
+    low, high = fit.band_hz
+    return PlantSetSpec(
+        nominal=fit.spec,
+        members=listed,
+        band_hz=(low, high),
+        provenance=provenance_of(fit, kind, sources=sources, measured_on=measured_on),
+    )
+
+
+def typed_in_set(spec: PlantSpec, *, kind: Kind = "typed in") -> PlantSetSpec:
+    """Return the set of a plant that was not measured here: typed in, or read from a file."""
+    return PlantSetSpec(
+        nominal=spec, members=parametric_members(kind), provenance=Provenance(kind=kind)
+    )
+
+
+def parametric_members(kind: Kind) -> ParametricMembers:
+    """Return the corners, sides and centre of the spread that `kind` of measurement has."""
+    f, z = PARAMETRIC_SPREAD[kind]
+    return ParametricMembers(frequency_scale=(1 - f, 1.0, 1 + f), damping_scale=(1 - z, 1.0, 1 + z))
+
+
+def provenance_of(
+    fit: Fit,
+    kind: Kind,
+    *,
+    sources: Sequence[SourceFile] = (),
+    measured_on: date | None = None,
+) -> Provenance:
+    """Return what a store keeps of how a plant was found."""
+    return Provenance(
+        kind=kind,
+        measured_on=measured_on,
+        sources=tuple(sources),
+        residual=fit.residual,
+        delay_s=fit.delay_s,
+        gain=fit.gain,
+        modes=tuple(
+            MeasuredMode(
+                f_hz=m.f_hz,
+                zeta=m.zeta,
+                f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
+                zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
+            )
+            for m in fit.modes
+        ),
+        trust_below_hz=fit.trust_below_hz,
+    )
+
+
+def delay_warning(x: Fit, y: Fit) -> str | None:
+    """Return a warning if the delays of two axes differ by more than 0.2 ms.
+
+    A delay that both share only shifts time; one that differs shears corners.
+    """
+    apart = abs(x.delay_s - y.delay_s)
+    if apart <= _DELAYS_DIFFER_S or x.magnitude_only or y.magnitude_only:
+        return None
+    return (
+        f"the delays of the axes differ by {apart * 1e3:.2f} ms (X {x.delay_s * 1e3:.2f}, "
+        f"Y {y.delay_s * 1e3:.2f} ms), more than {_DELAYS_DIFFER_S * 1e3:g} ms: corners would "
+        "shear; measure both axes again in one session"
+    )
+
+
+def _by_label(measured: Sequence[FrequencyResponse]) -> list[list[FrequencyResponse]]:
+    groups: dict[str, list[FrequencyResponse]] = {}
+    for response in measured:
+        groups.setdefault(response.label, []).append(response)
+    return list(groups.values())
+
+
+def _grid(fit: Fit) -> Array:
+    return np.linspace(*fit.band_hz, _POINTS)
+
+
+def _distance(member: Fit, nominal: Fit) -> Array:
+    """Return |G_j/G_0 - 1| over the band, shape (points,)."""
+    f = _grid(nominal)
+    ratio = frequency_response(member.spec, f) / frequency_response(nominal.spec, f)
+    return np.asarray(np.abs(ratio - 1), np.float64)
+
+
+def _noise_scatter(measured: Sequence[FrequencyResponse], fit: Fit) -> Array:
+    """Return three standard deviations of a response, relative, 2 % at least, over the band."""
+    f = _grid(fit)
+    known = [r for r in measured if np.isfinite(r.sd).all()]
+    rows = [np.interp(f, r.f_hz, r.sd / np.abs(r.response)) for r in known]
+    noise = _SIGMAS * np.median(rows, axis=0) if rows else np.zeros(len(f))
+    return np.maximum(noise, _NO_DIFFERENCE)
+
+
+def _outside_scatter(fits: list[Fit], nominal: Fit, scatter: Array) -> list[Fit]:
+    """Keep members that leave the scatter somewhere; the farthest if there are too many."""
+    distances = [_distance(fit, nominal) for fit in fits]
+    kept = [i for i, d in enumerate(distances) if np.any(d > scatter)]
+    # The nominal plant is a member too; of spectra two more are added.
+    room = _MOST_MEMBERS - 1 - (len(_SPECTRUM_DAMPING) if nominal.magnitude_only else 0)
+    farthest = sorted(kept, key=lambda i: -float(distances[i].max()))[:room]
+    return [fits[i] for i in sorted(farthest)]
+
+
+def _set_notes(names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit) -> tuple[str, ...]:
+    unit, scale = ("dB", 1.0) if nominal.magnitude_only else ("%", 100.0)
+    notes = [
+        f"{name or 'a measurement'}: the pairs of the mean leave {scale * fit.residual:.2g} {unit} "
+        f"of it (of the mean {scale * nominal.residual:.2g} {unit}); fit it by itself, another "
+        "mode may have moved into the band"
+        for name, fit in zip(names, fits, strict=False)
+        if fit.residual > _BAD_MEMBER * nominal.residual
+    ]
+    if len(kept) < len(fits):
+        notes.append(
+            f"{len(fits) - len(kept)} of {len(fits)} measurements add no member of their own: "
+            f"they lie within the scatter of repeats, or {_MOST_MEMBERS} plants are enough"
+        )
+    return tuple(notes)

@@ -1,0 +1,191 @@
+"""Sets from several measurements, and what one measurement is varied by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+
+from models.errors import ModelError
+from models.identification.averaging import mean_response, mean_spectrum
+from models.identification.sets import (
+    delay_warning,
+    parametric_members,
+    plant_set_from,
+    response_set,
+    spectrum_set,
+    typed_in_set,
+)
+from models.identification.synthetic import Sensor, simulate_spectrum
+from models.identification.types import Excitation, FrequencyResponse, Spectrum
+from models.plants import Mode, ModesSpec, ParametricMembers, frequency_response
+from models.provenance import SourceFile
+
+F = np.arange(5.0, 134.0, 0.5)
+TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0)
+SOURCE = SourceFile(name="raw_data_x.csv", sha256="0" * 64)
+
+
+def plant(f_scale: float = 1.0, zeta_scale: float = 1.0) -> ModesSpec:
+    return ModesSpec(
+        modes=(
+            Mode(f_hz=47.0 * f_scale, zeta=0.035 * zeta_scale, gain=0.75),
+            Mode(f_hz=95.0 * f_scale, zeta=0.060 * zeta_scale, gain=0.25),
+        )
+    )
+
+
+def response(
+    spec: ModesSpec, seed: int = 0, *, label: str = "", delay_s: float = 0.5e-3
+) -> FrequencyResponse:
+    h = 0.97 * frequency_response(spec, F) * np.exp(-2j * np.pi * F * delay_s)
+    rng = np.random.default_rng(seed)
+    sd = 0.002 * np.abs(h)
+    h = h + sd * (rng.standard_normal(len(F)) + 1j * rng.standard_normal(len(F))) / np.sqrt(2)
+    return FrequencyResponse(F, h, sd, np.full(len(F), 0.999), label=label)
+
+
+def spectrum(spec: ModesSpec, seed: int = 0) -> Spectrum:
+    rng = np.random.default_rng(seed)
+    plants = {"x": spec, "y": plant()}
+    made = simulate_spectrum(plants, TEST, sensor=Sensor(rate_hz=1600.0), rng=rng)
+    return replace(made, source=f"resonances_x_{seed}.csv")
+
+
+def test_one_response_is_varied_by_experience() -> None:
+    found = response_set(
+        [response(plant())], axis="x", sources=[SOURCE], measured_on=date(2026, 8, 1)
+    )
+    assert found.plants.members == ParametricMembers(
+        frequency_scale=(0.98, 1.0, 1.02), damping_scale=(0.8, 1.0, 1.2)
+    )
+    about = found.plants.provenance
+    assert about is not None
+    assert (about.kind, about.sources, about.measured_on) == (
+        "raw log",
+        (SOURCE,),
+        date(2026, 8, 1),
+    )
+    assert about.gain == pytest.approx(0.97, rel=2e-3)
+    assert about.modes[0].f_hz == pytest.approx(47.0, rel=1e-3)
+    assert about.modes[0].f_sd_hz is not None
+    assert found.plants.band_hz == (5.0, 133.5)
+
+
+def test_amplitudes_are_members() -> None:
+    """Four amplitudes: frequency falls, damping rises; each recording has its own delay."""
+    conditions = [(1.0, 1.0), (0.97, 1.3), (0.985, 1.15), (1.01, 0.9)]
+    measured = [
+        response(plant(f, z), i, label=f"{40 + 20 * i} mm/s", delay_s=(3 + i) * 1e-4)
+        for i, (f, z) in enumerate(conditions)
+    ]
+    found = response_set(measured, axis="x")
+    assert found.fit is not None
+    assert found.fit.order == 2
+    assert len(found.member_fits) == 4
+    for member, (f, z) in zip(found.member_fits, conditions, strict=True):
+        assert member.order == 2
+        assert member.modes[0].f_hz == pytest.approx(47.0 * f, rel=1e-3)
+        assert member.modes[0].zeta == pytest.approx(0.035 * z, rel=0.02)
+    listed = found.plants.weighted_members()
+    assert len(listed) == 5
+    for one in listed:
+        assert frequency_response(one.plant, [0.0])[0] == pytest.approx(1.0, abs=1e-9)
+    assert 0.97 < found.fit.modes[0].f_hz / 47.0 < 1.01
+
+
+def test_what_lies_within_the_scatter_of_repeats_adds_no_member() -> None:
+    repeats = [response(plant(f), i, label="75") for i, f in enumerate((0.985, 1.0, 1.015))]
+    near = response(plant(1.003), 7, label="110")
+    found = response_set([*repeats, near], axis="y")
+    assert found.member_fits == ()
+    assert isinstance(found.plants.members, ParametricMembers)
+    assert any("2 of 2 measurements add no member" in w for w in found.warnings)
+    # Without repeats there is no scatter but the noise, and both count.
+    assert len(response_set([repeats[1], near], axis="y").member_fits) == 2
+
+
+def test_a_set_has_at_most_fifteen_plants() -> None:
+    scales = np.linspace(0.96, 1.04, 18)
+    measured = [response(plant(f), i, label=str(i)) for i, f in enumerate(scales)]
+    found = response_set(measured, axis="x")
+    frequencies = [m.modes[0].f_hz for m in found.member_fits]
+    assert len(found.plants.weighted_members()) == 15
+    # The extremes stay.
+    assert min(frequencies) == pytest.approx(47.0 * 0.96, rel=2e-3)
+    assert max(frequencies) == pytest.approx(47.0 * 1.04, rel=2e-3)
+
+
+def test_spectra_vary_in_damping() -> None:
+    one = spectrum_set([spectrum(plant())], TEST, axis="x")
+    assert one.plants.members == ParametricMembers(
+        frequency_scale=(0.97, 1.0, 1.03), damping_scale=(0.5, 1.0, 1.5)
+    )
+    assert one.plants.provenance is not None
+    assert one.plants.provenance.magnitude_only
+    assert one.plants.provenance.trust_below_hz == one.fit.trust_below_hz  # type: ignore[union-attr]
+    several = spectrum_set(
+        [spectrum(plant(f), i) for i, f in enumerate((0.99, 1.0, 1.02))], TEST, axis="x"
+    )
+    assert several.fit is not None
+    assert several.fit.modes[0].f_hz == pytest.approx(47.0, rel=0.01)
+    listed = several.plants.weighted_members()
+    assert len(listed) == 6
+    damping = [m.plant.roots().poles.real.max() for m in listed[-2:]]
+    assert damping[1] / damping[0] == pytest.approx(3.0, rel=1e-6)
+
+
+def test_spectra_of_different_tests_have_no_mean() -> None:
+    pair = [spectrum(plant(), 0), spectrum(plant(), 1)]
+    with pytest.raises(ModelError, match="different tests"):
+        spectrum_set(pair, [TEST, replace(TEST, accel_per_hz_mm_s=60.0)], axis="x")
+
+
+def test_typed_in_is_trusted_least() -> None:
+    made = typed_in_set(plant())
+    assert made.provenance is not None
+    assert made.provenance.kind == "typed in"
+    assert made.members == parametric_members("typed in")
+    scales = parametric_members("typed in")
+    assert max(scales.frequency_scale) - 1 == pytest.approx(0.07)
+    assert len(made.weighted_members()) == 9
+
+
+def test_delays_that_differ_shear_corners() -> None:
+    x = response_set([response(plant())], axis="x").fit
+    y = response_set([response(plant(), delay_s=0.9e-3)], axis="y").fit
+    assert x is not None
+    assert y is not None
+    assert delay_warning(x, x) is None
+    assert "differ by 0.40 ms" in (delay_warning(x, y) or "")
+
+
+def test_mean_response_weighs_by_certainty_and_aligns() -> None:
+    sure, unsure = response(plant(), 1), response(plant(), 2, delay_s=1.5e-3)
+    unsure = replace(unsure, sd=10 * unsure.sd, f_hz=F.copy())
+    mean = mean_response([sure, unsure])
+    error = np.abs(mean.response - sure.response) / np.abs(sure.response)
+    assert np.median(error) < 1e-3
+    assert np.all(mean.sd <= np.fmax(sure.sd, np.abs(error * sure.response)) * 1.5)
+    with pytest.raises(ModelError, match="share no frequencies"):
+        mean_response([sure, replace(sure, f_hz=F + 500.0)])
+    with pytest.raises(ModelError, match="give one or more"):
+        mean_response([])
+
+
+def test_mean_spectrum_is_geometric() -> None:
+    f = np.arange(0.0, 200.0, 1.5625)
+    a, b = Spectrum(f, {"x": np.full(len(f), 4.0)}), Spectrum(f, {"x": np.full(len(f), 9.0)})
+    np.testing.assert_allclose(mean_spectrum([a, b]).psd["x"], 6.0)
+    with pytest.raises(ModelError, match="share no column"):
+        mean_spectrum([a, Spectrum(f, {"y": np.ones(len(f))})])
+
+
+def test_plant_set_of_a_fit_survives_json() -> None:
+    found = response_set([response(plant())], axis="x")
+    assert found.fit is not None
+    made = plant_set_from(found.fit, [found.fit], kind="frequency response")
+    again = type(made).model_validate_json(made.model_dump_json())
+    assert again == made
