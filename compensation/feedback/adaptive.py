@@ -28,10 +28,10 @@ __all__ = ["AdaptiveFmsdob", "FrequencyTracker", "Retuning"]
 Array = NDArray[np.float64]
 _START_RADIUS, _END_RADIUS = 0.3, 0.98
 _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
-_DECAY_S = 2.5e-3
+_DECAY_SAMPLES = 25
 _START_COVARIANCE = 1e4
-# Of the power behind the poles, the share that the zeros leave over. Locked it is below 1e-3 even
-# in noise as strong as the tone, because the poles lift the tone; a jump brings it to .01 and more.
+# Of the power behind the poles, the share that the zeros leave over. The poles lift the tone, so
+# when locked it is some 1/600 of noise over tone; a jump brings it to .01 and more.
 _LOST = 2e-3
 
 
@@ -41,8 +41,8 @@ class FrequencyTracker:
     Parameters
     ----------
     tones : int
-        At most 8. One and two lock within some 30 ms at 10 kHz, also at a signal-to-noise ratio
-        of 8 dB; of three, one that the loop leaves ten times weaker may be missed for long.
+        At most 8. One and two lock within some 200 samples, also at a signal-to-noise ratio of
+        8 dB; of three, one that the loop leaves ten times weaker may be missed for long.
     dt_s : float
     floor_rms : float
         Below this rms there is nothing to identify.
@@ -57,8 +57,7 @@ class FrequencyTracker:
         if not 1 <= tones <= 8:
             raise DesignError(f"{tones} tones; between 1 and 8 can be told apart")
         self._tones, self._dt_s, self._floor = tones, dt_s, floor_rms
-        self._decay = math.exp(-dt_s / _DECAY_S)
-        self._now = _Estimate.fresh(tones, self._decay)
+        self._now = _Estimate.fresh(tones)
         self.jumped = False
 
     def push(self, x: Array) -> tuple[float, ...]:
@@ -78,8 +77,7 @@ class FrequencyTracker:
         cosines = _cosines(now.theta)
         now.poles[:] = _coefficients(cosines)
         error = float(now.levels[0] / max(now.levels[1], 1e-300))
-        settled = now.heard * self._dt_s > 4 * _DECAY_S
-        if settled and error > _LOST:
+        if now.heard > 4 * _DECAY_SAMPLES and error > _LOST:
             return self._restart()
         if now.heard < 8 * self._tones:
             return ()
@@ -87,7 +85,7 @@ class FrequencyTracker:
         return tuple(float(v) for v in f)
 
     def _restart(self) -> tuple[float, ...]:
-        self._now = _Estimate.fresh(self._tones, self._decay)
+        self._now = _Estimate.fresh(self._tones)
         self.jumped = True
         return ()
 
@@ -212,7 +210,8 @@ class _Estimate:
     heard: int = 0
 
     @classmethod
-    def fresh(cls, tones: int, decay: float) -> _Estimate:
+    def fresh(cls, tones: int) -> _Estimate:
+        decay = math.exp(-1 / _DECAY_SAMPLES)
         return cls(
             np.zeros(tones),
             np.zeros(tones),

@@ -202,11 +202,18 @@ class Controller:
         return json.dumps(self.to_dict(curves=curves), indent=2) + "\n"
 
     def to_c_header(self) -> str:
-        """Return the coefficients as a C header (C99, no dependency)."""
+        """Return the coefficients as a C header (C99, no dependency).
+
+        The signals and the order of the computation stand in its comment; the numbers of every
+        filter named there stand in `to_json` under difference_equations.
+        """
         guard = f"STILLPATH_{_identifier(self.method)}_{_identifier(self.machine)}_H".upper()
         prefix = _identifier(self.method).lower()
         lines = [
-            f"/* {self.method} for {self.machine}: u = v - c, sampled every {self.dt_s!r} s. */",
+            f"/* {self.method} for {self.machine}: u = v - c, sampled every {self.dt_s!r} s.",
+            " * r reference, ym measured output, v control without add-on, u plant input.",
+            *(f" *   {_c_comment(b)}" for b in Diagram(self.blocks).blocks),
+            " */",
             f"#ifndef {guard}",
             f"#define {guard}",
             "",
@@ -328,6 +335,16 @@ def _equation(block: Block) -> dict[str, object]:
         "phase": block.phase,
         "zero_between": block.zero_between,
     }
+
+
+def _c_comment(block: Block) -> str:
+    """Tell what a block does: output = H(z) (sum of signals), and when."""
+    wires = " ".join(f"{gain:+.17g} {name}" for name, gain in block.inputs)
+    plain = block.order == 0 and block.num == block.den == (1.0,)
+    through = f"({wires})" if plain else f"H[{len(block.num)}/{len(block.den)}] ({wires})"
+    late = f", {block.delay} runs late" if block.delay else ""
+    when = f", at n mod {block.every} = {block.phase}" if block.every > 1 else ""
+    return f"{block.output} = {through}{late}{when}"
 
 
 def _identifier(text: str) -> str:
