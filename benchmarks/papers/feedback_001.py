@@ -33,6 +33,7 @@ SEEDS = 5
 
 def rows() -> Iterator[Row]:
     yield from parameters()
+    yield from forms()
     yield from singular()
     yield from noise_gains()
     yield from table_1()
@@ -58,6 +59,20 @@ def parameters() -> Iterator[Row]:
         for p in (made, predictor(TONES, 3, LOOP.dt_s, alpha=0.7)) for k in (1, 2) for z in slow
     )  # fmt: skip
     yield checked("W_k/B at the tones, spread over alpha", 0.0, float(gap), 1e-12)
+
+
+def forms() -> Iterator[Row]:
+    """The printed system, its decoupled form, and the short one of the product."""
+    made = predictor(TONES, 3, LOOP.dt_s, alpha=0.95)
+    full = [full_system(k, sign=-1.0) for k in (1, 2)]
+    gap = max(float(np.abs(w - made.w[k]).max()) for k, (w, _) in zip((1, 2), full, strict=True))
+    apart = max(float(np.abs(w - decoupled).max()) for w, decoupled in full)
+    yield checked("full system (22)-(24) against the short form", 0.0, gap, 1e-12,
+                  "with f_i Ts in (25); printed f_i L Ts")  # fmt: skip
+    yield checked("full system against the decoupled form (36), (37)", 0.0, apart, 1e-12)
+    printed = max(float(np.abs(full_system(k, sign=+1.0)[0] - made.w[k]).max()) for k in (1, 2))
+    yield shown("the same with +a on the right, as (41)-(46) print it", "equal", f"{printed:.2f}",
+                "PRINT ERROR: -a_1, -a_2")  # fmt: skip
 
 
 def singular() -> Iterator[Row]:
@@ -146,6 +161,25 @@ def budget() -> Iterator[Row]:
     speed = rate(lambda: loop.push({"d_out": d}), len(d))
     yield shown("simulation of servo, camera, predictor, observer", ">= 1 million/s", speed,
                 "one thread")  # fmt: skip
+
+
+def full_system(k: int, sign: float) -> tuple[Array, Array]:
+    """w_k of (22)-(24) solved at once, and by (36) and (37)."""
+    a, b = np.ones(1), np.ones(1)
+    for f in TONES:
+        w = 2 * np.pi * f * LOOP.dt_s
+        a = np.convolve(a, [1, -2 * np.cos(w), 1])
+        b = np.convolve(b, [1, -2 * 0.95 * np.cos(3 * w), 0.95**2])
+    count, size = 6, 18
+    tilde = np.array([np.convolve(a, np.eye(1, 12, j)[0])[:size] for j in range(12)]).T
+    right = np.zeros(size)
+    right[:count] = sign * a[1:]
+    right[2::3] += b[1:]
+    chosen = np.arange(k - 1, size, 3)
+    system = np.concatenate([tilde, np.eye(size)[:, chosen]], axis=1)
+    others = np.setdiff1d(np.arange(size), chosen)
+    h = np.linalg.solve(tilde[others], right[others])
+    return np.linalg.solve(system, right)[-count:], right[chosen] - tilde[chosen] @ h
 
 
 def disturbance(samples: int, tones: tuple[float, ...]) -> Array:
