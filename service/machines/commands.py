@@ -117,14 +117,14 @@ def history(
     store = open_machines().store
     revisions, approved = store.history(name), store.approvals(name)
     day = None if since is None else _day(since)
-    table = _table("revision", "when", "who", "content", "approved by", "why")
+    table = _table("revision", "when", "who", "X, Hz", "Y, Hz", "approved by", "why")
     for revision in revisions:
         approval = approved.get(revision.number)
         table.add_row(
             str(revision.number),
             f"{revision.when:%Y-%m-%d %H:%M}",
             revision.author,
-            revision.machine.revision,
+            *(_leading(revision, axis) for axis in ("x", "y")),
             approval.author if approval else "",
             revision.message,
         )
@@ -304,6 +304,7 @@ def from_config(
 
 
 def who(by: str | None) -> str:
+    """Return the author that was named, else the user of this computer."""
     if by is not None:
         return by
     import getpass
@@ -321,6 +322,13 @@ def _day(text: str) -> Any:
         return date.fromisoformat(text)
     except ValueError:
         raise ModelError(f"--since {text!r}: give a day like 2026-03-02") from None
+
+
+def _leading(revision: Revision, axis: Any) -> str:
+    from service.machines.resonances import leading
+
+    mode = leading(revision.machine.axes[axis].nominal)
+    return "" if mode is None else f"{mode[0]:.1f}"
 
 
 def _told(revision: Revision) -> None:

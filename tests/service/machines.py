@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import date
 from typing import Any
 
-from models.machine import Machine
+from models.machine import Machine, PlannerLimits
 from models.plants import PlantSetSpec
 from models.store import load_machine
 
-__all__ = ["make_machine", "make_plants"]
+__all__ = ["make_machine", "make_plants", "with_accel"]
 
 
 def make_plants(
@@ -28,3 +28,9 @@ def make_machine(name: str = "mine", **changes: Any) -> Machine:
     """A CoreXY machine; `changes` are fields of the document."""
     document = load_machine("generic-corexy").model_dump() | {"name": name, "title": "My printer"}
     return Machine.model_validate(document | changes)
+
+
+def with_accel(machine: Machine, accel: float) -> Machine:
+    planner = PlannerLimits(max_accel_mm_s2=accel)
+    firmware = machine.firmware.model_copy(update={"planner": planner})
+    return machine.model_copy(update={"firmware": firmware})
