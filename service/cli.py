@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from service.environment import prepare_environment
+from service.identification import commands as identification
 from service.interruption import Interrupted
 from service.machines import commands as machines
 from service.proof import commands as proof
@@ -261,6 +262,7 @@ def serve(
     serve_forever(settings, host, port)
 
 
+identification.register(app)
 proof.register(app)
 
 

@@ -116,16 +116,18 @@ def align(
     )
 
 
-def check_pair(x: AlignedLog, y: AlignedLog) -> None:
-    """Raise ModelError if the logs of two axes show motion along the same sensor direction.
+def check_pair(x: ArrayLike, y: ArrayLike) -> None:
+    """Raise ModelError if the tests of X and Y moved the sensor along the same of its directions.
 
-    The machine's axes are perpendicular; two logs that move alike are of the same axis.
+    The machine's axes are perpendicular: either one axis was measured twice, or the sensor was
+    turned in between.
     """
-    cosine = abs(float(x.direction @ y.direction))
+    cosine = abs(float(np.dot(x, y)))
     if cosine > _LEAST_COSINE:
         raise ModelError(
-            "the logs of X and Y both show motion along the sensor direction "
-            f"{_vector(x.direction)}: the same axis was measured twice; measure the other one"
+            f"the logs of X and Y both show motion along the sensor direction {_vector(x)}: the "
+            "same axis was measured twice, so measure the other one; if the sensor was turned "
+            "between the tests, say so (--sensor-turned)"
         )
 
 
@@ -307,5 +309,5 @@ def _not_found(
     )
 
 
-def _vector(direction: Array) -> str:
-    return "({:.2f}, {:.2f}, {:.2f})".format(*direction)
+def _vector(direction: ArrayLike) -> str:
+    return "({:.2f}, {:.2f}, {:.2f})".format(*np.asarray(direction, float))

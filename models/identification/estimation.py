@@ -116,6 +116,7 @@ def estimate_aligned(
         label=label,
         source=log.source,
         notes=notes,
+        sensor_direction=tuple(aligned.direction.tolist()),
     )
 
 

@@ -18,7 +18,8 @@ ComplexArray = NDArray[np.complex128]
 
 _LEAST_COHERENCE = 0.95
 _RELATIVE_FLOOR = 0.02
-"""Nonlinearity of a real axis: no point counts as better known than this share."""
+"""Nonlinearity of a real axis: no point counts as better known than this share of the response
+or, where it has fallen below that, of its value at low frequency."""
 _LEAST_POINTS = 12
 _UNKNOWN_NOISE = 0.005
 
@@ -102,7 +103,8 @@ def response_data(
         notes.append("the response had the opposite sign (sensor turned round); turned back")
     size, known = np.abs(h), np.isfinite(sd)
     noise = np.where(known, sd, min(_roughness(h), _UNKNOWN_NOISE) * size)
-    weight = 1 / np.maximum(np.where(known, sd, 0.0), _RELATIVE_FLOOR * size)
+    floor = _RELATIVE_FLOOR * np.maximum(size, np.median(size[:9]))
+    weight = 1 / np.maximum(np.where(known, sd, 0.0), floor)
     share = float(np.linalg.norm(noise) / np.linalg.norm(size))
     return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(notes))
 

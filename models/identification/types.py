@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.plants import PairsSpec, PlantSetSpec, PlantSpec
+from models.schedule import AxisSchedule
 
 __all__ = [
     "AccelerationLog",
@@ -128,6 +129,8 @@ class FrequencyResponse:
         1: all of the output follows the command; NaN where unknown.
     label : str
         What distinguishes it from others of the axis: amplitude, position, run.
+    sensor_direction : tuple of float, optional
+        Of the tested axis in the axes of the sensor, if that was found.
     """
 
     f_hz: Array
@@ -138,6 +141,7 @@ class FrequencyResponse:
     label: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
+    sensor_direction: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +220,10 @@ class AxisIdentification:
     measured : tuple
         FrequencyResponse or Spectrum, one per measurement.
     member_fits : tuple of Fit
-    warnings : tuple of str
+    schedule : AxisSchedule, optional
+        If the axis was measured with a weight on the bed, or at several places.
+    warnings, notes : tuple of str
+        What the user should look at, and what was assumed or set aside.
     """
 
     axis: str
@@ -224,4 +231,6 @@ class AxisIdentification:
     fit: Fit | None = None
     measured: tuple[FrequencyResponse | Spectrum, ...] = ()
     member_fits: tuple[Fit, ...] = ()
-    warnings: tuple[str, ...] = field(default=())
+    schedule: AxisSchedule | None = None
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()

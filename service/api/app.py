@@ -10,8 +10,9 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from service.api import designs, health, jobs, machines, problems
+from service.api import designs, health, identifications, jobs, machines, problems
 from service.api.guard import Guard
+from service.identification.archive import Archive
 from service.jobs.store import JobStore
 from service.jobs.supervisor import Supervisor
 from service.jobs.worker import Runner, run_task
@@ -81,6 +82,9 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     )
     app.state.settings = settings
     app.state.designs = designs.Designs()
+    app.state.identifications = identifications.Identifications(
+        Archive(settings.data_dir / "identifications")
+    )
     app.state.machines = Resolver(
         MachineStore(settings.data_dir / "machines"),
         require_approval=settings.require_approval,
@@ -91,6 +95,7 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     app.include_router(jobs.router)
     app.include_router(machines.router)
     app.include_router(designs.router)
+    app.include_router(identifications.router)
     app.include_router(health.router)
 
     @app.get("/", include_in_schema=False)

@@ -28,7 +28,7 @@ from service.machines.resolve import Resolver
 from service.machines.revision import Conflict, Revision, UnknownMachine
 from service.machines.store import MachineStore
 
-__all__ = ["look_up", "router"]
+__all__ = ["Author", "Message", "as_problems", "look_up", "router"]
 
 _LARGEST_BYTES = 4_000_000
 _BODY = {
@@ -55,7 +55,7 @@ router = APIRouter(prefix="/v1/machines", tags=["machines"])
 
 def look_up(request: Request, name: str) -> Machine:
     """Return the newest state of a machine, approved or not; raise `Problem` if there is none."""
-    with _as_problems():
+    with as_problems():
         return _machines(request).to_look_at(name).machine
 
 
@@ -114,7 +114,7 @@ async def put_machine(
     store = _store(request)
     expected = await run_in_threadpool(_expected, store, name, if_match)
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
-    with _as_problems():
+    with as_problems():
         machine = read_machine(content)
         made = await run_in_threadpool(
             store.add_revision, name, machine, author=author, message=message, expected=expected
@@ -137,7 +137,7 @@ def delete_machine(request: Request, name: str, if_match: IfMatch = None) -> Res
     `stillpath machines restore NAME` brings it back.
     """
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         _check_state(store, name, if_match)
         store.delete(name)
     return Response(status_code=204)
@@ -153,7 +153,7 @@ def list_revisions(
 ) -> HistoryView:
     """Return who changed a machine when and why, and whether its resonances moved."""
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         _check_own(name)
         history, approvals = store.history(name), store.approvals(name)
         return HistoryView(
@@ -168,7 +168,7 @@ def list_revisions(
 def show_revision(request: Request, name: str, number: Number) -> RevisionDocument:
     """Return a state of a machine with its document."""
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         _check_own(name)
         found = store.revision(name, number)
         return RevisionDocument(revision=_view(store, found), machine=found.machine)
@@ -183,7 +183,7 @@ def show_diff(
 ) -> DiffView:
     """Return what revision `to` changed against `from`, in words and figures."""
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         _check_own(name)
         old, new = store.revision(name, before), store.revision(name, after)
         return DiffView(before=before, after=after, changes=diff(old.machine, new.machine))
@@ -199,7 +199,7 @@ def approve_revision(
 ) -> RevisionView:
     """Say that a revision may be used for jobs. An approval that stands already stays."""
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         _check_own(name)
         store.approve(name, number, author=author, message=message)
         return _view(store, store.revision(name, number))
@@ -221,7 +221,7 @@ def roll_back(
 ) -> RevisionView:
     """Bring an earlier state back, as a new revision."""
     store = _store(request)
-    with _as_problems():
+    with as_problems():
         expected = _check_state(store, name, if_match)
         made = store.roll_back(name, number, author=author, message=message, expected=expected)
         return _changed(store, response, made)
@@ -255,7 +255,7 @@ def _changed(store: MachineStore, response: Response, made: Revision) -> Revisio
 
 def _expected(store: MachineStore, name: str, if_match: str | None) -> int:
     """Return the revision that a PUT is made on, 0 for a new machine; check its precondition."""
-    with _as_problems():
+    with as_problems():
         _check_own(name)
         if name not in store:
             if if_match is not None:
@@ -308,7 +308,8 @@ def _failed(detail: str) -> Problem:
 
 
 @contextmanager
-def _as_problems() -> Iterator[None]:
+def as_problems() -> Iterator[None]:
+    """Turn the errors of models and of the store into problem documents."""
     try:
         yield
     except UnknownMachine as error:

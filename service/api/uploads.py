@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -19,7 +19,7 @@ from service.api.problems import Problem
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Upload", "receive_document", "receive_upload", "safe_name"]
+__all__ = ["Upload", "limited_body", "receive_document", "receive_upload", "safe_name"]
 
 _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
@@ -60,7 +60,7 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
             name = await _receive_form(request, sink, parameters.get(b"boundary"), max_bytes)
         else:
             name = request.query_params.get("name", "")
-            async for chunk in _limited(request, max_bytes):
+            async for chunk in limited_body(request, max_bytes):
                 await sink.write(chunk)
         await sink.finish()
     if sink.size == 0:
@@ -81,7 +81,7 @@ async def receive_document(request: Request, *, max_bytes: int) -> bytes:
     Problem
         413 if the body is too large.
     """
-    return b"".join([chunk async for chunk in _limited(request, max_bytes)])
+    return b"".join([chunk async for chunk in limited_body(request, max_bytes)])
 
 
 def safe_name(name: str) -> str:
@@ -127,7 +127,8 @@ class _Sink:
         os.fsync(self.file.fileno())
 
 
-async def _limited(request: Request, max_bytes: int) -> AsyncIterator[bytes]:
+async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
+    """Yield the body of a request; raise `Problem` 413 when it grows too large."""
     size = 0
     async for chunk in request.stream():
         size += len(chunk)
@@ -144,7 +145,7 @@ async def _receive_form(
     form = _Form(sink.take)
     try:
         parser = MultipartParser(boundary, form.callbacks())
-        async for chunk in _limited(request, max_bytes):
+        async for chunk in limited_body(request, max_bytes):
             parser.write(chunk)
             await sink.drain()
         parser.finalize()

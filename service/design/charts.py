@@ -179,9 +179,9 @@ def _log_ticks(low: float, high: float) -> list[float]:
 
 
 def _number(value: float) -> str:
-    text = f"{value:g}"
+    text = f"{value:g}" if abs(value) < 1e4 else f"{value:.0e}"
     if "e" not in text:
-        return text if abs(value) < 1e4 else f"1e{math.log10(value):g}"
+        return text
     mantissa, exponent = text.split("e")
     return f"{mantissa}e{int(exponent)}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +12,24 @@ from service.design.charts import Chart, Line, Mark, draw
 from service.identification.figures import AxisFigures, IdentificationReport
 from service.reports.pages import asset, rendered, write_texts
 
-__all__ = ["render_identification", "write_identification"]
+__all__ = [
+    "change_text",
+    "fit_text",
+    "interval_text",
+    "render_identification",
+    "write_identification",
+]
 
 _PACKAGE = "service.identification"
+_STYLES = (
+    ("service.reports", "report.css"),
+    ("service.design", "design.css"),
+    (_PACKAGE, "identification.css"),
+)
 _WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 320.0), (480.0, 250.0)
 _MEASURED = ("before thin", "before thin d1", "before thin d2", "before thin d3", "before thin d5")
-_LARGEST_LABEL = 18
+_LARGEST_LABEL, _MOST_NAMES = 18, 6
+_SAME_MODE = 0.25
 
 
 def write_identification(report: IdentificationReport, directory: Path) -> None:
@@ -43,8 +56,8 @@ def render_identification(report: IdentificationReport) -> str:
     return rendered(
         _PACKAGE,
         "identification.html.j2",
-        asset("service.reports", "report.css") + asset("service.design", "design.css"),
-        {"number": _number, "fit": _fit, "interval": _interval, "change": _change},
+        "".join(asset(package, name) for package, name in _STYLES),
+        {"number": _number, "fit": fit_text, "interval": interval_text, "change": change_text},
         d=report,
         axes=[_Axis(axis, _figures(axis)) for axis in report.axes],
     )
@@ -76,10 +89,10 @@ def _figures(axis: AxisFigures) -> list[_Figure]:
 
 def _magnitude(axis: AxisFigures) -> _Figure:
     measured = [
-        Line(r.f_hz, r.magnitude, style, r.label[:_LARGEST_LABEL])
+        Line(r.f_hz, r.magnitude, style, _name(r.label, len(axis.responses)))
         for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
     ]
-    members = [Line(m.f_hz, m.magnitude, "soft thin") for m in axis.members]
+    members = [Line(m.f_hz, m.magnitude, "soft thin member") for m in axis.members]
     model = Line(axis.model.f_hz, axis.model.magnitude, "after main", "model")
     note = "How much further the nozzle moves than it is told: 1 is rigid."
     if members:
@@ -118,7 +131,7 @@ def _residual(axis: AxisFigures) -> _Figure:
 
 def _spectrum(axis: AxisFigures) -> _Figure:
     measured = [
-        Line(s.f_hz, s.measured, style, s.label[:_LARGEST_LABEL])
+        Line(s.f_hz, s.measured, style, _name(s.label, len(axis.spectra)))
         for s, style in zip(axis.spectra, _styles(len(axis.spectra)), strict=True)
     ]
     first = axis.spectra[0]
@@ -147,15 +160,19 @@ def _figure(
     return _Figure(title, note, draw(chart, *(_WIDE if wide else _SMALL)), draw(chart, *_NARROW))
 
 
+def _name(label: str, count: int) -> str:
+    return "measured" if count == 1 else label[:_LARGEST_LABEL] if count <= _MOST_NAMES else ""
+
+
 def _styles(count: int) -> list[str]:
     return [_MEASURED[i % len(_MEASURED)] for i in range(count)]
 
 
 def _apart(modes: Sequence[MeasuredMode]) -> list[MeasuredMode]:
-    """Leave out modes whose names would be written over each other, and fillers."""
+    """Leave out modes whose names would be written over each other on a phone, and fillers."""
     out: list[MeasuredMode] = []
     for mode in sorted(modes, key=lambda m: m.zeta):
-        if mode.zeta < 0.4 and all(abs(mode.f_hz - other.f_hz) > 12.0 for other in out):
+        if mode.zeta < 0.4 and all(abs(mode.f_hz - other.f_hz) > 25.0 for other in out):
             out.append(mode)
     return sorted(out, key=lambda m: m.f_hz)
 
@@ -165,21 +182,24 @@ def _number(value: float) -> str:
     return f"{value:,.0f}".replace(",", "\u202f")
 
 
-def _fit(axis: AxisFigures) -> str:
+def fit_text(axis: AxisFigures) -> str:
+    """Return the residual with its unit."""
     if axis.residual is None:
         return "–"
     return f"{axis.residual:.2f} dB" if axis.spectra else f"{100 * axis.residual:.2f} %"
 
 
-def _interval(value: float, deviation: float | None, digits: int) -> str:
-    """Return a value with its 95 % interval."""
-    text = f"{value:.{digits}f}"
-    return text if deviation is None else f"{text} ± {1.96 * deviation:.{digits}f}"
+def interval_text(value: float, deviation: float | None, digits: int) -> str:
+    """Return a value with its 95 % interval, with as many digits as that needs."""
+    if deviation is None or deviation == 0.0:
+        return f"{value:.{digits}f}"
+    half = 1.96 * deviation
+    digits = min(max(digits, 1 - math.floor(math.log10(half))), digits + 2)
+    return f"{value:.{digits}f} ± {half:.{digits}f}"
 
 
-def _change(mode: MeasuredMode, before: Sequence[MeasuredMode]) -> str:
-    """Tell how far the nearest mode of the former model was."""
-    if not before:
-        return "–"
+def change_text(mode: MeasuredMode, before: Sequence[MeasuredMode]) -> str:
+    """Tell which mode of the former model this one was."""
     near = min(before, key=lambda other: abs(other.f_hz - mode.f_hz))
-    return f"{near.f_hz:.1f} Hz ({100 * (mode.f_hz / near.f_hz - 1):+.1f} %)"
+    change = mode.f_hz / near.f_hz - 1
+    return f"{near.f_hz:.1f} Hz ({100 * change:+.1f} %)" if abs(change) < _SAME_MODE else "new"

@@ -46,6 +46,8 @@ class ReadSettings(BaseModel):
         Of the Klipper version that made the file.
     sensor_axis : str, optional
         Axis of the sensor that lies along the tested axis, if it is mounted turned.
+    sensor_turned : bool
+        The sensor was mounted differently for X and for Y.
     time_column, command_column, measured_column, axis_column : str or int, optional
         Columns of a recorded drive, by name or counted from 0.
     acceleration_unit, magnitude_unit : str, optional
@@ -70,6 +72,7 @@ class ReadSettings(BaseModel):
     sweeping_period_s: Positive | None = None
     firmware_date: date | None = None
     sensor_axis: Literal["x", "y", "z"] | None = None
+    sensor_turned: bool = False
     time_column: Column | None = None
     command_column: Column | None = None
     measured_column: Column | None = None

@@ -121,10 +121,10 @@ def test_the_other_axis_measured_in_place_of_this_one_is_found_by_the_mounting()
 def test_one_axis_measured_twice_is_found_by_the_pair() -> None:
     across = replace(SHORT, direction=(0.0, 1.0))
     x, y = align(log_of(SHORT), SHORT), align(log_of(across), across)
-    check_pair(x, y)
+    check_pair(x.direction, y.direction)
     swapped = align(log_of(across, sensor=Sensor(rotation=SWAPPED)), across)
     with pytest.raises(ModelError, match="same axis was measured twice"):
-        check_pair(x, swapped)
+        check_pair(x.direction, swapped.direction)
 
 
 def test_wrong_logs_have_their_own_messages() -> None:

@@ -1,0 +1,378 @@
+"""From measurements to the plants of a machine's axes.
+
+Measurements are grouped by axis; logs become frequency responses, those become a nominal plant and
+a set. What was measured with a weight on the bed or at different places becomes a schedule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+from models.errors import ModelError
+from models.identification.alignment import check_pair
+from models.identification.averaging import mean_response, mean_spectrum
+from models.identification.conditions import Condition
+from models.identification.estimation import estimate_driven, estimate_response
+from models.identification.fitting import refit_response
+from models.identification.readers import (
+    ReadSettings,
+    date_in_name,
+    direction_of,
+    excitation_for,
+    excitation_notes,
+)
+from models.identification.sets import delay_warning, response_set, spectrum_set, typed_in_set
+from models.identification.spectrum_fit import refit_spectrum
+from models.identification.types import (
+    AccelerationLog,
+    AxisIdentification,
+    DrivenLog,
+    Excitation,
+    Fit,
+    FrequencyResponse,
+    Measurement,
+    PlantModel,
+    Spectrum,
+)
+from models.provenance import Kind, SourceFile
+from models.schedule import (
+    AxisSchedule,
+    GridNode,
+    GridSchedule,
+    MassSchedule,
+    moving_mass_from_two_runs,
+)
+
+__all__ = ["Measured", "Progress", "identify"]
+
+Axis: TypeAlias = Literal["x", "y"]
+Progress: TypeAlias = Callable[[str, float], None]
+"""Called with what is being done and how much of all is done, 0 to 1."""
+
+_SENSOR_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_KINDS: dict[type, Kind] = {
+    AccelerationLog: "raw log",
+    DrivenLog: "recorded drive",
+    FrequencyResponse: "frequency response",
+    Spectrum: "spectrum",
+    PlantModel: "model file",
+}
+_BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectrum)
+"""Where an axis has measurements of several kinds, the first kind is used."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A measurement with the conditions that it was made under."""
+
+    measurement: Measurement
+    condition: Condition = field(default_factory=Condition)
+
+
+def identify(
+    measured: Sequence[Measured],
+    settings: ReadSettings | None = None,
+    *,
+    sources: Sequence[SourceFile] = (),
+    max_order: int = 4,
+    progress: Progress | None = None,
+) -> dict[Axis, AxisIdentification]:
+    """Find the plants of every axis that was measured.
+
+    Parameters
+    ----------
+    measured : sequence of Measured
+    settings : ReadSettings, optional
+        What the files do not carry.
+    sources : sequence of SourceFile
+        The files; each axis keeps those that its measurements come from.
+    max_order : int
+        Most pole pairs to try.
+
+    Raises
+    ------
+    ModelError
+        If a measurement cannot be used, its axis is unknown, or nothing is left to identify.
+    """
+    settings = settings or ReadSettings()
+    groups: dict[Axis, list[Measured]] = {}
+    for one in measured:
+        groups.setdefault(_axis(one.measurement, settings), []).append(one)
+    if not groups:
+        raise ModelError("nothing to identify: give at least one measurement")
+    steps = _Steps(progress, len(measured) + len(groups))
+    found = {
+        axis: _AxisWork(axis, groups[axis], settings, sources, max_order, steps).identified()
+        for axis in sorted(groups)
+    }
+    if not settings.sensor_turned:
+        _check_directions(found)
+    steps.say("done", 1.0)
+    return _delays_compared(found)
+
+
+class _Steps:
+    """Progress over all files and fits."""
+
+    def __init__(self, progress: Progress | None, steps: int) -> None:
+        self._progress, self._steps, self._done = progress, steps, 0
+
+    def say(self, what: str, fraction: float) -> None:
+        if self._progress is not None:
+            self._progress(what, fraction)
+
+    def within(self, what: str) -> Callable[[float], None]:
+        return lambda part: self.say(what, (self._done + part) / self._steps)
+
+    def stepped(self, what: str) -> None:
+        self._done += 1
+        self.say(what, self._done / self._steps)
+
+
+class _AxisWork:
+    """One axis on its way from measurements to plants."""
+
+    def __init__(
+        self,
+        axis: Axis,
+        measured: Sequence[Measured],
+        settings: ReadSettings,
+        sources: Sequence[SourceFile],
+        max_order: int,
+        steps: _Steps,
+    ) -> None:
+        self._axis, self._settings, self._steps = axis, settings, steps
+        self._max_order = max_order
+        kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
+        self._used = [m for m in measured if isinstance(m.measurement, kind)]
+        self._left_out = [m for m in measured if not isinstance(m.measurement, kind)]
+        self._kind = _KINDS[kind]
+        names = {m.measurement.source for m in self._used}
+        self._sources = tuple(s for s in sources if s.name in names)
+        self._date = max(filter(None, map(date_in_name, names)), default=None)
+
+    def identified(self) -> AxisIdentification:
+        """Return the axis with the notes of its files."""
+        if self._kind == "model file":
+            found = self._from_model()
+        elif self._kind == "spectrum":
+            found = self._from_spectra()
+        else:
+            found = self._from_responses()
+        self._steps.stepped(f"axis {self._axis}: fitted")
+        notes = list(found.notes)
+        for one in self._used:
+            notes += [f"{one.measurement.source}: {n}" for n in one.measurement.notes]
+        for one in self._left_out:
+            notes.append(
+                f"{one.measurement.source}: not used, because a {self._kind} of axis {self._axis} "
+                "says more"
+            )
+        for response in found.measured:
+            notes += [f"{response.source}: {n}" for n in response.notes]
+        return replace(found, notes=tuple(dict.fromkeys(notes)))
+
+    def _from_model(self) -> AxisIdentification:
+        if len(self._used) > 1:
+            names = ", ".join(m.measurement.source for m in self._used)
+            raise ModelError(f"axis {self._axis}: {len(self._used)} models ({names}); give one")
+        model = self._used[0].measurement
+        assert isinstance(model, PlantModel)
+        plants = typed_in_set(model.spec, kind="model file")
+        if plants.provenance is not None:
+            about = plants.provenance.model_copy(update={"sources": self._sources})
+            plants = plants.model_copy(update={"provenance": about})
+        return AxisIdentification(axis=self._axis, plants=plants)
+
+    def _from_responses(self) -> AxisIdentification:
+        responses = [(self._response(m), m.condition) for m in self._used]
+        usual = _usual([c for _, c in responses])
+        chosen = [r for r, c in responses if c in usual]
+        found = response_set(
+            chosen,
+            axis=self._axis,
+            kind=self._kind,
+            max_order=self._max_order,
+            sources=self._sources,
+            measured_on=self._date,
+            progress=self._steps.within(f"axis {self._axis}: fitting"),
+        )
+        nominal = found.fit
+        assert nominal is not None
+        fits = {
+            condition: refit_response(
+                mean_response([r for r, c in responses if c == condition]), nominal
+            )
+            for condition in _special([c for _, c in responses])
+        }
+        others = tuple(r for r, c in responses if c not in usual)
+        found = replace(found, measured=(*found.measured, *others))
+        return self._scheduled(found, nominal, fits)
+
+    def _from_spectra(self) -> AxisIdentification:
+        spectra: list[tuple[Spectrum, Excitation, Condition]] = []
+        notes: list[str] = []
+        for one in self._used:
+            spectrum = one.measurement
+            assert isinstance(spectrum, Spectrum)
+            spectra.append((spectrum, excitation_for(spectrum, self._settings), one.condition))
+            notes += excitation_notes(spectrum, self._settings)
+            self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
+        usual = _usual([c for _, _, c in spectra])
+        chosen = [(s, e) for s, e, c in spectra if c in usual]
+        found = spectrum_set(
+            [s for s, _ in chosen],
+            [e for _, e in chosen],
+            axis=self._axis,
+            column=self._settings.sensor_axis,
+            max_order=self._max_order,
+            sources=self._sources,
+            measured_on=self._date,
+            progress=self._steps.within(f"axis {self._axis}: fitting"),
+        )
+        nominal = found.fit
+        assert nominal is not None
+        fits = {
+            condition: refit_spectrum(
+                mean_spectrum([s for s, _, c in spectra if c == condition]),
+                next(e for _, e, c in spectra if c == condition),
+                nominal,
+                column=self._settings.sensor_axis,
+            )
+            for condition in _special([c for _, _, c in spectra])
+        }
+        others = tuple(s for s, _, c in spectra if c not in usual)
+        found = replace(found, measured=(*found.measured, *others), notes=tuple(notes))
+        return self._scheduled(found, nominal, fits)
+
+    def _response(self, one: Measured) -> FrequencyResponse:
+        measurement, label = one.measurement, one.condition.label
+        what = f"axis {self._axis}: {measurement.source}"
+        if isinstance(measurement, AccelerationLog):
+            test = excitation_for(measurement, self._settings)
+            sensor = self._settings.sensor_axis
+            response = estimate_response(
+                measurement,
+                test,
+                sensor_direction=None if sensor is None else _SENSOR_AXES[sensor],
+                # Tests of different strength are different operating points.
+                label=label or f"{test.accel_per_hz_mm_s:g} mm/s",
+                progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
+            )
+            notes = excitation_notes(measurement, self._settings)
+            response = replace(response, notes=(*response.notes, *notes))
+        elif isinstance(measurement, DrivenLog):
+            response = estimate_driven(measurement, label=label)
+        else:
+            assert isinstance(measurement, FrequencyResponse)
+            response = replace(measurement, label=label or measurement.label)
+        self._steps.stepped(what)
+        return response
+
+    def _scheduled(
+        self, found: AxisIdentification, nominal: Fit, fits: Mapping[Condition, Fit]
+    ) -> AxisIdentification:
+        """Turn what was measured with a weight or at places into a schedule."""
+        loaded = {c: f for c, f in fits.items() if c.added_kg}
+        placed = {c: f for c, f in fits.items() if c.position_mm}
+        mass, notes = _mass(nominal, loaded) if loaded else (None, ())
+        grid = None
+        if placed:
+            grid = GridSchedule(nodes=tuple(_node(c, f) for c, f in _sorted_places(placed)))
+        if mass is None and grid is None:
+            return found
+        schedule = AxisSchedule(mass=mass, grid=grid)
+        schedule.check(found.plants)
+        return replace(found, schedule=schedule, notes=(*found.notes, *notes))
+
+
+def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
+    text = settings.axis or measurement.axis
+    if text is None:
+        raise ModelError(
+            f"{measurement.source}: neither the file nor its name says which axis it is of; give "
+            "--axis x or y"
+        )
+    x, y = direction_of(text)
+    if min(abs(x), abs(y)) > 1e-6:
+        raise ModelError(
+            f"{measurement.source}: measured along {text}, which moves both axes at once; identify "
+            "X and Y from tests along X and along Y"
+        )
+    return "x" if abs(x) > abs(y) else "y"
+
+
+def _usual(conditions: Sequence[Condition]) -> list[Condition]:
+    """Return the conditions of the nominal plant: an empty bed, wherever that was measured.
+
+    If all were measured at known places, the one in the middle.
+    """
+    plain = [c for c in dict.fromkeys(conditions) if not c.added_kg and not c.position_mm]
+    if plain:
+        return plain
+    places = [c for c in dict.fromkeys(conditions) if not c.added_kg]
+    if not places:
+        raise ModelError(
+            "every run has a weight on the bed: measure the empty bed too, it is what the machine "
+            "starts a print with"
+        )
+    return [sorted(places, key=lambda c: c.position_mm)[len(places) // 2]]
+
+
+def _special(conditions: Sequence[Condition]) -> list[Condition]:
+    return [c for c in dict.fromkeys(conditions) if c.added_kg or c.position_mm]
+
+
+def _sorted_places(placed: Mapping[Condition, Fit]) -> list[tuple[Condition, Fit]]:
+    """Return fits in the order of their places."""
+    return sorted(placed.items(), key=lambda item: item[0].position_mm)
+
+
+def _node(condition: Condition, fit: Fit) -> GridNode:
+    where = {f"{axis}_mm": value for axis, value in condition.position_mm}
+    return GridNode.model_validate({**where, "plant": fit.spec.model_dump()})
+
+
+def _mass(nominal: Fit, loaded: Mapping[Condition, Fit]) -> tuple[MassSchedule, tuple[str, ...]]:
+    """Return the schedule of the mode that the heaviest weight lowers most clearly."""
+    condition, fit = max(loaded.items(), key=lambda item: item[0].added_kg)
+    drops = [1 - b.f_hz / a.f_hz for a, b in zip(nominal.modes, fit.modes, strict=True)]
+    mode = max(range(len(drops)), key=lambda k: drops[k] * nominal.modes[k].peak)
+    empty, heavy = nominal.modes[mode], fit.modes[mode]
+    found = moving_mass_from_two_runs(
+        empty.f_hz,
+        heavy.f_hz,
+        condition.added_kg,
+        f0_sd_hz=empty.f_sd_hz,
+        f1_sd_hz=heavy.f_sd_hz,
+    )
+    note = (
+        f"{condition.added_kg:g} kg on the bed lowered {empty.f_hz:.2f} Hz to {heavy.f_hz:.2f} Hz: "
+        f"the axis moves {found.mass_kg:.3f} ± {1.96 * found.sd_kg:.3f} kg"
+    )
+    return MassSchedule(moving_mass_kg=round(found.mass_kg, 4), modes=(mode,)), (note,)
+
+
+def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:
+    along = [
+        next((r.sensor_direction for r in one.measured if isinstance(r, FrequencyResponse)), None)
+        for one in found.values()
+    ]
+    if len(along) == 2 and along[0] is not None and along[1] is not None:
+        check_pair(along[0], along[1])
+
+
+def _delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
+    """Warn about delays that differ, where they are known: a log does not say when it began."""
+    fits = [one.fit for _, one in sorted(found.items()) if _keeps_time(one) and one.fit]
+    warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
+    if warning is None:
+        return found
+    return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
+
+
+def _keeps_time(found: AxisIdentification) -> bool:
+    about = found.plants.provenance
+    return about is not None and about.kind in ("frequency response", "recorded drive")

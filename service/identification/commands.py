@@ -1,0 +1,211 @@
+"""The command `identify`. Heavy imports wait until it is needed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from models.errors import ModelError
+from service.machines.commands import By, Message, open_machines, who
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from models.identification.readers import ReadSettings
+    from models.machine import Machine
+    from service.identification.run import Identified
+    from service.machines.resolve import Resolver
+    from service.pipeline.progress import ProgressCallback
+
+__all__ = ["register"]
+
+Files = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FILE[@CONDITION]...",
+        help="Measurements. Conditions: +0.5kg (a weight on the bed), z=150 or x=50,y=100 (where "
+        "the nozzle was), or any label; files with the same label are repeats.",
+    ),
+]
+Name = Annotated[
+    str | None,
+    typer.Option("--machine", "-m", help="Your machine: made, or given a new revision."),
+]
+Base = Annotated[
+    str | None,
+    typer.Option(help="What a new machine starts from: a name of `stillpath machines`, or a file."),
+]
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="OUT", help="Write the machine to a JSON file too."),
+]
+Report = Annotated[
+    Path | None, typer.Option("--report", metavar="DIR", help="Folder for identification.html.")
+]
+AxisOption = Annotated[
+    Literal["x", "y"] | None, typer.Option(help="Axis, if neither files nor their names say it.")
+]
+PerHz = Annotated[float | None, typer.Option(help="accel_per_hz of [resonance_tester].")]
+Low = Annotated[float | None, typer.Option(help="min_freq of [resonance_tester], Hz.")]
+High = Annotated[float | None, typer.Option(help="max_freq of [resonance_tester], Hz.")]
+Rate = Annotated[float | None, typer.Option(help="hz_per_sec of [resonance_tester].")]
+Sweep = Annotated[float | None, typer.Option(help="sweeping_accel; 0: none.")]
+Firmware = Annotated[
+    str | None, typer.Option(metavar="DATE", help="Of the Klipper version that measured.")
+]
+Sensor = Annotated[
+    Literal["x", "y", "z"] | None, typer.Option(help="Sensor axis along the tested axis.")
+]
+Turned = Annotated[
+    bool, typer.Option("--sensor-turned", help="It was mounted differently for X and for Y.")
+]
+Columns = Annotated[
+    str | None,
+    typer.Option(metavar="T,U,Y", help="Columns of time, command and measurement of a drive."),
+]
+Repair = Annotated[
+    bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add identify to a command line."""
+    app.command("identify")(run)
+
+
+def run(
+    files: Files,
+    machine: Name = None,
+    base: Base = None,
+    title: Annotated[str | None, typer.Option(help="Of the machine.")] = None,
+    output: Output = None,
+    report: Report = None,
+    axis: AxisOption = None,
+    accel_per_hz: PerHz = None,
+    min_freq: Low = None,
+    max_freq: High = None,
+    hz_per_sec: Rate = None,
+    sweeping_accel: Sweep = None,
+    firmware_date: Firmware = None,
+    sensor_axis: Sensor = None,
+    sensor_turned: Turned = False,
+    columns: Columns = None,
+    repair_rounding: Repair = False,
+    max_order: Annotated[int, typer.Option(min=1, max=8, help="Most modes to try.")] = 4,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Make a machine of measurements: resonance tests, recorded drives, responses, models.
+
+    Without --machine and --output nothing is stored: the figures are printed.
+    """
+    settings = _settings(
+        axis=axis,
+        accel_per_hz_mm_s=accel_per_hz,
+        f_start_hz=min_freq,
+        f_end_hz=max_freq,
+        hz_per_s=hz_per_sec,
+        sweeping_accel_mm_s2=sweeping_accel,
+        firmware_date=firmware_date,
+        sensor_axis=sensor_axis,
+        sensor_turned=sensor_turned,
+        repair_rounding=repair_rounding,
+        **_columns(columns),
+    )
+    machines = open_machines()
+    start, expected = _start(machines, machine, base)
+
+    from service.console import progress_shown
+    from service.identification.page import write_identification
+    from service.identification.run import identify_files, read_inputs
+    from service.identification.tables import print_identification
+    from service.pipeline.files import replacing
+
+    with progress_shown("stillpath") as progress:
+        found = identify_files(
+            read_inputs(files),
+            start,
+            settings,
+            name=machine,
+            title=title,
+            max_order=max_order,
+            progress=_told(progress),
+        )
+    if report is not None:
+        write_identification(found.report, report)
+    if output is not None:
+        with replacing(output) as temporary:
+            temporary.write_text(found.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    print_identification(found.report)
+    if machine is not None:
+        _store(machines, machine, found, who(by), message, expected)
+
+
+def _settings(**given: Any) -> ReadSettings:
+    from pydantic import ValidationError
+
+    from models.identification.readers import ReadSettings
+    from models.store import explain
+
+    try:
+        return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
+    except ValidationError as error:
+        raise ModelError(f"options: {explain(error)}") from None
+
+
+def _columns(text: str | None) -> dict[str, str]:
+    if text is None:
+        return {}
+    names = [part.strip() for part in text.split(",")]
+    if len(names) != 3 or not all(names):
+        raise ModelError(f"--columns {text!r}: three names or numbers (from 0) are needed: t,u,y")
+    return dict(zip(("time_column", "command_column", "measured_column"), names, strict=True))
+
+
+def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Machine, int]:
+    """Return the machine to start from, and the revision that the change is made on."""
+    if name is not None and name in machines.store:
+        if base is not None:
+            raise ModelError(
+                f"machine {name!r} exists, so it is what the change starts from; leave out --base, "
+                "or take another name"
+            )
+        current = machines.store.current(name)
+        return current.machine, current.number
+    if base is None and name is not None:
+        raise ModelError(
+            f"there is no machine {name!r} yet: say by --base what it starts from (a machine of "
+            "`stillpath machines` with the limits of yours, or a file), or make it with "
+            "`stillpath machines from-config printer.cfg`"
+        )
+    return machines.to_look_at(base or "generic-bedslinger", files=True).machine, 0
+
+
+def _store(
+    machines: Resolver, name: str, found: Identified, author: str, message: str, expected: int
+) -> None:
+    made = machines.store.add_revision(
+        name,
+        found.machine,
+        author=author,
+        message=message or f"identified from {', '.join(s.name for s in found.report.sources)}",
+        sources=found.report.sources,
+        expected=expected,
+    )
+    typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
+
+
+def _told(progress: ProgressCallback) -> Callable[[str, float], None]:
+    from service.pipeline.progress import Progress
+
+    began = time.monotonic()
+
+    def tell(stage: str, fraction: float) -> None:
+        elapsed = time.monotonic() - began
+        eta = elapsed * (1 - fraction) / fraction if fraction > 0.05 else None
+        progress(Progress(stage, fraction, 0.0, elapsed, eta))
+
+    return tell
