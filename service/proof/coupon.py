@@ -114,14 +114,18 @@ def _legend(
 
 
 def _outline() -> list[Point]:
-    """From behind the zigzag: inner wall, front, outer wall, back with teeth."""
+    """From the back wall: inner wall, front, outer wall, back with teeth.
+
+    It ends on a straight line, where what is left of the motion at the stop does not show.
+    """
     side = _SIDE_MM
     first = 0.5 * (side - _TEETH * _TOOTH_MM)
     teeth: list[Point] = [(first + _TEETH * _TOOTH_MM, side)]
     for k in reversed(range(_TEETH)):
         x = first + k * _TOOTH_MM
         teeth += [(x + 0.5 * _TOOTH_MM, side - _TOOTH_DEPTH_MM), (x, side)]
-    return [(first, side), (0.0, side), (0.0, 0.0), (side, 0.0), (side, side), *teeth]
+    seam = (0.5 * first, side)
+    return [seam, (0.0, side), (0.0, 0.0), (side, 0.0), (side, side), *teeth, seam]
 
 
 def _circle() -> list[Point]:

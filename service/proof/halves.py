@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from models.machine import Machine
+from models.plants import continuous
 from service.pipeline.files import replacing
 from service.pipeline.options import Options
 from service.pipeline.progress import ProgressCallback
@@ -25,6 +26,7 @@ Point = tuple[float, float]
 
 AS_PLANNED, COMPENSATED = "as planned", "compensated"
 
+_LONGEST_STAND_S = 0.5
 _GAP_MM, _RIM_MM, _PURGE_MM = 10.0, 4.0, 5.0
 
 
@@ -55,6 +57,9 @@ class Halves:
     ) -> None:
         self.program = Program(machine, settings)
         self._width_mm = width_mm
+        plants = [continuous(machine.axes[a].nominal) for a in ("x", "y")]
+        settling_s = max(plant.settling_time_s(0.05) for plant in plants)
+        self._settling_s = min(settling_s, _LONGEST_STAND_S)
         front = LETTER_HEIGHT_MM + 2 * _RIM_MM
         area = place(
             machine,
@@ -98,6 +103,8 @@ class Halves:
         program.region(band + AS_PLANNED)
         for path in paths:
             program.trace([self._at(point, -1) for point in path], speed_mm_s)
+        # The right half must not begin in the vibration of the left one.
+        program.stand(self._settling_s)
         program.region(band + COMPENSATED)
         with program.compensated():
             for path in paths:

@@ -1,7 +1,8 @@
 """One axis of a log against its prediction: how far off, at which frequency, and a verdict.
 
 The command's acceleration is known, so the axis can be identified from the print itself: all its
-frequencies and damping ratios are scaled until the predicted spectrum fits the measured one.
+frequencies and damping ratios are scaled until the predicted spectrum fits the measured one, the
+mode that rings most a little further than the others if need be.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ _EXCERPT_S = 0.4
 _CORNER_S = (0.02, 0.12)
 _FREQUENCY_TOLERANCE, _DAMPING_TOLERANCE, _GAIN_TOLERANCE = 0.01, 0.35, 0.15
 _SIGMAS = 3.0
+_OWN_SHIFT = 0.03
+"""How far one mode is expected to move against the others."""
 _QUIET, _FEWEST_CORNERS = 0.05, 5
 _POOR_NRMSE = 0.4
 _VAGUE = 0.03
@@ -69,9 +72,9 @@ def judge(axis: AxisMotion, dt_s: float) -> AxisReadback:
         (np.fft.rfft(window * rows) * correction)[band] for rows in (axis.command, axis.predicted)
     )
     measured = np.fft.rfft(window * axis.measured)[band]
-    fit = _fit(axis.spec, f[band], command, measured)
-    predicted = predicted * np.exp(-2j * np.pi * f[band] * fit.delay_s)
     mode = ringing_mode(axis.spec)
+    fit = _fit(axis, mode, f[band], command, measured)
+    predicted = predicted * np.exp(-2j * np.pi * f[band] * fit.delay_s)
     waves = [_wave(x, band, n) for x in (measured, predicted, fit.spectrum)]
     corners = _corner_samples(axis.command, dt_s)
     misses = [
@@ -113,45 +116,55 @@ class _Fit:
     spectrum: Spectrum
 
 
-def _fit(spec: PlantSpec, f: Array, command: Spectrum, measured: Spectrum) -> _Fit:
+def _fit(
+    axis: AxisMotion, mode: RingingMode, f: Array, command: Spectrum, measured: Spectrum
+) -> _Fit:
     """Scale frequencies, damping and gain of a plant, and shift it, to fit a spectrum.
 
-    The residual is weighted with its own smoothed spectrum, from a first pass without weights;
-    standard deviations are those of the weighted least squares.
+    All frequencies share a factor; the ringing mode may have a little more of its own. The residual
+    is weighted with its own smoothed spectrum, from a first pass without weights; standard
+    deviations are those of the weighted least squares.
     """
+    s = 2j * np.pi * f
 
     def model(x: Array) -> Spectrum:
-        plant = spec.scaled(float(np.exp(x[0])), float(np.exp(x[1])))
-        shift = np.exp(x[2] - 2j * np.pi * f * 1e-3 * x[3])
-        return np.asarray(shift * frequency_response(plant, f) * command)  # type: ignore[arg-type]
+        plant = axis.spec.scaled(float(np.exp(x[0])), float(np.exp(x[1])))
+        shift = np.exp(x[2] - 1e-3 * s * x[3])
+        before, after = (abs(mode.pole) * np.exp(x[0] + extra) for extra in (0.0, x[4]))
+        zeta = mode.zeta * np.exp(x[1])
+        own = (1 + 2 * zeta * s / before + (s / before) ** 2) / (
+            1 + 2 * zeta * s / after + (s / after) ** 2
+        )
+        return np.asarray(shift * own * frequency_response(plant, f) * command)  # type: ignore[arg-type]
 
     sd = np.full(len(f), np.sqrt(_power(measured) / len(f)))
-    x = np.zeros(4)
-    limits = ([-0.5, -1.5, -1.0, -6.0], [0.5, 1.5, 1.0, 6.0])
+    x = np.zeros(5)
+    limits = ([-0.5, -1.5, -1.0, -6.0, -0.2], [0.5, 1.5, 1.0, 6.0, 0.2])
     width = max(3, round(_SMOOTH_HZ / (f[1] - f[0])))
     for _ in range(3):
 
         def residual(x: Array, sd: Array = sd) -> Array:
             e = (model(x) - measured) / sd
-            return np.concatenate([e.real, e.imag])
+            # Without other modes the data cannot tell both factors apart.
+            return np.concatenate([e.real, e.imag, [x[4] / _OWN_SHIFT]])
 
-        solved = least_squares(residual, x, bounds=limits, x_scale=[0.01, 0.1, 0.05, 0.1])
+        solved = least_squares(residual, x, bounds=limits, x_scale=[0.01, 0.1, 0.05, 0.1, 0.01])
         x = solved.x
         power = uniform_filter1d(np.abs(model(x) - measured) ** 2, width, mode="nearest")
         # Half of the power lies in each of the real and imaginary parts.
         sd = np.sqrt(0.5 * power + 1e-12 * float(power.max()))
     jacobian = np.asarray(solved.jac, np.float64)
     covariance = np.linalg.pinv(jacobian.T @ jacobian) * 2 * solved.cost / len(solved.fun)
-    spread = np.sqrt(np.diag(covariance))
-    frequency, damping, gain = (float(v) for v in np.exp(x[:3]))
+    both = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
+    frequency, damping, gain = (float(np.exp(v)) for v in (x[0] + x[4], x[1], x[2]))
     return _Fit(
-        frequency,
-        frequency * float(spread[0]),
-        damping,
-        damping * float(spread[1]),
-        gain,
-        1e-3 * float(x[3]),
-        model(x),
+        frequency=frequency,
+        frequency_sd=frequency * float(np.sqrt(both @ covariance @ both)),
+        damping=damping,
+        damping_sd=damping * float(np.sqrt(covariance[1, 1])),
+        gain=gain,
+        delay_s=1e-3 * float(x[3]),
+        spectrum=model(x),
     )
 
 

@@ -203,6 +203,11 @@ class Program:
         """Set the acceleration of what follows."""
         self._add(f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:g}")
 
+    def stand(self, seconds: float) -> None:
+        """Stand still, filament back."""
+        self._retract()
+        self._add(f"G4 P{1e3 * seconds:.0f}")
+
     def trace(self, points: Sequence[Point], speed_mm_s: float) -> None:
         """Travel to the first point and extrude along all others."""
         if self._at is None or math.dist(self._at, points[0]) > self.width_mm:

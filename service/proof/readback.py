@@ -104,7 +104,7 @@ def verify_log(
         **report,
         outcome="the model holds" if all(a.holds for a in judged) else "the machine has changed",
         verdicts=[a.verdict for a in judged],
-        notes=[*recorded.notes, *_notes(found), *notes],
+        notes=[*recorded.notes, *_notes(found, machine), *notes],
         compared_s=len(axes[0].measured) * command.dt_s,
         plan_start_s=found.plan_start_s,
         clock_ppm=1e6 * (found.rate - 1.0),
@@ -174,8 +174,13 @@ def _in_machine_axes(
     return axes, sensor, notes
 
 
-def _notes(found: Match) -> list[str]:
+def _notes(found: Match, machine: Machine) -> list[str]:
     notes = []
+    if machine.schedules:
+        notes.append(
+            "The machine's model follows mass or position; compared is its nominal plant: a mode "
+            "may be lower here because the print is heavy."
+        )
     if found.places > 1:
         notes.append(
             f"The log fits at {found.places} places of the print about as well (layers repeat); "

@@ -108,6 +108,17 @@ def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed
     assert all("reads 0.70 of the predicted" in verdict for verdict in report.verdicts)
 
 
+def test_one_mode_of_several_moved(machine, printed, tmp_path):
+    document = machine.model_dump(mode="json")
+    pole = document["axes"]["x"]["nominal"]["poles"][1]
+    assert pole["f_hz"] == pytest.approx(44.7, abs=0.1)
+    pole["f_hz"] *= 0.97
+    record(printed, Machine.model_validate(document), tmp_path / "log.csv", start_s=300)
+    report = verify_log(printed, tmp_path / "log.csv", machine)
+    assert modes(report)["x"] == pytest.approx(0.97, abs=0.005)
+    assert report.axes[0].nrmse_fitted < 0.05
+
+
 def test_damping_that_changed(machine, printed, tmp_path):
     record(printed, machine, tmp_path / "log.csv", damping=2.0, start_s=300)
     report = verify_log(printed, tmp_path / "log.csv", machine)
