@@ -131,7 +131,7 @@ def four_stages() -> Iterator[Row]:
             yield shown(quantity, f"{paper} um", f"{got.peak_um:.2f} um", f"NOT: {note}")
     for name, said in (("PD", "2 um"), ("+ observer", "0")):
         yield shown(f"steady error, {name}", said, f"{stages[name].steady_um:.2f} um",
-                    "friction of 0.12 V assumed: PD stops anywhere within 0.12 V / kp = 2.1 um")  # fmt: skip
+                    "friction of 0.12 V assumed; PD stops within 0.12 V / kp = 2.1 um")  # fmt: skip
     for name in ("+ ZPETC", "+ FIR"):
         got, smooth = stages[name], staged(name, y_d, 0.0)
         said = "chatter, clips" if name == "+ ZPETC" else "both gone"

@@ -1,0 +1,84 @@
+"""From a file of a pass to a machine that knows its ripple."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.errors import ModelError
+from models.identification.ripple import WaveBasis
+from models.identification.ripple_passes import learn_machine_ripple, read_pass
+from models.machine import Machine
+from models.plants import Mode, ModesSpec, PlantSetSpec, continuous
+from models.response_kernels import dense_response
+from models.store import load_machine
+
+DT = 1e-3
+
+
+def machine(name: str = "ender3") -> Machine:
+    plants = PlantSetSpec(nominal=ModesSpec(modes=(Mode(f_hz=45.0, zeta=0.05),)))
+    return load_machine(name).model_copy(update={"axes": {"x": plants, "y": plants}})
+
+
+def log(comment: str = "# homed\n", share: float = 1.0) -> str:
+    """A pass at 80 mm/s over a ripple of 20 um and 2 mm, the sensor at 500 Hz."""
+    t = np.arange(0, 4, DT)
+    speed = 80 * np.clip(np.minimum(t / 0.1, (4 - t) / 0.1), 0, 1)
+    s = 40 + np.cumsum(speed) * DT
+    u = s + share * 0.02 * np.sin(np.pi * s + 0.7)
+    plant = continuous(ModesSpec(modes=(Mode(f_hz=45.0, zeta=0.05),))).discretise(DT)
+    y = np.empty(len(u))
+    dense_response(plant.a, plant.b, plant.c, plant.d, float(u[0]), np.zeros(2), u, y)
+    rows = "\n".join(f"{a:.4f},{b:.6f},{c:.6f}" for a, b, c in zip(t, s, y, strict=True))
+    return f"{comment}time_s,position_mm,measured_mm\n{rows}\n"
+
+
+BASIS = (WaveBasis("belt", 2.0, (1, 2)),)
+
+
+def test_a_file_becomes_ripple_of_the_machine() -> None:
+    made, learning = learn_machine_ripple(machine(), "x", [read_pass(log(), "pass.csv")], BASIS)
+    first, second = made.ripple["x"].sources[0].harmonics
+    assert first.amplitude_um == pytest.approx(20.0, rel=0.01)
+    assert first.phase_deg == pytest.approx(np.degrees(0.7), abs=0.5)
+    assert second.amplitude_um < 0.2
+    assert learning.explained > 0.9
+    assert made.revision != machine().revision
+
+
+def test_a_later_pass_updates_it() -> None:
+    known, _ = learn_machine_ripple(machine(), "x", [read_pass(log(), "a.csv")], BASIS)
+    later = [read_pass(log(share=0.5), "b.csv")]
+    made, _ = learn_machine_ripple(known, "x", later, BASIS, gain=0.5)
+    assert made.ripple["x"].sources[0].harmonics[0].amplitude_um == pytest.approx(15.0, rel=0.01)
+    made, _ = learn_machine_ripple(known, "x", later, BASIS, gain=1.0, remaining=True)
+    assert made.ripple["x"].sources[0].harmonics[0].amplitude_um == pytest.approx(30.0, rel=0.01)
+
+
+def test_without_homing_it_is_refused() -> None:
+    with pytest.raises(ModelError, match="homed"):
+        learn_machine_ripple(machine(), "x", [read_pass(log(""), "pass.csv")], BASIS)
+
+
+def test_motors_of_corexy_cannot_be_told_apart() -> None:
+    with pytest.raises(ModelError, match="two motors"):
+        learn_machine_ripple(machine("generic-corexy"), "x", [read_pass(log(), "a")], BASIS)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time_s,position_mm\n0,1\n1,2\n", "measured_mm nor accel_mm_s2"),
+        ("time_s,position_mm,measured_mm\n0,1,1\n1,2,2\n", "2 rows"),
+        (
+            "time_s,position_mm,measured_mm\n" + "".join(f"{k % 10},{k},{k}\n" for k in range(20)),
+            "line 12: time_s does not rise",
+        ),
+        ("time_s,position_mm,measured_mm\n" + "0,1,x\n" * 20, "line 2.*measured_mm"),
+        ("time_s,place_mm,measured_mm\n0,1,1\n1,1,1\n", "position_mm"),
+    ],
+)
+def test_names_what_is_wrong_with_a_file(text: str, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        read_pass(text, "pass.csv")
