@@ -28,7 +28,7 @@ def track(
     `theta` has a_1 .. a_m of A = 1 + a_1 z^-1 + .. + a_m z^-m + .. + a_1 z^-(2m-1) + z^-2m;
     `poles` the same numbers as used in A(rho z). `history` has the last 2m filtered samples,
     newest first. `radius` and `forgetting` hold (now, end, decay towards the end); `levels` the
-    mean squares of error and filtered signal. All but x and poles are carried on.
+    mean squares of error, filtered signal and signal. All but x and poles are carried on.
     """
     m = len(theta)
     psi = np.empty(m)
@@ -67,5 +67,6 @@ def track(
         history[0] = filtered
         levels[0] += 0.05 * (error * error - levels[0])
         levels[1] += 0.05 * (filtered * filtered - levels[1])
+        levels[2] += 0.05 * (x[k] * x[k] - levels[2])
         radius[0] = radius[1] - (radius[1] - radius[0]) * radius[2]
         forgetting[0] = forgetting[1] - (forgetting[1] - forgetting[0]) * forgetting[2]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from compensation.base import DesignError
 from compensation.feedback._adaptive_kernels import track
@@ -30,9 +31,10 @@ _START_RADIUS, _END_RADIUS = 0.3, 0.98
 _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
 _DECAY_SAMPLES = 25
 _START_COVARIANCE = 1e4
-# Of the power behind the poles, the share that the zeros leave over. The poles lift the tone, so
-# when locked it is some 1/600 of noise over tone; a jump brings it to .01 and more.
-_LOST = 2e-3
+_LARGEST_POLE = 0.97
+# Shares of power that the zeros leave over when a tone has moved. Behind the poles, which lift the
+# tone, it is some 1/600 of noise over tone when locked; of the signal itself it is the noise.
+_LEFT_BEHIND_POLES, _LEFT_OF_SIGNAL = 2e-3, 0.4
 
 
 class FrequencyTracker:
@@ -41,8 +43,8 @@ class FrequencyTracker:
     Parameters
     ----------
     tones : int
-        At most 8. One and two lock within some 200 samples, also at a signal-to-noise ratio of
-        8 dB; of three, one that the loop leaves ten times weaker may be missed for long.
+        At most 8. One locks within some 100 samples, three within some 500, also at a signal-to-
+        noise ratio of 8 dB.
     dt_s : float
     floor_rms : float
         Below this rms there is nothing to identify.
@@ -76,8 +78,10 @@ class FrequencyTracker:
         )  # fmt: skip
         cosines = _cosines(now.theta)
         now.poles[:] = _coefficients(cosines)
-        error = float(now.levels[0] / max(now.levels[1], 1e-300))
-        if now.heard > 4 * _DECAY_SAMPLES and error > _LOST:
+        if now.heard <= 2 * _DECAY_SAMPLES:
+            # The first errors say nothing, and may be huge.
+            now.levels[:] = 0.0
+        elif now.heard > 4 * _DECAY_SAMPLES * self._tones and now.lost:
             return self._restart()
         if now.heard < 8 * self._tones:
             return ()
@@ -112,7 +116,7 @@ class AdaptiveFmsdob:
     bandwidth_hz : float
         Of the band pass.
     floor_rms : float
-        Of dhat; silence below.
+        Of the disturbance; silence below.
     """
 
     def __init__(
@@ -133,6 +137,8 @@ class AdaptiveFmsdob:
         self._last: tuple[float, ...] = ()
         self._judged: tuple[float, ...] = ()
         self._refused: tuple[float, ...] = ()
+        self._unloop = _unlooped(loops[0]) if around == "servo" else (np.ones(1), np.ones(1))
+        self._memory = np.zeros(max(map(len, self._unloop)) - 1)
 
     @property
     def targets_hz(self) -> tuple[float, ...]:
@@ -146,7 +152,8 @@ class AdaptiveFmsdob:
 
     def hear(self, dhat: Array) -> Retuning | None:
         """Return what to change after the samples `dhat`, None for nothing."""
-        found = self.tracker.push(dhat)
+        disturbance, self._memory = lfilter(*self._unloop, dhat, zi=self._memory)
+        found = self.tracker.push(disturbance)
         moved, self._last = _apart(found, self._last), found
         if moved > 0.25 * self._bandwidth_hz:
             return self._retuned(()) if self.tracker.jumped else None
@@ -219,8 +226,14 @@ class _Estimate:
             np.zeros(2 * tones),
             np.array([_START_RADIUS, _END_RADIUS, decay]),
             np.array([_START_FORGETTING, _END_FORGETTING, decay]),
-            np.zeros(2),
+            np.zeros(3),
         )
+
+    @property
+    def lost(self) -> bool:
+        """Whether more is left over than noise would leave."""
+        error, filtered, signal = self.levels
+        return bool(error > _LEFT_BEHIND_POLES * filtered or error > _LEFT_OF_SIGNAL * signal)
 
 
 def _cosines(theta: Array) -> Array:
@@ -228,6 +241,17 @@ def _cosines(theta: Array) -> Array:
     series = np.concatenate([theta[-1:], 2 * theta[-2::-1], [2.0]])
     roots = chebyshev.chebroots(series)
     return np.asarray(np.clip(np.real(roots), -1 + 1e-9, 1 - 1e-9), np.float64)
+
+
+def _unlooped(loop: Loop) -> tuple[Array, Array]:
+    """Return a stable filter close to 1/S0.
+
+    Around the servo, dhat is S0 d: tones that the baseline loop suppresses would drown.
+    """
+    poles = np.roots(np.convolve(loop.plant_den, loop.controller[1]))
+    size = np.maximum(np.abs(poles), 1e-300)
+    poles = poles * np.minimum(1.0, _LARGEST_POLE / size)
+    return np.asarray(loop.t0_den), np.asarray(np.real(np.poly(poles)), np.float64)
 
 
 def _apart(a: tuple[float, ...], b: tuple[float, ...]) -> float:

@@ -59,11 +59,21 @@ def test_published_steps() -> None:
     assert not any(targets[:49])
 
 
-def test_two_tones_at_once() -> None:
-    y, targets, _ = follow([(900, 2000), (1500, 2600), (2100, 3200)], 2)
-    assert targets[-1] == pytest.approx((2100, 3200), abs=1e-6)
-    for end in (8000, 11000, 14000):
-        assert np.abs(y[end - 100 : end]).max() < 1e-10
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [(900, 2000), (1500, 2600), (2100, 3200)],
+        [(500, 900, 2000), (1000, 1500, 2600), (500, 900, 2000), (1200, 2100, 3200)],
+        [(300,), (330,), (4000,), (1000,), (1050,)],
+    ],
+)
+def test_several_tones_and_small_jumps(parts: list[Tones]) -> None:
+    """Paper 000, figure 15; and tones that a loop suppresses or that hardly move."""
+    y, targets, _ = follow(parts, len(parts[0]))
+    for i, part in enumerate(parts):
+        end = 8000 + 3000 * i
+        assert targets[end // STEP - 1] == pytest.approx(part, abs=1e-5)
+        assert np.abs(y[end - 100 : end]).max() < 1e-9
 
 
 def test_in_noise_the_residual_is_the_noise() -> None:
@@ -93,7 +103,7 @@ def test_kernel_is_the_textbook_recursion() -> None:
     poles, rho, lam = np.array([-0.5, 0.9]), 0.6, 0.97
     theta, covariance, history = np.zeros(2), 10 * np.eye(2), np.zeros(4)
     track(x, theta, covariance, history, poles, np.array([rho, rho, 1.0]),
-          np.array([lam, lam, 1.0]), np.zeros(2))  # fmt: skip
+          np.array([lam, lam, 1.0]), np.zeros(3))  # fmt: skip
     a = np.array([poles[0] * rho, poles[1] * rho**2, poles[0] * rho**3, rho**4])
     filtered = np.zeros(64)
     estimate, p = np.zeros(2), 10 * np.eye(2)
