@@ -114,12 +114,16 @@ def verify_log(
 
 
 def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None) -> Signal:
-    """Commanded positions of X and Y."""
+    """Commanded positions of X and Y, without the jumps of homing and macros."""
     with tempfile.TemporaryDirectory(prefix="stillpath-verify-") as folder:
         target = Path(folder, "motion.npz")
         plan_file(printed, target, machine, rate_hz=_RATE_HZ, progress=progress)
         with np.load(target) as motion:
             rows = np.stack([motion["x"], motion["y"]])
+    fastest = max(machine.command.velocity_mm_s, machine.firmware.planner.max_velocity_mm_s)
+    step = np.diff(rows)
+    step[np.abs(step) > 2.0 * fastest / _RATE_HZ] = 0.0
+    rows[:, 1:] = rows[:, :1] + np.cumsum(step, axis=1)
     return Signal(0.0, 1.0 / _RATE_HZ, rows)
 
 

@@ -108,6 +108,15 @@ def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed
     assert all("reads 0.70 of the predicted" in verdict for verdict in report.verdicts)
 
 
+def test_homing_in_mid_print_is_no_motion(machine, printed, tmp_path):
+    twice = tmp_path / "twice.gcode"
+    twice.write_text(2 * printed.read_text())
+    record(printed, machine, tmp_path / "log.csv", start_s=300)
+    report = verify_log(twice, tmp_path / "log.csv", machine)
+    assert report.outcome == "the model holds"
+    assert modes(report)["x"] == pytest.approx(1.0, abs=0.002)
+
+
 def test_one_mode_of_several_moved(machine, printed, tmp_path):
     document = machine.model_dump(mode="json")
     pole = document["axes"]["x"]["nominal"]["poles"][1]
