@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from models.identification.readers import ReadSettings
     from models.machine import Machine
-    from service.identification.run import Identified
+    from models.provenance import SourceFile
     from service.machines.resolve import Resolver
     from service.pipeline.progress import ProgressCallback
 
@@ -69,6 +69,21 @@ Columns = Annotated[
 Repair = Annotated[
     bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
 ]
+Ripple = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME:PITCH[:1,2,3][@output]",
+        help="Learn ripple instead of plants: a part that repeats, its pitch in mm and harmonics. "
+        "FILEs are passes with time_s, position_mm and measured_mm or accel_mm_s2.",
+    ),
+]
+Gain = Annotated[
+    float, typer.Option(help="Share by which passes move ripple that is known already.")
+]
+Remaining = Annotated[
+    bool, typer.Option("--remaining", help="The passes ran with the known ripple undone.")
+]
+Homing = Annotated[float, typer.Option(metavar="MM", help="How exactly homing repeats.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -95,6 +110,10 @@ def run(
     columns: Columns = None,
     repair_rounding: Repair = False,
     max_order: Annotated[int, typer.Option(min=1, max=8, help="Most modes to try.")] = 4,
+    ripple: Ripple = None,
+    gain: Gain = 0.5,
+    remaining: Remaining = False,
+    homing_repeatability: Homing = 0.0,
     by: By = None,
     message: Message = "",
 ) -> None:
@@ -117,12 +136,30 @@ def run(
     )
     machines = open_machines()
     start, expected = _start(machines, machine, base)
+    if ripple:
+        from service.identification.ripple import learn_from_files
+
+        learnt = learn_from_files(
+            files,
+            start,
+            axis,
+            ripple,
+            gain=gain,
+            remaining=remaining,
+            homing_repeatability_mm=homing_repeatability,
+            name=machine,
+            title=title,
+        )
+        typer.echo(learnt.summary)
+        _write(output, learnt.machine)
+        if machine is not None:
+            _store(machines, machine, learnt.machine, learnt.sources, who(by), message, expected)
+        return
 
     from service.console import progress_shown
     from service.identification.page import write_identification
     from service.identification.run import identify_files, read_inputs
     from service.identification.tables import print_identification
-    from service.pipeline.files import replacing
 
     with progress_shown("stillpath") as progress:
         found = identify_files(
@@ -136,12 +173,19 @@ def run(
         )
     if report is not None:
         write_identification(found.report, report)
-    if output is not None:
-        with replacing(output) as temporary:
-            temporary.write_text(found.machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    _write(output, found.machine)
     print_identification(found.report)
     if machine is not None:
-        _store(machines, machine, found, who(by), message, expected)
+        sources = found.report.sources
+        _store(machines, machine, found.machine, sources, who(by), message, expected)
+
+
+def _write(output: Path | None, machine: Machine) -> None:
+    from service.pipeline.files import replacing
+
+    if output is not None:
+        with replacing(output) as temporary:
+            temporary.write_text(machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
 def _settings(**given: Any) -> ReadSettings:
@@ -185,14 +229,20 @@ def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Mach
 
 
 def _store(
-    machines: Resolver, name: str, found: Identified, author: str, message: str, expected: int
+    machines: Resolver,
+    name: str,
+    machine: Machine,
+    sources: tuple[SourceFile, ...],
+    author: str,
+    message: str,
+    expected: int,
 ) -> None:
     made = machines.store.add_revision(
         name,
-        found.machine,
+        machine,
         author=author,
-        message=message or f"identified from {', '.join(s.name for s in found.report.sources)}",
-        sources=found.report.sources,
+        message=message or f"identified from {', '.join(s.name for s in sources)}",
+        sources=sources,
         expected=expected,
     )
     typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
