@@ -170,7 +170,7 @@ class Designs:
         return max(4, round(n * self.lifted.window / 300))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=12)
 def designs(
     plants: tuple[DiscretePlant, ...],
     weights: tuple[float, ...],
@@ -179,7 +179,7 @@ def designs(
     basis: str,
     most: int = 300,
 ) -> Designs:
-    """Designs of an axis, kept as long as the process works with this machine revision."""
+    """Designs of an axis; those used last are kept (up to 30 MB each, for sets)."""
     return Designs(lifted_window(plants, weights, window, update), basis, most)
 
 

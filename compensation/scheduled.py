@@ -23,7 +23,7 @@ __all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "ScheduledCompensator"]
 
 Array = NDArray[np.float64]
 
-STEP = 0.01
+STEP = 0.02
 """Ratio, minus 1, of a resonance from one design to the next in mass and height."""
 BLEND_STEP = 0.02
 """The same in x and y. The blend of two neighbours is off by the square of their difference."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.base import Compensator, DesignError, compensator
+from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.encoder import Encoded, KlipperEncoder
 from gcode.pieces import Piece
@@ -16,7 +17,7 @@ from gcode.segments import ErrorFilter, Segments, fit_segments
 from gcode.timeline import Timeline, build_timeline, group_rows
 from gcode.types import Phases
 from models.machine import Machine
-from models.operating import machine_at
+from models.operating import OperatingGrid, machine_at
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
 from service.pipeline.options import Options
@@ -83,6 +84,8 @@ class PieceCompensator:
         self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
         self.encoder = KlipperEncoder(machine)
         self._filter = _error_filter(machine)
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._level: OperatingPoint | None = None
 
     def compensate(self, piece: Piece, point: OperatingPoint = EMPTY) -> CompensatedPiece:
         """Return the piece with its command.
@@ -100,11 +103,18 @@ class PieceCompensator:
         """
         try:
             if self._machine.schedules:
-                self.compensator.operate_at(point)
-                self._filter = _error_filter(machine_at(self._machine, point))
+                self._operate_at(point)
             return self._compensate(piece)
         except (DesignError, GcodeError) as error:
             raise Unfit(str(error)) from error
+
+    def _operate_at(self, point: OperatingPoint) -> None:
+        self.compensator.operate_at(point)
+        level = self._grid.level(point)
+        if level != self._level:
+            self._level = level
+            nodes = self._grid.at_level(level)
+            self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
 
     def _compensate(self, piece: Piece) -> CompensatedPiece:
         phases = piece.phases
