@@ -61,7 +61,7 @@ Complex = NDArray[np.complex128]
 
 _RADIUS = 0.97
 _SERIES_LEFT = 1e-3
-_LARGEST_PERIOD = 4000
+_LARGEST_PERIOD = 1000
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,8 @@ _STEADY = 1e-3
 """Relative change of speed that still counts as steady."""
 _FEWEST = 4
 """Samples per unknown that a fit must have."""
-_LARGEST_POINTS = 4_000_000
+_LARGEST_MATRIX = 50_000_000
+"""Numbers in the matrix of a fit: 400 MB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,9 +256,12 @@ def _check(passes: Sequence[PassLog], basis: Sequence[WaveBasis]) -> None:
         if not (np.all(np.isfinite(log.measured)) and np.all(np.isfinite(log.command_mm))):
             raise ModelError(f"{log.source}: values that are not finite numbers; cut them out")
     unknowns = 2 * sum(len(source.numbers) for source in basis)
-    points = unknowns * max(len(log.command_mm) for log in passes)
-    if points > 40 * _LARGEST_POINTS:
-        raise ModelError(f"{unknowns} unknowns over a command this long; cut the pass into parts")
+    rows = sum(max(len(log.measured), len(log.command_mm)) for log in passes)
+    if unknowns * rows > _LARGEST_MATRIX:
+        raise ModelError(
+            f"{rows} samples times {unknowns} unknowns are more than {_LARGEST_MATRIX}: cut the "
+            "passes, or learn fewer harmonics"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -151,6 +151,41 @@ def test_multirate_beats_the_others_also_on_plants_that_differ() -> None:
         assert left["multirate"] < left["quasi"] < baseline
 
 
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    divisor=st.sampled_from([480.0, 600.0, 960.0, 1200.0, 1920.0, 2400.0]),
+    alpha=st.floats(0.9, 0.9999),
+    pairs=st.integers(0, 5),
+    gain=st.floats(0.6, 1.3),
+)
+def test_multirate_is_stable_on_every_member_or_refused(
+    divisor: float, alpha: float, pairs: int, gain: float
+) -> None:
+    loops = (NOMINAL, NOMINAL.varied(gain))
+    try:
+        made = design_multirate(loops, FAST, divisor, alpha=alpha, nyquist_pairs=pairs)
+    except Refusal as refusal:
+        refused = refusal.reason
+    else:
+        refused = ""
+    if refused:
+        assert refused in ("unstable", "inverse")
+        return
+    assert max(made.spectral_radii) < 1
+    kick = np.zeros(120_000)
+    kick[:3] = 1.0
+    for loop, radius in zip(loops, made.spectral_radii, strict=True):
+        watched = simulate(loop, made.blocks, {"d_out": kick}, ("y", "c", "w"), every=3)
+        early = max(np.abs(x[:12_000]).max() for x in watched.values())
+        late = max(np.abs(x[-12_000:]).max() for x in watched.values())
+        assert late <= early * max(radius**60_000, 1e-9) * 1e3
+
+
+def test_a_fast_model_of_another_rate_is_refused() -> None:
+    with pytest.raises(Refusal, match="identify the servo at that rate"):
+        design_multirate(LOOPS, FAST, 800.0)
+
+
 class TestInverse:
     def test_zeros_inside_are_cancelled_exactly(self) -> None:
         inverse = invert_servo((0.0, 0.5, 0.2), (1.0, -0.3))
