@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 _DB = 10 / np.log(10)
 _KNEE_DB = 0.6
 _PERFECT_DB = 0.05
-_CLEARLY = 0.55
-"""Beyond the knee a pair more must bring the residual below this share."""
+_CLEARLY = 0.3
+"""Beyond the knee each further pair must bring the residual below this share."""
 _NO_WORSE = 1.1
 _SCALE = 0.15
 """Where a residual of the logarithm counts as an outlier."""
@@ -47,6 +47,7 @@ _PRIOR = 0.3
 """Standard deviation of the logarithm of the gain, of one bin's weight."""
 _ZETA = (3e-3, 0.5)
 _LEVEL = 0.15
+_WEAK_MODE = 0.1
 _CROSS = 0.2
 
 
@@ -194,7 +195,8 @@ def _without_fillers(model: SpectrumModel, fit: _Candidate) -> _Candidate:
     for pole in filler_poles(fit.structure, fit.theta) if fit.structure.poles > 1 else ():
         structure, theta = fit.structure.without(fit.theta, pole)
         smaller = _polished(model, _Candidate(structure, np.append(fit.vector[:2], theta)))
-        if smaller.residual_db < max(_NO_WORSE * fit.residual_db, _KNEE_DB):
+        clearly_worse = min(_KNEE_DB, fit.residual_db / _CLEARLY)
+        if smaller.residual_db < max(_NO_WORSE * fit.residual_db, clearly_worse):
             return _without_fillers(model, smaller)
     return fit
 
@@ -265,12 +267,16 @@ def _trust_below_hz(spec: PairsSpec, band_hz: tuple[float, float]) -> float:
     """Return half the lowest frequency of a zero that might be non-minimum phase.
 
     A minimum-phase inverse of a zero that is not leaves 12 % at 0.6 and 3 % at 0.4 of the zero's
-    frequency.
+    frequency. A zero next to a pole belongs to a mode that hardly moves this point: on the other
+    side of the axis it would need a mode several times as strong.
     """
-    zeros = [z.f_hz for z in spec.zeros]
-    if spec.real_zero_tau_s > 0:
-        zeros.append(1 / (2 * np.pi * spec.real_zero_tau_s))
-    return float(min(0.5 * min(zeros, default=np.inf), band_hz[1]))
+    roots = spec.roots()
+    zeros = [
+        float(abs(zero))
+        for zero in roots.zeros
+        if np.min(np.abs(roots.poles - zero)) > _WEAK_MODE * abs(zero)
+    ]
+    return float(min(0.5 * min(zeros, default=np.inf) / (2 * np.pi), band_hz[1]))
 
 
 def _level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
