@@ -27,7 +27,7 @@ _LEAST_CORRELATION = 0.6
 _SECOND_PEAK = 0.8
 _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
-_LATEST_START_S = 0.5
+_LATEST_START_S = 0.6  # half a second, and what else is late: sensor, plant, time stamps
 _LEAD_S = 0.5
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 

@@ -21,7 +21,7 @@ class Condition:
     Attributes
     ----------
     label : str
-        Measurements with the same label are repeats.
+        Measurements with the same label are repeats; weights and places have one spelling.
     position_mm : tuple of (coordinate, mm)
         Where the nozzle was; empty if it does not matter.
     added_kg : float
@@ -47,9 +47,10 @@ class Condition:
             kg = float(weight[1]) * (1.0 if weight[2] == "kg" else 1e-3)
             if kg == 0.0:
                 raise ModelError(f"condition {text!r}: a weight of 0 kg tells nothing")
-            return cls(text, added_kg=kg)
+            return cls(f"+{kg:g}kg", added_kg=kg)
         if text.startswith("+") or "=" in text:
-            return cls(text, position_mm=_place(text))
+            place = _place(text)
+            return cls(",".join(f"{axis}={at:g}" for axis, at in place), position_mm=place)
         return cls(text)
 
 

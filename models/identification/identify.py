@@ -13,8 +13,9 @@ from typing import Literal, TypeAlias
 from models.errors import ModelError
 from models.identification.alignment import check_pair
 from models.identification.averaging import mean_response, mean_spectrum
+from models.identification.conditioned import scheduled, special, usual
 from models.identification.conditions import Condition
-from models.identification.estimation import estimate_driven, estimate_response
+from models.identification.estimation import estimate_driven, estimate_response, plateau_gain
 from models.identification.fitting import refit_response
 from models.identification.readers import (
     ReadSettings,
@@ -37,13 +38,6 @@ from models.identification.types import (
     Spectrum,
 )
 from models.provenance import Kind, SourceFile
-from models.schedule import (
-    AxisSchedule,
-    GridNode,
-    GridSchedule,
-    MassSchedule,
-    moving_mass_from_two_runs,
-)
 
 __all__ = ["Measured", "Progress", "identify"]
 
@@ -61,6 +55,10 @@ _KINDS: dict[type, Kind] = {
 }
 _BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectrum)
 """Where an axis has measurements of several kinds, the first kind is used."""
+
+_LEVEL_TOLERANCE = 0.15
+_LEVELS = (0.3, 3.0)
+_MOSTLY = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,8 +186,8 @@ class _AxisWork:
 
     def _from_responses(self) -> AxisIdentification:
         responses = [(self._response(m), m.condition) for m in self._used]
-        usual = _usual([c for _, c in responses])
-        chosen = [r for r, c in responses if c in usual]
+        common = usual([c for _, c in responses], self._axis)
+        chosen = [r for r, c in responses if c in common]
         found = response_set(
             chosen,
             axis=self._axis,
@@ -205,11 +203,14 @@ class _AxisWork:
             condition: refit_response(
                 mean_response([r for r, c in responses if c == condition]), nominal
             )
-            for condition in _special([c for _, c in responses])
+            for condition in special([c for _, c in responses])
         }
-        others = tuple(r for r, c in responses if c not in usual)
-        found = replace(found, measured=(*found.measured, *others))
-        return self._scheduled(found, nominal, fits)
+        others = tuple(r for r, c in responses if c not in common)
+        warnings = list(found.warnings)
+        if self._kind == "raw log":
+            warnings += _level_warnings(chosen, nominal) + self._mounting_warnings(chosen)
+        found = replace(found, measured=(*found.measured, *others), warnings=tuple(warnings))
+        return scheduled(found, nominal, fits, self._kind)
 
     def _from_spectra(self) -> AxisIdentification:
         spectra: list[tuple[Spectrum, Excitation, Condition]] = []
@@ -220,8 +221,8 @@ class _AxisWork:
             spectra.append((spectrum, excitation_for(spectrum, self._settings), one.condition))
             notes += excitation_notes(spectrum, self._settings)
             self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
-        usual = _usual([c for _, _, c in spectra])
-        chosen = [(s, e) for s, e, c in spectra if c in usual]
+        common = usual([c for _, _, c in spectra], self._axis)
+        chosen = [(s, e) for s, e, c in spectra if c in common]
         found = spectrum_set(
             [s for s, _ in chosen],
             [e for _, e in chosen],
@@ -241,11 +242,11 @@ class _AxisWork:
                 nominal,
                 column=self._settings.sensor_axis,
             )
-            for condition in _special([c for _, _, c in spectra])
+            for condition in special([c for _, _, c in spectra])
         }
-        others = tuple(s for s, _, c in spectra if c not in usual)
+        others = tuple(s for s, _, c in spectra if c not in common)
         found = replace(found, measured=(*found.measured, *others), notes=tuple(notes))
-        return self._scheduled(found, nominal, fits)
+        return scheduled(found, nominal, fits, self._kind)
 
     def _response(self, one: Measured) -> FrequencyResponse:
         measurement, label = one.measurement, one.condition.label
@@ -271,21 +272,21 @@ class _AxisWork:
         self._steps.stepped(what)
         return response
 
-    def _scheduled(
-        self, found: AxisIdentification, nominal: Fit, fits: Mapping[Condition, Fit]
-    ) -> AxisIdentification:
-        """Turn what was measured with a weight or at places into a schedule."""
-        loaded = {c: f for c, f in fits.items() if c.added_kg}
-        placed = {c: f for c, f in fits.items() if c.position_mm}
-        mass, notes = _mass(nominal, loaded) if loaded else (None, ())
-        grid = None
-        if placed:
-            grid = GridSchedule(nodes=tuple(_node(c, f) for c, f in _sorted_places(placed)))
-        if mass is None and grid is None:
-            return found
-        schedule = AxisSchedule(mass=mass, grid=grid)
-        schedule.check(found.plants)
-        return replace(found, schedule=schedule, notes=(*found.notes, *notes))
+    def _mounting_warnings(self, responses: Sequence[FrequencyResponse]) -> list[str]:
+        """Say where the sensor's axes seem exchanged: or another axis was measured."""
+        if self._settings.sensor_axis is not None:
+            return []
+        warnings = []
+        for response in responses:
+            along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
+            most = max(along, key=along.__getitem__, default=self._axis)
+            if most != self._axis and along[most] > _MOSTLY:
+                warnings.append(
+                    f"{response.source}: the sensor's {most} moved in the test of axis "
+                    f"{self._axis}; unless it is mounted so (say it by sensor_axis {most}), "
+                    "another axis was measured"
+                )
+        return warnings
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
@@ -293,9 +294,12 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     if text is None:
         raise ModelError(
             f"{measurement.source}: neither the file nor its name says which axis it is of; give "
-            "--axis x or y"
+            "the axis, x or y"
         )
-    x, y = direction_of(text)
+    try:
+        x, y = direction_of(text)
+    except ModelError as error:
+        raise ModelError(f"{measurement.source}: {error}") from None
     if min(abs(x), abs(y)) > 1e-6:
         raise ModelError(
             f"{measurement.source}: measured along {text}, which moves both axes at once; identify "
@@ -304,64 +308,33 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     return "x" if abs(x) > abs(y) else "y"
 
 
-def _usual(conditions: Sequence[Condition]) -> list[Condition]:
-    """Return the conditions of the nominal plant: an empty bed, wherever that was measured.
-
-    If all were measured at known places, the one in the middle.
-    """
-    plain = [c for c in dict.fromkeys(conditions) if not c.added_kg and not c.position_mm]
-    if plain:
-        return plain
-    places = [c for c in dict.fromkeys(conditions) if not c.added_kg]
-    if not places:
+def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
+    """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
+    names = ", ".join(r.source for r in responses if plateau_gain(r) is None)
+    if not names or abs(fit.gain - 1.0) <= _LEVEL_TOLERANCE:
+        return []
+    seen = f"{names}: by the fit the sensor moved {fit.gain:.2g} times as much as commanded"
+    if not _LEVELS[0] < fit.gain < _LEVELS[1]:
         raise ModelError(
-            "every run has a weight on the bed: measure the empty bed too, it is what the machine "
-            "starts a print with"
+            f"{seen}: it does not sit on what moves, or accel_per_hz or its scale is wrong; "
+            "measure at the part that the axis moves"
         )
-    return [sorted(places, key=lambda c: c.position_mm)[len(places) // 2]]
-
-
-def _special(conditions: Sequence[Condition]) -> list[Condition]:
-    return [c for c in dict.fromkeys(conditions) if c.added_kg or c.position_mm]
-
-
-def _sorted_places(placed: Mapping[Condition, Fit]) -> list[tuple[Condition, Fit]]:
-    """Return fits in the order of their places."""
-    return sorted(placed.items(), key=lambda item: item[0].position_mm)
-
-
-def _node(condition: Condition, fit: Fit) -> GridNode:
-    where = {f"{axis}_mm": value for axis, value in condition.position_mm}
-    return GridNode.model_validate({**where, "plant": fit.spec.model_dump()})
-
-
-def _mass(nominal: Fit, loaded: Mapping[Condition, Fit]) -> tuple[MassSchedule, tuple[str, ...]]:
-    """Return the schedule of the mode that the heaviest weight lowers most clearly."""
-    condition, fit = max(loaded.items(), key=lambda item: item[0].added_kg)
-    drops = [1 - b.f_hz / a.f_hz for a, b in zip(nominal.modes, fit.modes, strict=True)]
-    mode = max(range(len(drops)), key=lambda k: drops[k] * nominal.modes[k].peak)
-    empty, heavy = nominal.modes[mode], fit.modes[mode]
-    found = moving_mass_from_two_runs(
-        empty.f_hz,
-        heavy.f_hz,
-        condition.added_kg,
-        f0_sd_hz=empty.f_sd_hz,
-        f1_sd_hz=heavy.f_sd_hz,
-    )
-    note = (
-        f"{condition.added_kg:g} kg on the bed lowered {empty.f_hz:.2f} Hz to {heavy.f_hz:.2f} Hz: "
-        f"the axis moves {found.mass_kg:.3f} ± {1.96 * found.sd_kg:.3f} kg"
-    )
-    return MassSchedule(moving_mass_kg=round(found.mass_kg, 4), modes=(mode,)), (note,)
+    return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]
 
 
 def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:
     along = [
-        next((r.sensor_direction for r in one.measured if isinstance(r, FrequencyResponse)), None)
+        (r.source, r.sensor_direction)
         for one in found.values()
+        for r in one.measured[:1]
+        if isinstance(r, FrequencyResponse) and r.sensor_direction is not None
     ]
-    if len(along) == 2 and along[0] is not None and along[1] is not None:
-        check_pair(along[0], along[1])
+    if len(along) == 2:
+        (x, x_direction), (y, y_direction) = along
+        try:
+            check_pair(x_direction, y_direction)
+        except ModelError as error:
+            raise ModelError(f"{x}, {y}: {error}") from None
 
 
 def _delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from models.machine import Machine
     from models.provenance import SourceFile
     from service.machines.resolve import Resolver
+    from service.machines.revision import Revision
     from service.pipeline.progress import ProgressCallback
 
 __all__ = ["register"]
@@ -134,6 +135,7 @@ def run(
         repair_rounding=repair_rounding,
         **_columns(columns),
     )
+    _check_targets(output, report)
     machines = open_machines()
     start, expected = _start(machines, machine, base)
     if ripple:
@@ -188,6 +190,14 @@ def _write(output: Path | None, machine: Machine) -> None:
             temporary.write_text(machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
+def _check_targets(output: Path | None, report: Path | None) -> None:
+    """Refuse what could not be written before the work is done."""
+    if output is not None and (output.is_dir() or not output.resolve().parent.is_dir()):
+        raise ModelError(f"--output {output} is a folder or lies in none; name a file to write")
+    if report is not None and report.exists() and not report.is_dir():
+        raise ModelError(f"--report {report} is a file; name a folder")
+
+
 def _settings(**given: Any) -> ReadSettings:
     from pydantic import ValidationError
 
@@ -228,24 +238,17 @@ def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Mach
     return machines.to_look_at(base or "generic-bedslinger", files=True).machine, 0
 
 
-def _store(
-    machines: Resolver,
-    name: str,
-    machine: Machine,
-    sources: tuple[SourceFile, ...],
-    author: str,
-    message: str,
-    expected: int,
-) -> None:
-    made = machines.store.add_revision(
+def _stored(
+    machines: Resolver, name: str, found: Identified, author: str, message: str, expected: int
+) -> Revision:
+    return machines.store.add_revision(
         name,
-        machine,
+        found.machine,
         author=author,
-        message=message or f"identified from {', '.join(s.name for s in sources)}",
-        sources=sources,
+        message=message or f"identified from {', '.join(s.name for s in found.report.sources)}",
+        sources=found.report.sources,
         expected=expected,
     )
-    typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
 
 
 def _told(progress: ProgressCallback) -> Callable[[str, float], None]:

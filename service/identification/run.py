@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, TypeAlias
+
+import numpy as np
 
 from models.errors import ModelError
 from models.identification.conditions import Condition
@@ -14,14 +16,16 @@ from models.identification.identify import Measured, Progress, identify
 from models.identification.readers import ReadSettings, read_content
 from models.identification.types import AxisIdentification
 from models.machine import Machine
+from models.plants import PlantSpec
 from models.provenance import SourceFile
-from models.schedule import MassSchedule
+from models.schedule import AxisSchedule, MassSchedule, resonances_hz
 from service.identification.figures import IdentificationReport
 from service.identification.report import identification_report
 
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
 
 LARGEST_BYTES = 200_000_000
+Axis: TypeAlias = Literal["x", "y"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +98,17 @@ def identify_files(
         If a file cannot be used; the message names it.
     """
     settings = settings or ReadSettings()
-    measured = [
-        Measured(measurement, file.condition)
-        for file in files
-        for measurement in read_content(file.content, file.name, settings=settings)
-    ]
+    measured: list[Measured] = []
+    for file in files:
+        if progress is not None:
+            progress(f"reading {file.name}", 0.0)
+        read = read_content(file.content, file.name, settings=settings)
+        measured += [Measured(measurement, file.condition) for measurement in read]
     sources = [file.source for file in files]
-    found = identify(measured, settings, sources=sources, max_order=max_order, progress=progress)
+    identified = identify(
+        measured, settings, sources=sources, max_order=max_order, progress=progress
+    )
+    found = {axis: _with_what_is_known(base, axis, one) for axis, one in identified.items()}
     machine = _with_plants(base, found, name, title)
     report = identification_report(machine, base, found, settings, sources)
     return Identified(machine, report)
@@ -119,46 +127,56 @@ def _read_input(argument: str) -> InputFile:
         raise ModelError(f"cannot read {path}: {error.strerror}") from None
 
 
+def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) -> AxisIdentification:
+    """Keep the moving mass that was known before, where no weight was put on the bed now."""
+    before, now = base.schedules.get(axis), found.schedule
+    mass, grid = (now.mass, now.grid) if now else (None, None)
+    notes, warnings = list(found.notes), list(found.warnings)
+    if mass is not None:
+        mass = _same_filament(mass, base)
+    elif before is not None and before.mass is not None:
+        mass = _same_modes(before.mass, base.axes[axis].nominal, found.plants.nominal)
+        known = f"the {before.mass.moving_mass_kg:g} kg that axis {axis} moves"
+        if mass is None:
+            warnings.append(f"{known} are left out: the new plant is not given by its resonances")
+        else:
+            notes.append(f"{known} stay: no weight was put on the bed")
+    if grid is None and before is not None and before.grid is not None:
+        # Its plants would hide the new one.
+        warnings.append(
+            f"the plants of {len(before.grid.nodes)} places that the machine had for axis {axis} "
+            "are left out: they belong to the former measurement; measure there again (FILE@z=150)"
+        )
+    schedule = AxisSchedule(mass=mass, grid=grid) if mass or grid else None
+    return replace(found, schedule=schedule, notes=tuple(notes), warnings=tuple(warnings))
+
+
+def _same_filament(mass: MassSchedule, base: Machine) -> MassSchedule:
+    """Return the mass with the density of what the machine prints with, if that is known."""
+    known = [s.mass.filament_density_g_cm3 for s in base.schedules.values() if s.mass]
+    return mass.model_copy(update={"filament_density_g_cm3": known[0]}) if known else mass
+
+
+def _same_modes(mass: MassSchedule, before: PlantSpec, now: PlantSpec) -> MassSchedule | None:
+    """Return the mass for the resonances that are nearest to those it lowered before."""
+    were, are = resonances_hz(before), resonances_hz(now)
+    if not len(are):
+        return None
+    modes = {int(np.argmin(np.abs(np.log(are / were[k])))) for k in mass.modes}
+    return mass.model_copy(update={"modes": tuple(sorted(modes))})
+
+
 def _with_plants(
-    base: Machine,
-    found: Mapping[Literal["x", "y"], AxisIdentification],
-    name: str | None,
-    title: str | None,
+    base: Machine, found: Mapping[Axis, AxisIdentification], name: str | None, title: str | None
 ) -> Machine:
     document = base.model_dump()
     for axis, one in found.items():
         document["axes"][axis] = one.plants.model_dump()
-        schedule = _schedule(base, axis, one)
         document["schedules"].pop(axis, None)
-        if schedule:
-            document["schedules"][axis] = schedule
+        if one.schedule is not None:
+            document["schedules"][axis] = one.schedule.model_dump()
     if name is not None and name != base.name:
         document.update(name=name, title=title or f"{base.title}, measured")
     elif title is not None:
         document["title"] = title
     return Machine.model_validate(document)
-
-
-def _schedule(base: Machine, axis: Literal["x", "y"], found: AxisIdentification) -> dict[str, Any]:
-    """Return the schedule of an axis: what was measured now, else the mass that was known before.
-
-    A grid that was known before is dropped: its plants would hide the new one.
-    """
-    now = found.schedule
-    before = base.schedules.get(axis)
-    mass = now.mass if now else None
-    if mass is None and before is not None and _fits(before.mass, found):
-        mass = before.mass
-    grid = now.grid if now else None
-    parts = {"mass": mass, "grid": grid}
-    return {key: part.model_dump() for key, part in parts.items() if part is not None}
-
-
-def _fits(mass: MassSchedule | None, found: AxisIdentification) -> bool:
-    if mass is None:
-        return False
-    try:
-        mass.check(found.plants.nominal)
-    except ModelError:
-        return False
-    return True

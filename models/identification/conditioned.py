@@ -1,0 +1,170 @@
+"""What runs with a weight on the bed, or with the nozzle at places, say of how an axis changes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from pydantic import ValidationError
+
+from models.errors import ModelError
+from models.identification.conditions import Condition
+from models.identification.sets import parametric_members
+from models.identification.types import AxisIdentification, Fit, ModeEstimate
+from models.plants import ParametricMembers, PlantSetSpec
+from models.provenance import Kind
+from models.schedule import (
+    AxisSchedule,
+    GridNode,
+    GridSchedule,
+    MassSchedule,
+    moving_mass_from_two_runs,
+)
+from models.store import explain
+
+__all__ = ["scheduled", "special", "usual"]
+
+_REPEATABLE = 0.0035
+"""Relative standard deviation of a frequency from run to run: +-0.7 % within a session."""
+
+
+def usual(conditions: Sequence[Condition], axis: str) -> list[Condition]:
+    """Return the conditions of the nominal plant: an empty bed, wherever that was measured.
+
+    If all were measured at known places, the one in the middle.
+
+    Raises
+    ------
+    ModelError
+        If every run has a weight on the bed.
+    """
+    empty = [c for c in dict.fromkeys(conditions) if not c.added_kg]
+    plain = [c for c in empty if not c.position_mm]
+    if plain:
+        return plain
+    if not empty:
+        raise ModelError(
+            f"axis {axis}: every run has a weight on the bed: measure the empty bed too, it is "
+            "what the machine starts a print with"
+        )
+    return [sorted(empty, key=lambda c: c.position_mm)[len(empty) // 2]]
+
+
+def special(conditions: Sequence[Condition]) -> list[Condition]:
+    """Return the conditions that each get a plant of their own."""
+    return [c for c in dict.fromkeys(conditions) if c.added_kg or c.position_mm]
+
+
+def scheduled(
+    found: AxisIdentification, nominal: Fit, fits: Mapping[Condition, Fit], kind: Kind
+) -> AxisIdentification:
+    """Return the axis with the schedule that its runs under special conditions make.
+
+    Parameters
+    ----------
+    found : AxisIdentification
+    nominal : Fit
+        Of the usual condition.
+    fits : mapping of Condition to Fit
+        With the structure of `nominal`.
+    kind : Kind
+        Of the measurements.
+
+    Raises
+    ------
+    ModelError
+        If a weight did not lower a resonance, or the places make no grid.
+    """
+    loaded = {c: f for c, f in fits.items() if c.added_kg}
+    placed = {c: f for c, f in fits.items() if c.position_mm}
+    if not loaded and not placed:
+        return found
+    try:
+        mass, notes = _mass(nominal, loaded) if loaded else (None, ())
+        grid = _grid(placed) if placed else None
+    except ModelError as error:
+        raise ModelError(f"axis {found.axis}: {error}") from None
+    plants = found.plants
+    if grid is not None:
+        plants, varied = _followed(plants, kind)
+        notes = (*notes, *varied)
+    schedule = AxisSchedule(mass=mass, grid=grid)
+    schedule.check(plants)
+    return replace(found, plants=plants, schedule=schedule, notes=(*found.notes, *notes))
+
+
+def _mass(nominal: Fit, loaded: Mapping[Condition, Fit]) -> tuple[MassSchedule, tuple[str, ...]]:
+    """Return the schedule of the mode that the heaviest weight lowers, and what it predicts."""
+    condition, fit = max(loaded.items(), key=lambda item: item[0].added_kg)
+    before, after = _moved(nominal.modes, fit.modes)
+    empty, heavy = nominal.modes[before], fit.modes[after]
+    found = moving_mass_from_two_runs(
+        empty.f_hz,
+        heavy.f_hz,
+        condition.added_kg,
+        f0_sd_hz=_deviation_hz(empty),
+        f1_sd_hz=_deviation_hz(heavy),
+    )
+    mass = MassSchedule(moving_mass_kg=round(found.mass_kg, 4), modes=(before,))
+    note = (
+        f"{condition.added_kg:g} kg on the bed lowered {empty.f_hz:.2f} Hz to {heavy.f_hz:.2f} Hz: "
+        f"the axis moves {found.mass_kg:.3f} ± {1.96 * found.sd_kg:.3f} kg"
+    )
+    notes = [note]
+    for lighter, other in loaded.items():
+        if lighter != condition:
+            seen = other.modes[_moved(nominal.modes, other.modes)[1]].f_hz
+            expected = empty.f_hz * mass.factor(lighter.added_kg)
+            notes.append(
+                f"{lighter.added_kg:g} kg on the bed: {seen:.2f} Hz, by that mass {expected:.2f} Hz"
+            )
+    return mass, tuple(notes)
+
+
+def _moved(before: Sequence[ModeEstimate], after: Sequence[ModeEstimate]) -> tuple[int, int]:
+    """Return which mode moved, in both lists: without it the others agree best.
+
+    Both rise in frequency, so a mode that falls below its neighbour changes its place.
+    """
+
+    def apart(pair: tuple[int, int]) -> float:
+        i, j = pair
+        rest = zip((*before[:i], *before[i + 1 :]), (*after[:j], *after[j + 1 :]), strict=True)
+        return sum(a.peak * abs(math.log(b.f_hz / a.f_hz)) for a, b in rest)
+
+    return min(itertools.product(range(len(before)), range(len(after))), key=apart)
+
+
+def _deviation_hz(mode: ModeEstimate) -> float:
+    """Return what the frequency may be off by: a fit knows its own run only."""
+    repeatable = _REPEATABLE * mode.f_hz
+    return math.hypot(repeatable, mode.f_sd_hz) if math.isfinite(mode.f_sd_hz) else repeatable
+
+
+def _grid(placed: Mapping[Condition, Fit]) -> GridSchedule:
+    if len(placed) < 2:
+        (only,) = placed
+        raise ModelError(
+            f"measured at one place only ({only.label}): measure at another one too, or leave the "
+            "place out"
+        )
+    rising = sorted(placed.items(), key=lambda item: item[0].position_mm)
+    try:
+        return GridSchedule(nodes=tuple(_node(c, f) for c, f in rising))
+    except ValidationError as error:
+        raise ModelError(f"the places: {explain(error).partition(': ')[2]}") from None
+
+
+def _node(condition: Condition, fit: Fit) -> GridNode:
+    where = {f"{axis}_mm": value for axis, value in condition.position_mm}
+    return GridNode.model_validate({**where, "plant": fit.spec.model_dump()})
+
+
+def _followed(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:
+    """Return members that can follow a grid: those that scale, not those that are listed."""
+    if not plants.members or isinstance(plants.members, ParametricMembers):
+        return plants, ()
+    note = "members are spread about the plant of each place; repeats at one place make none"
+    return plants.model_copy(update={"members": parametric_members(kind)}), (note,)
