@@ -12,7 +12,7 @@ from models.errors import ModelError
 from service.machines.commands import By, Message, open_machines, who
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from models.identification.readers import ReadSettings
     from models.machine import Machine
@@ -152,10 +152,12 @@ def run(
             name=machine,
             title=title,
         )
-        typer.echo(learnt.summary)
+        made = _stored(
+            machines, machine, learnt.machine, learnt.sources, who(by), message, expected
+        )
         _write(output, learnt.machine)
-        if machine is not None:
-            _store(machines, machine, learnt.machine, learnt.sources, who(by), message, expected)
+        typer.echo(learnt.summary)
+        _tell(made)
         return
 
     from service.console import progress_shown
@@ -173,20 +175,20 @@ def run(
             max_order=max_order,
             progress=_told(progress),
         )
+    sources = found.report.sources
+    made = _stored(machines, machine, found.machine, sources, who(by), message, expected)
     if report is not None:
         write_identification(found.report, report)
     _write(output, found.machine)
     print_identification(found.report)
-    if machine is not None:
-        sources = found.report.sources
-        _store(machines, machine, found.machine, sources, who(by), message, expected)
+    _tell(made)
 
 
 def _write(output: Path | None, machine: Machine) -> None:
     from service.pipeline.files import replacing
 
     if output is not None:
-        with replacing(output) as temporary:
+        with replacing(output.resolve()) as temporary:
             temporary.write_text(machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
@@ -239,16 +241,31 @@ def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Mach
 
 
 def _stored(
-    machines: Resolver, name: str, found: Identified, author: str, message: str, expected: int
-) -> Revision:
+    machines: Resolver,
+    name: str | None,
+    machine: Machine,
+    sources: Sequence[SourceFile],
+    author: str,
+    message: str,
+    expected: int,
+) -> Revision | None:
+    """Make a revision, before anything else is written: the store may refuse."""
+    if name is None:
+        return None
     return machines.store.add_revision(
         name,
-        found.machine,
+        machine,
         author=author,
-        message=message or f"identified from {', '.join(s.name for s in found.report.sources)}",
-        sources=found.report.sources,
+        message=message or f"identified from {', '.join(s.name for s in sources)}",
+        sources=sources,
         expected=expected,
     )
+
+
+def _tell(made: Revision | None) -> None:
+    if made is not None:
+        name = made.machine.name
+        typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
 
 
 def _told(progress: ProgressCallback) -> Callable[[str, float], None]:
