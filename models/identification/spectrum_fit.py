@@ -46,6 +46,10 @@ _SCALE = 0.15
 _PRIOR = 0.3
 """Standard deviation of the logarithm of the gain, of one bin's weight."""
 _ZETA = (3e-3, 0.5)
+_HIGHEST = 2.0
+"""Poles may lie above the band by this factor."""
+_USUAL_ZETA, _ZETA_SPREAD = 0.08, 1.5
+"""Damping where the spectrum does not tell it, and the standard deviation of its logarithm."""
 _LEVEL = 0.15
 _WEAK_MODE = 0.1
 _CROSS = 0.2
@@ -215,24 +219,28 @@ def _polished(
     structure = start.structure
     least = np.full(structure.poles, _ZETA[0]) if least_zeta is None else least_zeta
     low, high = structure.bounds(
-        (0.7 * model.f_hz[0], 1.3 * model.f_hz[-1]), (least, _ZETA[1]), minimum_phase=True
+        (0.7 * model.f_hz[0], _HIGHEST * model.f_hz[-1]), (least, _ZETA[1]), minimum_phase=True
     )
     quiet = float(model.log_psd.min())
     low, high = np.append([-3.0, quiet - 12.0], low), np.append([3.0, quiet + 0.5], high)
 
     def residual(vector: Array) -> Array:
         error = model.log_spectrum(structure, vector) - model.log_psd
-        return np.append(error / _SCALE, vector[0] / _PRIOR)
+        damping = (vector[damped] - np.log(_USUAL_ZETA)) / _ZETA_SPREAD
+        return np.concatenate([error / _SCALE, vector[:1] / _PRIOR, damping])
 
     def jacobian(vector: Array) -> Array:
-        prior = np.eye(1, len(vector)) / _PRIOR
-        return np.vstack([model.log_gradient(structure, vector) / _SCALE, prior])
+        unit = np.eye(len(vector))
+        priors = [unit[:1] / _PRIOR, unit[damped] / _ZETA_SPREAD]
+        return np.vstack([model.log_gradient(structure, vector) / _SCALE, *priors])
 
+    # Gain, noise, tau and the frequencies of the poles come first.
+    damped = slice(3 + structure.poles, 3 + 2 * structure.poles)
     inside = np.clip(start.vector, low + 1e-6, high - 1e-6)
     solution = least_squares(
         residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=60
     )
-    error = _SCALE * residual(solution.x)[:-1]
+    error = _SCALE * residual(solution.x)[: len(model.log_psd)]
     return replace(
         start,
         vector=np.asarray(solution.x, np.float64),
