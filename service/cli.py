@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from service.controllers import commands as controllers
 from service.environment import prepare_environment
 from service.identification import commands as identification
 from service.interruption import Interrupted
@@ -264,6 +265,7 @@ def serve(
 
 identification.register(app)
 proof.register(app)
+controllers.register(app)
 
 
 def _options(**values: Any) -> Any:

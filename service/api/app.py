@@ -10,7 +10,7 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from service.api import designs, health, identifications, jobs, machines, problems
+from service.api import controllers, designs, health, identifications, jobs, machines, problems
 from service.api.guard import Guard
 from service.identification.archive import Archive
 from service.jobs.store import JobStore
@@ -82,6 +82,7 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     )
     app.state.settings = settings
     app.state.designs = designs.Designs()
+    app.state.controllers = controllers.Controllers()
     app.state.identifications = identifications.Identifications(
         Archive(settings.data_dir / "identifications")
     )
@@ -96,6 +97,7 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     app.include_router(machines.router)
     app.include_router(designs.router)
     app.include_router(identifications.router)
+    app.include_router(controllers.router)
     app.include_router(health.router)
 
     @app.get("/", include_in_schema=False)

@@ -46,8 +46,9 @@ class Chart:
         For those who cannot see it.
     tick : callable
         Text of a number on the x axis; a second line after a line break.
-    log : bool
-        Logarithmic y axis; values that are not positive leave gaps.
+    log, log_x : bool
+        Logarithmic y axis, where values that are not positive leave gaps, and x axis, where all
+        values must be positive.
     """
 
     about: str
@@ -57,6 +58,7 @@ class Chart:
     tick: Callable[[float], str] = "{:g}".format
     log: bool = False
     marks: Sequence[Mark] = field(default=())
+    log_x: bool = False
 
 
 def draw(chart: Chart, width: float, height: float) -> str:
@@ -71,13 +73,20 @@ def draw(chart: Chart, width: float, height: float) -> str:
     ys = [y for line in points for _, y in line] or [1.0]
     ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(min(0.0, *ys), max(0.0, *ys), 5)
     low, high = (f(f(ticks), f(ys)) for f in (min, max))
-    x_ticks = _ticks(min(xs), max(xs), max(2, int((width - _LEFT - right) / 62)))
+    scaled: Callable[[float], float] = math.log10 if chart.log_x else float
+    left_end, right_end = scaled(min(xs)), scaled(max(xs))
+    x_ticks = (
+        _log_ticks(min(xs), max(xs))
+        if chart.log_x
+        else _ticks(min(xs), max(xs), max(2, int((width - _LEFT - right) / 62)))
+    )
     x_ticks = [x for x in x_ticks if min(xs) <= x <= max(xs)]
     lower = _TOP + _LINE + (_LINE if chart.marks else 0.0)
     bottom = height - _LINE * (1.6 + max(chart.tick(x).count("\n") + 1 for x in x_ticks))
 
     def at_x(x: float) -> float:
-        return _LEFT + (x - min(xs)) / ((max(xs) - min(xs)) or 1.0) * (width - _LEFT - right)
+        share = (scaled(x) - left_end) / ((right_end - left_end) or 1.0)
+        return _LEFT + share * (width - _LEFT - right)
 
     def at_y(y: float) -> float:
         a, b, c = (math.log10(v) for v in (low, y, high)) if chart.log else (low, y, high)

@@ -1,0 +1,1 @@
+"""Add-on controllers of closed-loop machines: options, design, figures, page, commands."""
