@@ -87,9 +87,14 @@ def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> S
     Raises
     ------
     ModelError
-        If the column is dead, or too few bins are left.
+        If the column is missing or dead, or too few bins are left.
     """
     f, bin_hz = _bins(spectrum.f_hz)
+    if column not in spectrum.psd:
+        raise ModelError(
+            f"{spectrum.source}: no column of the sensor's axis {column!r}, only "
+            f"{', '.join(spectrum.psd)}; give another sensor_axis"
+        )
     psd = spectrum.psd[column]
     use = (f >= _LOWEST_HZ) & (f <= excitation.f_end_hz - _BELOW_END_HZ)
     use &= f >= excitation.f_start_hz + bin_hz

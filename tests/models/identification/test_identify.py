@@ -1,0 +1,384 @@
+"""From measurements to plants and schedules: which file counts for what, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import date
+
+import numpy as np
+import pytest
+
+from models.errors import ModelError
+from models.identification.conditions import Condition
+from models.identification.identify import Measured, identify
+from models.identification.readers import ReadSettings, read_content
+from models.identification.synthetic import Sensor
+from models.identification.types import (
+    AxisIdentification,
+    FrequencyResponse,
+    Measurement,
+    PlantModel,
+)
+from models.plants import PairsSpec, PolePair, frequency_response
+from models.schedule import AxisSchedule, MassSchedule
+from service.identification.run import InputFile
+from tests.models.identification.recordings import (
+    LEGACY,
+    QUICK,
+    QUICK_SETTINGS,
+    one_mode,
+    quick_raw,
+    spectrum_file,
+)
+
+SETTINGS = ReadSettings.model_validate(QUICK_SETTINGS)
+F_HZ = np.linspace(6.0, 150.0, 300)
+
+
+def read(*files: InputFile, settings: ReadSettings = SETTINGS) -> list[Measured]:
+    return [
+        Measured(measurement, file.condition)
+        for file in files
+        for measurement in read_content(file.content, file.name, settings=settings)
+    ]
+
+
+def one(*files: InputFile, settings: ReadSettings = SETTINGS) -> AxisIdentification:
+    (found,) = identify(read(*files, settings=settings), settings).values()
+    return found
+
+
+def response(plant: PairsSpec, *, axis: str = "x", source: str = "frf.csv") -> FrequencyResponse:
+    rng = np.random.default_rng(0)
+    g = frequency_response(plant, F_HZ)
+    noise = 1e-3 * (rng.normal(size=len(g)) + 1j * rng.normal(size=len(g)))
+    sd = np.full(len(g), np.nan)
+    return FrequencyResponse(F_HZ, g + noise, sd, np.ones(len(g)), axis, "", source)
+
+
+def at(measurement: Measurement, condition: str = "") -> Measured:
+    return Measured(measurement, Condition.parse(condition))
+
+
+def main_mode(found: AxisIdentification) -> float:
+    assert found.fit is not None
+    return max(found.fit.modes, key=lambda m: m.peak).f_hz
+
+
+def two_modes(bed_hz: float, frame_hz: float = 60.0) -> PairsSpec:
+    return PairsSpec(
+        poles=(PolePair(f_hz=bed_hz, zeta=0.06), PolePair(f_hz=frame_hz, zeta=0.08)),
+    )
+
+
+def mass_of(found: AxisIdentification) -> MassSchedule:
+    assert found.schedule is not None
+    assert found.schedule.mass is not None
+    return found.schedule.mass
+
+
+# Which file counts for what
+
+
+def test_files_go_to_their_axes() -> None:
+    x, y = quick_raw("x"), quick_raw("y", name="20251224_120000")
+    sources = [file.source for file in (x, y)]
+    found = identify(read(x, y), SETTINGS, sources=sources)
+    assert list(found) == ["x", "y"]
+    for axis, file, f_hz, day in (
+        ("x", x, 42.0, date(2026, 1, 1)),
+        ("y", y, 35.0, date(2025, 12, 24)),
+    ):
+        about = found[axis].plants.provenance  # type: ignore[index]
+        assert about is not None
+        assert (about.kind, about.sources, about.measured_on) == ("raw log", (file.source,), day)
+        assert main_mode(found[axis]) == pytest.approx(f_hz, rel=1e-3)  # type: ignore[index]
+    assert all(len(one.plants.weighted_members()) == 9 for one in found.values())
+
+
+def test_the_best_kind_is_used_and_the_others_are_named() -> None:
+    raw = quick_raw("x", one_mode(42.0, 0.06))
+    psd = spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0))
+    found = one(psd, raw)
+    assert main_mode(found) == pytest.approx(42.0, rel=1e-3)
+    assert found.plants.provenance is not None
+    assert found.plants.provenance.kind == "raw log"
+    told = [n for n in found.notes if n.startswith(psd.name)]
+    assert told == [f"{psd.name}: not used, because a raw log of axis x says more"]
+
+
+def test_a_model_goes_before_measurements() -> None:
+    spec = one_mode(61.0, 0.05)
+    found = identify([at(response(one_mode(40.0, 0.05))), at(PlantModel(spec, "x", "m.json"))])
+    assert found["x"].plants.nominal == spec
+    assert found["x"].fit is None
+    with pytest.raises(ModelError, match=r"axis x: 2 models \(a.json, b.json\); give one"):
+        identify([at(PlantModel(spec, "x", name)) for name in ("a.json", "b.json")])
+
+
+def test_assumptions_are_noted_by_file() -> None:
+    assert any(
+        note.startswith("raw_data_x_20260101_120000.csv: assumed accel_per_hz_mm_s 60")
+        for note in one(quick_raw("x")).notes
+    )
+
+
+@pytest.mark.parametrize(
+    ("axis", "words"),
+    [
+        (None, "f.csv: neither the file nor its name says which axis"),
+        ("1.000,1.000", "f.csv: measured along 1.000,1.000, which moves both axes"),
+        ("z", "f.csv: axis 'z' is not a direction of the plane"),
+    ],
+)
+def test_an_axis_that_cannot_be(axis: str | None, words: str) -> None:
+    measured = replace(response(one_mode(40.0, 0.05), source="f.csv"), axis=axis)
+    with pytest.raises(ModelError, match=words):
+        identify([at(measured)])
+    if axis is None:
+        assert list(identify([at(measured)], ReadSettings(axis="y"))) == ["y"]
+
+
+def test_nothing_to_identify() -> None:
+    with pytest.raises(ModelError, match="nothing to identify"):
+        identify([])
+
+
+# Level and mounting
+
+
+def test_a_level_that_only_the_fit_shows() -> None:
+    """So weak that nothing is coherent from 8 to 15 Hz: not taken for a measurement."""
+    weak = Sensor(rate_hz=500.0, noise_mm_s2=20.0, gain=0.02)
+    with pytest.raises(ModelError, match=r"raw_data_x.*0\.02 times as much .*measure at the part"):
+        one(quick_raw("x", sensor=weak))
+
+
+def test_axes_of_the_sensor_that_seem_exchanged() -> None:
+    swapped = Sensor(rate_hz=500.0, rotation=((0, 1, 0), (1, 0, 0), (0, 0, -1)))
+    files = [quick_raw(axis, sensor=swapped) for axis in "xy"]
+    for axis, found in identify(read(*files), SETTINGS).items():
+        other = {"x": "y", "y": "x"}[axis]
+        (warning,) = found.warnings
+        assert f"the sensor's {other} moved in the test of axis {axis}" in warning
+    said = SETTINGS.model_copy(update={"sensor_axis": "y"})
+    assert one(files[0], settings=said).warnings == ()
+    with pytest.raises(ModelError, match="another axis was measured"):
+        one(files[0], settings=SETTINGS.model_copy(update={"sensor_axis": "x"}))
+
+
+def test_one_axis_measured_twice() -> None:
+    files = [quick_raw("x"), quick_raw("y", sensor=Sensor(rate_hz=500.0, rotation=TURNED_ROUND_Z))]
+    with pytest.raises(ModelError, match=r"raw_data_x_.*, raw_data_y_.*: .*measured twice"):
+        identify(read(*files), SETTINGS)
+    turned = SETTINGS.model_copy(update={"sensor_turned": True})
+    assert list(identify(read(*files), turned)) == ["x", "y"]
+
+
+TURNED_ROUND_Z = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_delays_of_responses_are_compared() -> None:
+    late = response(one_mode(40.0, 0.05), axis="y")
+    shifted = replace(late, response=late.response * np.exp(-2j * np.pi * F_HZ * 1e-3))
+    found = identify([at(response(one_mode(40.0, 0.05))), at(shifted)])
+    assert all(
+        any("delays of the axes differ by 1.0" in w for w in a.warnings) for a in found.values()
+    )
+
+
+# A weight on the bed
+
+
+def loaded(kg: float, f_hz: float = 35.0, zeta: float = 0.08, m0_kg: float = 0.8) -> PairsSpec:
+    """Stiffness and viscous damping stay."""
+    factor = 1.0 / math.sqrt(1.0 + kg / m0_kg)
+    return one_mode(f_hz * factor, zeta * factor)
+
+
+@pytest.mark.parametrize("condition", ["+0.5kg", "+500g"])
+def test_moving_mass_from_two_raw_logs(condition: str) -> None:
+    found = one(quick_raw("y", loaded(0.0)), quick_raw("y", loaded(0.5), condition=condition))
+    mass = mass_of(found)
+    assert mass.moving_mass_kg == pytest.approx(0.8, rel=0.01)
+    assert mass.modes == (0,)
+    assert main_mode(found) == pytest.approx(35.0, rel=1e-3)  # the empty bed's
+    (note,) = [n for n in found.notes if "lowered" in n]
+    assert note.startswith("0.5 kg on the bed lowered 35.00 Hz to 27.4")
+    # The schedule's own plant with the weight is the one that was measured with it.
+    heavy = mass.loaded(found.plants.nominal, 0.5)
+    f = np.linspace(6.0, 60.0, 100)
+    truth = frequency_response(loaded(0.5), f)
+    assert np.max(np.abs(frequency_response(heavy, f) - truth)) < 0.02 * np.max(np.abs(truth))
+
+
+def test_a_second_weight_checks_the_first() -> None:
+    runs = [quick_raw("y", loaded(kg), condition=f"+{kg}kg") for kg in (0.2, 0.5)]
+    found = one(quick_raw("y", loaded(0.0)), *runs)
+    assert mass_of(found).moving_mass_kg == pytest.approx(0.8, rel=0.01)
+    assert "0.2 kg on the bed: 31.30 Hz, by that mass 31.30 Hz" in found.notes
+
+
+def test_repeats_with_a_weight_are_one_run() -> None:
+    runs = [
+        quick_raw("y", loaded(0.5), seed=1, condition="+0.5kg"),
+        quick_raw("y", loaded(0.5), seed=2, condition="+500g"),
+    ]
+    found = one(quick_raw("y", loaded(0.0)), *runs)
+    assert len([n for n in found.notes if "on the bed" in n]) == 1
+    assert len(found.measured) == 3
+
+
+def test_the_mode_of_the_bed_is_found_among_others() -> None:
+    """Also when the weight brings it below the frame's, which stays."""
+    bed_below = identify([at(response(two_modes(35.0))), at(response(two_modes(28.0)), "+0.45kg")])
+    assert mass_of(bed_below["x"]).modes == (0,)
+    assert mass_of(bed_below["x"]).moving_mass_kg == pytest.approx(0.8, rel=0.01)
+    bed_above = identify(
+        [at(response(two_modes(60.0, 38.0))), at(response(two_modes(50.0, 38.0)), "+0.352kg")]
+    )
+    assert mass_of(bed_above["x"]).modes == (1,)
+    assert mass_of(bed_above["x"]).moving_mass_kg == pytest.approx(0.8, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("runs", "words"),
+    [
+        ([("+0.5kg", 27.5)], "axis x: every run has a weight on the bed"),
+        ([("", 27.5), ("+0.5kg", 35.0)], "axis x: with 0.5 kg .* were the runs swapped"),
+        ([("", 42.0), ("+0.5kg", 41.9)], "axis x: .* is lost in the scatter .* heavier weight"),
+    ],
+)
+def test_weights_that_tell_nothing(runs: list[tuple[str, float]], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        identify([at(response(one_mode(f, 0.06)), condition) for condition, f in runs])
+
+
+# Places
+
+
+def placed(places: Iterable[tuple[str, float]]) -> list[InputFile]:
+    return [quick_raw("x", one_mode(f, 0.06), condition=where) for where, f in places]
+
+
+def test_heights_make_a_grid() -> None:
+    found = one(*placed([("z=200", 40.0), ("z=0", 44.0), ("z=100", 42.0)]))
+    assert found.schedule is not None
+    grid = found.schedule.grid
+    assert grid is not None
+    assert [node.z_mm for node in grid.nodes] == [0.0, 100.0, 200.0]
+    for node, f_hz in zip(grid.nodes, (44.0, 42.0, 40.0), strict=True):
+        assert isinstance(node.plant, PairsSpec)
+        assert node.plant.poles[0].f_hz == pytest.approx(f_hz, rel=1e-3)
+    assert main_mode(found) == pytest.approx(42.0, rel=1e-3)  # the middle one's
+    assert len(found.measured) == 3
+
+
+def test_repeats_at_places_are_one_node_each() -> None:
+    files = placed([("x=50", 40.0), ("x=250", 44.0)])
+    again = quick_raw("x", one_mode(40.0, 0.06), seed=5, condition="x=50.0")
+    found = one(*files, again)
+    assert found.schedule is not None
+    assert found.schedule.grid is not None
+    assert len(found.schedule.grid.nodes) == 2
+
+
+def test_members_follow_the_grid() -> None:
+    """Runs of several strengths would be listed one by one, which a grid cannot move."""
+    found = one(
+        quick_raw("x", one_mode(41.0, 0.06), condition="weak"),
+        quick_raw("x", one_mode(44.0, 0.06), condition="strong"),
+        *placed([("z=0", 44.0), ("z=200", 40.0)]),
+    )
+    assert isinstance(found.schedule, AxisSchedule)
+    assert len(found.plants.weighted_members()) == 9
+    assert any("spread about the plant of each place" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        (["z=20"], r"axis x: measured at one place only \(z=20\): measure at another"),
+        (["x=0,y=0", "x=0,y=100", "x=100,y=0"], "axis x: .* no node at x 100, y 100 mm"),
+        (["z=0", "x=100"], "axis x: .* lacks"),
+    ],
+)
+def test_places_that_make_no_grid(places: list[str], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        identify([at(response(one_mode(40.0, 0.06)), place) for place in places])
+
+
+# Labels
+
+
+def test_labels_are_members_and_repeats_are_one() -> None:
+    three = [quick_raw("x", one_mode(40.0, 0.06), seed=k) for k in range(3)]
+    far = [quick_raw("x", one_mode(44.0, 0.06), seed=k, condition="far") for k in (3, 4)]
+    found = one(*three, *far)
+    assert len(found.measured) == 5
+    assert len(found.member_fits) == 2
+    assert len(found.plants.weighted_members()) == 3
+
+
+def test_at_most_fifteen_members() -> None:
+    plants = [one_mode(f, 0.06) for f in np.linspace(36.0, 46.0, 20)]
+    found = identify([at(response(p), f"run {k}") for k, p in enumerate(plants)])
+    assert len(found["x"].plants.weighted_members()) == 15
+
+
+def test_repeats_only_are_spread_by_experience() -> None:
+    found = one(*(quick_raw("x", seed=k) for k in range(3)))
+    assert found.member_fits == ()
+    assert len(found.plants.weighted_members()) == 9
+
+
+def test_strengths_of_the_test_are_operating_points() -> None:
+    weak = replace(QUICK, accel_per_hz_mm_s=40.0)
+    measured = [*read(quick_raw("x", one_mode(44.0, 0.06), test=weak))]
+    settings = SETTINGS.model_copy(update={"accel_per_hz_mm_s": 40.0})
+    assert [r.label for r in identify(measured, settings)["x"].measured if r.label] == ["40 mm/s"]
+
+
+# Spectra
+
+
+def test_spectra_of_different_tests_have_no_mean() -> None:
+    files = [
+        spectrum_file(one_mode(50.0, 0.06), LEGACY, name="20230101_120000"),
+        spectrum_file(one_mode(50.0, 0.06), name="20260101_120000"),
+    ]
+    with pytest.raises(ModelError, match="axis x: the spectra come from different tests"):
+        one(*files, settings=ReadSettings())
+
+
+# Progress
+
+
+def test_progress_rises_from_nothing_to_all() -> None:
+    seen: list[tuple[str, float]] = []
+    files = [quick_raw("x"), quick_raw("x", seed=2, condition="far"), quick_raw("y")]
+    spare = spectrum_file(one_mode(50.0, 0.06), QUICK, sensor=Sensor(rate_hz=1600.0))
+    identify(read(*files, spare), SETTINGS, progress=lambda what, part: seen.append((what, part)))
+    parts = [part for _, part in seen]
+    assert parts == sorted(parts)
+    assert parts[0] < 0.1
+    assert seen[-1] == ("done", 1.0)
+    assert all(0.0 <= part <= 1.0 for part in parts)
+    assert any(what == "axis y: raw_data_y_20260101_120000.csv, estimate" for what, _ in seen)
+
+
+def test_whoever_listens_can_stop_it() -> None:
+    def stop(what: str, _: float) -> None:
+        if "fitting" in what:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        identify(read(quick_raw("x")), SETTINGS, progress=stop)
+
+
+def test_same_files_same_plants() -> None:
+    files = [quick_raw("x"), quick_raw("y")]
+    first, again = (identify(read(*files), SETTINGS) for _ in range(2))
+    assert [a.plants for a in first.values()] == [a.plants for a in again.values()]
