@@ -24,6 +24,7 @@ from models.plants import PairsSpec, PlantSpec, PolePair
 from service.identification.run import InputFile
 
 __all__ = [
+    "BROKEN",
     "LEGACY",
     "QUICK",
     "QUICK_OPTIONS",
@@ -114,53 +115,69 @@ def _written(write: Callable[[Path], Path], condition: str) -> InputFile:
         return InputFile(path.name, path.read_bytes(), Condition.parse(condition))
 
 
-def broken() -> dict[str, tuple[list[InputFile], list[str]]]:
-    """Files by what is wrong with them, with words of the message they must get."""
+def broken(what: str) -> list[InputFile]:
+    """Files that `what` of `BROKEN` is wrong with."""
     whole = quick_raw("x")
     rows = table(whole)
-
-    def of(lines: list[bytes], name: str = whole.name) -> list[InputFile]:
-        return [InputFile(name, b"".join(lines))]
-
-    def column(value: bytes) -> list[bytes]:
-        parts = [row.split(b",") for row in rows[1:]]
-        return [rows[0], *(b",".join([p[0], value, *p[2:]]) for p in parts)]
-
-    moved = quick_log("x", seed=1)
-    two = quick_log("x", seed=2, start_s=float(moved.time_s[-1]) + 1.002)
-    # Between the two nothing is missing: the first one's rest is made as long as the pause.
-    gap = np.arange(moved.time_s[-1] + 0.002, two.time_s[0] - 0.001, 0.002)
-    rest = np.tile(moved.accel_mm_s2[-1], (len(gap), 1))
-    twice = AccelerationLog(
-        np.concatenate([moved.time_s, gap, two.time_s]),
-        np.concatenate([moved.accel_mm_s2, rest, two.accel_mm_s2]),
-        "x",
-    )
-    m956 = [b"Sample,X,Y,Z\n"]
-    for i, a in enumerate(moved.accel_mm_s2 / 9806.65):
-        m956.append(f"{i},{a[0]:.3f},{a[1]:.3f},{a[2]:.3f}\n".encode())
-    m956.append(b"Rate 500, overflows 3\n")
-    same = [whole, raw_file(replace(quick_log("x", seed=3), axis="y"))]
-    other = quick_log("x", sensor=Sensor(rate_hz=500.0, noise_mm_s2=20.0, gain=0.02))
-    return {
-        "other axis measured": (same, ["same axis was measured twice", "measure the other"]),
-        "sensor elsewhere": ([raw_file(other)], ["does not move with", "measure at the part"]),
-        "dead column": (of(column(b"12.500000")), ["x is dead", "check the sensor"]),
-        "gap": (of(rows[:4000] + rows[4010:]), ["gap in time", "line 4001", "Measure again"]),
-        "overflow": (of(m956, "accel_x.csv"), ["overflowed 3 times", "record again"]),
-        "overflow of klipper": (
-            of([b"## overflows: 7\n", *rows]),
-            ["overflowed 7 times", "record again"],
-        ),
-        "accel_per_hz": (
-            [quick_raw("x", test=replace(QUICK, accel_per_hz_mm_s=75.0))],
-            ["1.25 times", "accel_per_hz = 75", "printer.cfg"],
-        ),
-        "empty": (of([]), ["empty"]),
-        "truncated": (of(rows[:8000]), ["ends", "record the whole"]),
-        "other sweep": (
-            [quick_raw("x", test=replace(QUICK, hz_per_s=1.0, f_end_hz=35.0))],
-            ["the test is not in the log", "hz_per_sec"],
-        ),
-        "two tests": ([raw_file(twice)], ["more than one test", "give a log of one test"]),
+    made: dict[str, Callable[[], list[InputFile]]] = {
+        "same axis twice": lambda: [whole, raw_file(replace(quick_log("x", seed=3), axis="y"))],
+        "sensor elsewhere": lambda: [quick_raw("x", sensor=replace(QUICK_SENSOR, gain=0.02))],
+        "sensor at rest": lambda: [quick_raw("x", sensor=replace(QUICK_SENSOR, gain=0.0))],
+        "dead column": lambda: _of(rows[:1] + [_constant(row) for row in rows[1:]]),
+        "gap": lambda: _of(rows[:4000] + rows[4010:]),
+        "overflow of M956": lambda: _of(_m956(quick_log("x")), "accelerations_x.csv"),
+        "overflow of Klipper": lambda: _of([b"## overflows: 7\n", *rows]),
+        "accel_per_hz": lambda: [quick_raw("x", test=replace(QUICK, accel_per_hz_mm_s=75.0))],
+        "empty": lambda: _of([]),
+        "cut off": lambda: _of(rows[:8000]),
+        "other sweep": lambda: [quick_raw("x", test=replace(QUICK, hz_per_s=1.0, f_end_hz=35.0))],
+        "two tests": lambda: [raw_file(_two_tests())],
+        "of nothing known": lambda: _of([b"a,b\n", b"1,2\n", b"3,4\n"]),
     }
+    return made[what]()
+
+
+BROKEN = {
+    "same axis twice": ["same axis was measured twice", "measure the other"],
+    "sensor elsewhere": ["0.02 times as much", "measure at the part"],
+    "sensor at rest": ["does not move with the tested axis", "measure at the part"],
+    "dead column": ["x is dead", "check the sensor"],
+    "gap": ["line 4001: gap in time", "10 samples are missing", "Measure again"],
+    "overflow of M956": ["overflowed 3 times", "record again"],
+    "overflow of Klipper": ["overflowed 7 times", "record again"],
+    "accel_per_hz": ["1.25 times as much", "looks like accel_per_hz = 74.8", "printer.cfg"],
+    "empty": ["the file is empty"],
+    "cut off": ["the log ends", "before the end of the test", "record the whole test"],
+    "other sweep": ["the test is not in the log", "check min_freq, max_freq, hz_per_sec"],
+    "two tests": ["more than one test", "give a log of one test"],
+    "of nothing known": ["not a known format", "'a,b'"],
+}
+"""What is wrong with files, and words of the message that each must get."""
+
+
+def _of(rows: list[bytes], name: str = "raw_data_x_20260101_120000.csv") -> list[InputFile]:
+    return [InputFile(name, b"".join(rows))]
+
+
+def _constant(row: bytes) -> bytes:
+    time, _, *rest = row.split(b",")
+    return b",".join([time, b"12.500000", *rest])
+
+
+def _m956(log: AccelerationLog) -> list[bytes]:
+    rows = [
+        "{},{:.3f},{:.3f},{:.3f}\n".format(i, *a).encode()
+        for i, a in enumerate(log.accel_mm_s2 / 9806.65)
+    ]
+    return [b"Sample,X,Y,Z\n", *rows, b"Rate 500, overflows 3\n"]
+
+
+def _two_tests() -> AccelerationLog:
+    """One after the other, without a gap."""
+    first = quick_log("x", seed=1, tail_s=2.0)
+    second = quick_log("x", seed=2, start_s=float(first.time_s[-1]) + 0.502)
+    rows = [
+        np.concatenate(pair)
+        for pair in ((first.time_s, second.time_s), (first.accel_mm_s2, second.accel_mm_s2))
+    ]
+    return AccelerationLog(rows[0], rows[1], "x")
