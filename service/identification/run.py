@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+from pydantic import ValidationError
 
 from models.errors import ModelError
 from models.identification.conditions import Condition
@@ -19,6 +20,7 @@ from models.machine import Machine
 from models.plants import PlantSpec
 from models.provenance import SourceFile
 from models.schedule import AxisSchedule, MassSchedule, resonances_hz
+from models.store import explain
 from service.identification.figures import IdentificationReport
 from service.identification.report import identification_report
 
@@ -95,7 +97,7 @@ def identify_files(
     Raises
     ------
     ModelError
-        If a file cannot be used; the message names it.
+        If a file cannot be used (the message names it), or its plants do not fit the machine.
     """
     settings = settings or ReadSettings()
     measured: list[Measured] = []
@@ -179,4 +181,7 @@ def _with_plants(
         document.update(name=name, title=title or f"{base.title}, measured")
     elif title is not None:
         document["title"] = title
-    return Machine.model_validate(document)
+    try:
+        return Machine.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"machine {document['name']!r:.80}: {explain(error)}") from None

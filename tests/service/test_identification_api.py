@@ -1,0 +1,197 @@
+"""Measurements over HTTP: a revision with its figures, or a problem and nothing at all."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from models.machine import Machine
+from models.plants import PairsSpec
+from service.api import create_app
+from service.identification.figures import IdentificationReport
+from service.identification.run import InputFile
+from service.settings import Settings
+from tests.models.identification.recordings import (
+    BROKEN,
+    QUICK_QUERY,
+    TAZ,
+    broken,
+    one_mode,
+    quick_raw,
+)
+from tests.service.machines import make_machine
+from tests.service.runners import pretend
+from tests.service.test_api import assert_problem
+
+MINE = "/v1/machines/mine"
+MEASUREMENTS = f"{MINE}/measurements"
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def client(data: Path) -> Iterator[TestClient]:
+    """With a machine `mine`."""
+    app = create_app(Settings(data_dir=data), runner=pretend)
+    with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as opened:
+        machine = make_machine(kinematics="cartesian")
+        made = opened.put(MINE, content=machine.model_dump_json(), params={"author": "anna"})
+        assert made.status_code == 201, made.text
+        yield opened
+
+
+def post(client: TestClient, *files: InputFile, where: str = MEASUREMENTS, **more: Any) -> Any:
+    parts = []
+    for file in files:
+        label = file.condition.label
+        parts.append(("file", (f"{file.name}@{label}" if label else file.name, file.content)))
+    return client.post(where, files=parts, params=QUICK_QUERY | more)
+
+
+def kept(data: Path) -> dict[str, bytes]:
+    """Machines and identifications; the job database writes as it likes."""
+    return {
+        str(p.relative_to(data)): p.read_bytes()
+        for folder in ("machines", "identifications")
+        for p in (data / folder).rglob("*")
+        if p.is_file()
+    }
+
+
+def test_a_revision_with_its_figures(client: TestClient) -> None:
+    before = client.get(MINE).headers["etag"].strip('"')
+    files = [quick_raw("x"), quick_raw("y")]
+    answer = post(client, *files, author="anna", message="new belts")
+    assert answer.status_code == 201, answer.text
+    document = answer.json()
+    assert answer.headers["location"] == f"{MINE}/revisions/2"
+    revision = document["revision"]
+    assert (revision["number"], revision["author"]) == (2, "anna")
+    assert revision["message"] == "new belts"
+    assert [s["name"] for s in revision["sources"]] == [file.name for file in files]
+    report = IdentificationReport.model_validate(document["report"])
+    assert report.base_revision == before
+    machine = Machine.model_validate(client.get(MINE).json())
+    assert machine.revision == report.machine_revision
+    plant = machine.axes["x"].nominal
+    assert isinstance(plant, PairsSpec)
+    assert plant.poles[0].f_hz == pytest.approx(42.0, rel=1e-3)
+
+    found = client.get(f"{MINE}/identification")
+    assert IdentificationReport.model_validate(found.json()) == report
+    assert b"NaN" not in found.content
+    page = client.get(f"{MINE}/identification.html")
+    assert page.headers["content-type"].startswith("text/html")
+    assert "Axis X, strongest mode" in page.text
+    # Of another state nothing is known.
+    client.post(f"{MINE}/revisions/1/rollback")
+    assert_problem(client.get(f"{MINE}/identification"), 404, "/measurements")
+    assert_problem(client.get(f"{MINE}/identification.html"), 404)
+
+
+def test_a_trial_stores_nothing(client: TestClient, data: Path) -> None:
+    before = kept(data)
+    answer = post(client, quick_raw("x"), trial=True)
+    assert (answer.status_code, answer.json()["revision"]) == (200, None)
+    assert answer.json()["report"]["axes"][0]["modes"][0]["f_hz"] == pytest.approx(42.0, rel=1e-3)
+    assert kept(data) == before
+
+
+def test_a_new_machine_from_a_base(client: TestClient) -> None:
+    where = "/v1/machines/new/measurements"
+    assert_problem(post(client, quick_raw("x"), where=where), 404, "base")
+    assert post(client, quick_raw("x"), where=where, base="ender3").status_code == 201
+    machine = Machine.model_validate(client.get("/v1/machines/new").json())
+    assert machine.name == "new"
+    bad = "/v1/machines/Not%20Good/measurements"
+    assert_problem(post(client, quick_raw("x"), where=bad, base="ender3"), 422)
+
+
+def test_conditions_follow_the_name(client: TestClient) -> None:
+    heavy = quick_raw("y", one_mode(35.0 / 1.625**0.5, 0.08 / 1.625**0.5), condition="+0.5kg")
+    assert post(client, quick_raw("y"), heavy).status_code == 201
+    mass = Machine.model_validate(client.get(MINE).json()).schedules["y"].mass
+    assert mass is not None
+    assert mass.moving_mass_kg == pytest.approx(0.8, rel=0.01)
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_broken_files_leave_the_store_as_it_was(what: str, client: TestClient, data: Path) -> None:
+    files = broken(what)
+    before = kept(data)
+    assert_problem(post(client, *files), 422, files[0].name, *BROKEN[what])
+    assert kept(data) == before
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ({"axis": "q"}, ["axis 'q'"]),
+        ({"accel_per_hz": -1}, ["accel_per_hz"]),
+        ({"accel_per_hz": "nan"}, ["accel_per_hz"]),
+        ({"min_freq": 90}, ["f_start_hz 90"]),
+        ({"firmware_date": "soon"}, ["firmware_date"]),
+        ({"sensor_axis": "q"}, ["sensor_axis"]),
+        ({"max_order": 9}, ["max_order"]),
+    ],
+)
+def test_bad_parameters(
+    client: TestClient, data: Path, query: dict[str, Any], words: list[str]
+) -> None:
+    before = kept(data)
+    assert_problem(post(client, quick_raw("x"), **query), 422, *words)
+    assert kept(data) == before
+
+
+def test_who_and_why_are_text(client: TestClient) -> None:
+    assert_problem(post(client, quick_raw("x"), author="a\x1b"), 422, "author")
+    assert len(client.get(f"{MINE}/revisions").json()["revisions"]) == 1
+
+
+def test_what_is_no_form(client: TestClient, data: Path) -> None:
+    before = kept(data)
+    plain = client.post(MEASUREMENTS, content=b"#time,accel_x")
+    assert_problem(plain, 422, "multipart/form-data")
+    typed = {"content-type": "multipart/form-data; boundary=x"}
+    for body in (b"", b"--x\r\n", b"--x--\r\n", b"\x00" * 100):
+        assert client.post(MEASUREMENTS, content=body, headers=typed).status_code == 422
+    bare = {"content-type": "multipart/form-data"}
+    assert_problem(client.post(MEASUREMENTS, content=b"", headers=bare), 422)
+    assert_problem(client.post(MEASUREMENTS, files={"note": (None, "text")}), 422, "no file")
+    many = [quick_raw("x")] + [InputFile(f"{k}.csv", b"") for k in range(40)]
+    assert_problem(post(client, *many), 422, "40")
+    assert kept(data) == before
+
+
+def test_names_of_files_are_only_names(client: TestClient, data: Path) -> None:
+    before = kept(data)
+    for name in ("../../raw_data_x_1.csv", "C:\\raw_data_x_1.csv", "raw_data_x_\n1.csv"):
+        answer = post(client, InputFile(name, quick_raw("x").content), trial=True)
+        assert answer.status_code == 200, answer.text
+        (source,) = answer.json()["report"]["sources"]
+        assert not set(source["name"]) & set("/\\\n")
+    assert kept(data) == before
+
+
+def test_a_printed_model_is_repaired_on_request(client: TestClient) -> None:
+    file = InputFile("taz_x.json", TAZ.encode())
+    assert_problem(post(client, file), 422, "integrator", "repair_rounding")
+    answer = post(client, file, repair_rounding=True)
+    assert answer.status_code == 201, answer.text
+    notes = json.dumps(answer.json()["report"]["axes"][0]["notes"])
+    assert "-4.54 to -4.53995" in notes
+
+
+def test_a_damaged_archive_is_told(client: TestClient, data: Path) -> None:
+    assert post(client, quick_raw("x")).status_code == 201
+    (file,) = (data / "identifications").iterdir()
+    file.write_text("{")
+    assert_problem(client.get(f"{MINE}/identification"), 422, file.name, "damaged")
