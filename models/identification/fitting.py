@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from models.identification.averaging import mean_response
+from models.identification.averaging import low_frequency_delay, mean_response
 from models.identification.mode_estimates import (
     band_warnings,
     filler_poles,
@@ -42,14 +42,24 @@ _EXPLAINED = 1.3
 _NO_WORSE = 1.05
 """What may be lost for a model that is minimum phase, or has a pair less."""
 _ZERO_BAND = 0.8
-"""Zeros above this share of the band trade off with the delay: taken as minimum phase."""
-_DELAY_SPAN_S = 1.5e-3
+"""Zeros above this share of the band trade off with the delay: to be non-minimum phase they must
+pay like a pair of poles, and beyond the band nothing proves it."""
+_EARLIER_S = 25e-3
+"""The delay that the phase's slope shows has the plant's own in it, so the true one is earlier:
+2 zeta/w of every pole pair, 20 ms for two well damped ones at 20 Hz."""
+_LATER_S = 2e-3
 _DELAY_STEP_S = 0.5e-3
-_MOST_DELAYS = 15
+_MOST_DELAYS = 80
+_APART_S = 1.5e-3
 _START_POINTS = 160
 _POLES_BAND = (0.5, 1.6)
-"""Poles and zeros may lie outside the band by these factors."""
+"""Poles may lie outside the band by these factors."""
+_ZEROS_BAND = (0.5, 10.0)
+"""Zeros so far above that there are as good as none."""
 _ZETA = (3e-3, 3.0)
+_TINY = 1e-9
+_FAR_ZERO = 3.0
+"""A real zero above this multiple of the band is hardly anything but a delay."""
 
 
 def fit_response(
@@ -93,7 +103,8 @@ def fit_response(
             progress(order / max_order)
         if tried[-1].nrmse < _EXPLAINED * data.noise:
             break
-    chosen = _calm_beyond(data, _without_fillers(data, _by_the_knee(tried, data.noise)))
+    chosen = _without_fillers(data, _by_the_knee(tried, data.noise))
+    chosen = _without_far_zero(data, _calm_beyond(data, chosen))
     trials = tuple(OrderTrial(c.structure.poles, c.nrmse) for c in tried)
     return replace(_as_fit(data, chosen), trials=trials)
 
@@ -113,8 +124,9 @@ def refit_response(
     data = response_data(measured, band_hz)
     structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
     theta = structure.parameters(like.spec)
-    start = _candidate(data, structure, theta, data.delay_s)
-    fitted = _polished(data, start, _sides(start))
+    ratio = data.response / structure.response(theta, data.f_hz)
+    start = _candidate(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
+    fitted = _polished(data, start, _sides(start), real_zero=like.spec.real_zero_tau_s != 0.0)
     return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
 
 
@@ -130,6 +142,10 @@ class _Candidate:
     @property
     def theta(self) -> Array:
         return self.vector[2:]
+
+    @property
+    def delay_s(self) -> float:
+        return float(self.vector[1] / (2 * np.pi * self.structure.unit_hz))
 
     def model(self, f_hz: Array) -> ComplexArray:
         nuisance = np.exp(self.vector[0] - 1j * f_hz / self.structure.unit_hz * self.vector[1])
@@ -157,25 +173,43 @@ def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -
 def _with_zeros_in_band(data: ResponseData, fit: _Candidate) -> _Candidate:
     """Mirror the zeros right of the imaginary axis that the measurement does not prove."""
     kept = np.zeros(fit.structure.size)
-    for _ in range(3):
-        beyond = (_sides(fit) < 0) & (_zero_hz(fit) > _ZERO_BAND * data.f_hz[-1])
-        if not beyond.any():
-            break
+    while (beyond := (_sides(fit) < 0) & (_zero_hz(fit) > data.f_hz[-1])).any():
         kept[beyond] = 1.0
         fit = _mirrored(data, fit, kept)
-    sides = _sides(fit)
-    if (sides < 0).any():
-        minimum_phase = _mirrored(data, fit, np.abs(sides))
-        if minimum_phase.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise):
-            return minimum_phase
+    zero_hz = _zero_hz(fit)
+    for zero in np.argsort(-zero_hz):
+        sides = _sides(fit)
+        if sides[zero] < 0:
+            sides[zero] = 1.0
+            mirrored = _mirrored(data, fit, sides)
+            if _stands(data, mirrored, fit, clearly=zero_hz[zero] > _ZERO_BAND * data.f_hz[-1]):
+                fit = mirrored
     return fit
+
+
+def _stands(data: ResponseData, simpler: _Candidate, fit: _Candidate, *, clearly: bool) -> bool:
+    """Whether the measurement does not tell a simpler fit from `fit`, or not `clearly`."""
+    share = 1 / _CLEARLY if clearly else _NO_WORSE
+    return simpler.nrmse < max(share * fit.nrmse, _EXPLAINED * data.noise)
 
 
 def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
     """Refit with the zeros kept at `sides` (+1: left half plane)."""
     vector = fit.vector.copy()
-    vector[2:][sides > 0] = np.abs(vector[2:][sides > 0])
+    turned = (sides > 0) & (fit.theta < 0)
+    vector[2:][turned] *= -1
+    # What a zero no longer delays, the delay takes over: of a pair 4 zeta/w, of a real one 2 tau.
+    vector[1] += 2 * float(np.sum(_zero_delay(fit)[turned]))
     return _polished(data, replace(fit, vector=vector), sides)
+
+
+def _zero_delay(fit: _Candidate) -> Array:
+    """Return what the zero at each parameter that holds its side delays slow motion by, or 0."""
+    tau, _, _, log_fz, zz = fit.structure.split(fit.theta)
+    out = np.zeros(fit.structure.size)
+    out[0] = abs(tau)
+    out[fit.structure.size - fit.structure.zeros :] = 2 * np.abs(zz) / np.exp(log_fz)
+    return out
 
 
 def _sides(fit: _Candidate) -> Array:
@@ -189,10 +223,12 @@ def _sides(fit: _Candidate) -> Array:
 def _zero_hz(fit: _Candidate) -> Array:
     """Return the frequency of the zero at each parameter that holds its side, else 0."""
     structure = fit.structure
-    tau, _, _, log_fz, _ = structure.split(fit.theta)
+    tau, _, _, log_fz, zz = structure.split(fit.theta)
     out = np.zeros(structure.size)
     out[0] = structure.unit_hz / max(abs(tau), 1e-9)
-    out[structure.size - structure.zeros :] = np.exp(log_fz) * structure.unit_hz
+    # Of two real zeros the slower one.
+    slower = np.where(np.abs(zz) > 1, np.abs(zz) - np.sqrt(np.maximum(zz**2 - 1, 0)), 1.0)
+    out[structure.size - structure.zeros :] = np.exp(log_fz) * structure.unit_hz * slower
     return out
 
 
@@ -211,21 +247,32 @@ def _without_fillers(data: ResponseData, fit: _Candidate) -> _Candidate:
     """Drop the pairs that are no resonances, unless the measurement needs them."""
     for pole in filler_poles(fit.structure, fit.theta) if fit.structure.poles > 1 else ():
         structure, theta = fit.structure.without(fit.theta, pole)
-        delay = fit.vector[1] / (2 * np.pi * data.unit_hz)
         smaller = _with_zeros_in_band(
-            data, _polished(data, _candidate(data, structure, theta, delay))
+            data, _polished(data, _candidate(data, structure, theta, fit.delay_s))
         )
-        if smaller.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise):
+        if _stands(data, smaller, fit, clearly=False):
             return _without_fillers(data, smaller)
     return fit
 
 
+def _without_far_zero(data: ResponseData, fit: _Candidate) -> _Candidate:
+    """Drop a real zero far above the band, which trades off with the delay that is set aside."""
+    if abs(fit.theta[0]) * data.f_hz[-1] * _FAR_ZERO > data.unit_hz:
+        return fit
+    sides = _sides(fit)
+    sides[0] = 0.0
+    without = _polished(data, fit, sides, real_zero=False)
+    no_worse = without.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise)
+    return without if no_worse else fit
+
+
 def _calm_beyond(data: ResponseData, fit: _Candidate) -> _Candidate:
-    """Refit if a pole pair above the band rings more than the measurement can tell."""
+    """Refit if a pole pair above the band rings, unless its flank shows clearly that it does."""
     least = fit.structure.least_damping(fit.theta, _ZETA[0], float(data.f_hz[-1]))
     if np.all(np.exp(fit.structure.split(fit.theta)[2]) >= least):
         return fit
-    return _polished(data, fit, _sides(fit), least)
+    calm = _polished(data, fit, _sides(fit), least)
+    return calm if _stands(data, calm, fit, clearly=True) else fit
 
 
 def _as_fit(data: ResponseData, found: _Candidate) -> Fit:
@@ -237,7 +284,7 @@ def _as_fit(data: ResponseData, found: _Candidate) -> Fit:
         spec=found.structure.spec(found.theta),
         residual=found.nrmse,
         gain=float(np.exp(found.vector[0])),
-        delay_s=float(found.vector[1] / (2 * np.pi * data.unit_hz)),
+        delay_s=found.delay_s,
         band_hz=data.band_hz,
         modes=modes,
         notes=(*data.notes, *band_warnings(modes, data.band_hz)),
@@ -245,7 +292,7 @@ def _as_fit(data: ResponseData, found: _Candidate) -> Fit:
 
 
 def _rational_starts(data: ResponseData, order: int) -> list[_Candidate]:
-    """Return the two best Sanathanan-Koerner fits over the delays, made stable."""
+    """Return the best Sanathanan-Koerner fit over the delays, and the best one away from it."""
     some = data.thinned(_START_POINTS)
     basis = polynomial_basis(np.asarray(1j * some.f_hz / data.unit_hz, np.complex128), 2 * order)
     structure = PairStructure(order, order - 1, data.unit_hz)
@@ -256,13 +303,14 @@ def _rational_starts(data: ResponseData, order: int) -> list[_Candidate]:
         theta = _pairs_theta(structure, b, a)
         if theta is not None:
             found.append(_judged(some, _candidate(some, structure, theta, float(delay))))
-    return sorted(found, key=lambda c: c.cost)[:2]
+    found.sort(key=lambda c: c.cost)
+    apart = [c for c in found if abs(c.delay_s - found[0].delay_s) > _APART_S]
+    return [*found[:1], *apart[:1]]
 
 
 def _delays(data: ResponseData) -> Array:
-    """Return delays to try: around the phase's slope and, the plant having its own, around 0."""
-    low = min(data.delay_s, 0.0) - _DELAY_SPAN_S
-    high = max(data.delay_s, 0.0) + _DELAY_SPAN_S
+    """Return delays to try: those before the phase's slope, and, should noise tilt that, 0."""
+    low, high = min(data.delay_s - _EARLIER_S, 0.0), max(data.delay_s, 0.0) + _LATER_S
     count = min(_MOST_DELAYS, 1 + round((high - low) / _DELAY_STEP_S))
     return np.linspace(low, high, count)
 
@@ -317,14 +365,19 @@ def _polished(
     start: _Candidate,
     sides: Array | None = None,
     least_zeta: Array | None = None,
+    *,
+    real_zero: bool = True,
 ) -> _Candidate:
     """Minimise the weighted error, the zeros kept at `sides` (0: free)."""
     structure, f = start.structure, data.f_hz
     least = np.full(structure.poles, _ZETA[0]) if least_zeta is None else least_zeta
-    low, high = structure.bounds((_POLES_BAND[0] * f[0], _POLES_BAND[1] * f[-1]), (least, _ZETA[1]))
+    poles_hz, zeros_hz = ((b[0] * f[0], b[1] * f[-1]) for b in (_POLES_BAND, _ZEROS_BAND))
+    low, high = structure.bounds(poles_hz, (least, _ZETA[1]), zeros_hz=zeros_hz)
     if sides is not None:
         low[sides > 0], high[sides < 0] = 1e-3, -1e-3
-    turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 5e-3)
+    if not real_zero:
+        low[0], high[0] = -_TINY, _TINY
+    turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 1.5 * _EARLIER_S)
     low, high = np.append([-7.0, -turns], low), np.append([7.0, turns], high)
 
     def residual(vector: Array) -> Array:
@@ -335,8 +388,12 @@ def _polished(
         slope = data.weight[:, None] * replace(start, vector=vector).gradient(f)
         return np.concatenate([slope.real, slope.imag])
 
-    inside = np.clip(start.vector, low + 1e-6, high - 1e-6)
+    margin = np.minimum(1e-6, 0.25 * (high - low))
+    inside = np.clip(start.vector, low + margin, high - margin)
     solution = least_squares(
         residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=60
     )
-    return _judged(data, replace(start, vector=np.asarray(solution.x, np.float64)))
+    vector = np.asarray(solution.x, np.float64)
+    if not real_zero:
+        vector[2] = 0.0
+    return _judged(data, replace(start, vector=vector))

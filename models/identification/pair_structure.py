@@ -119,18 +119,25 @@ class PairStructure:
         )
 
     def bounds(
-        self, f_hz: tuple[float, float], zeta: tuple[Array, float], *, minimum_phase: bool = False
+        self,
+        f_hz: tuple[float, float],
+        zeta: tuple[Array, float],
+        *,
+        zeros_hz: tuple[float, float] | None = None,
+        minimum_phase: bool = False,
     ) -> tuple[Array, Array]:
         """Return lowest and highest parameters for pairs within `f_hz` and damping `zeta`.
 
-        The least damping is given for every pole pair (`least_damping`).
+        The least damping is given for every pole pair (`least_damping`); zeros are within
+        `zeros_hz` if that is given.
         """
         n, m = self.poles, self.zeros
         log_f = np.log(np.array(f_hz) / self.unit_hz)
+        log_fz = np.log(np.array(zeros_hz or f_hz) / self.unit_hz)
         # Slower real zeros than the lowest frequency would make a differentiator of the plant.
         tau, zz = self.unit_hz / f_hz[0], 1.5
-        low = [[-tau], np.full(n, log_f[0]), np.log(zeta[0]), np.full(m, log_f[0])]
-        high = [[tau], np.full(n, log_f[1]), np.full(n, np.log(zeta[1])), np.full(m, log_f[1])]
+        low = [[-tau], np.full(n, log_f[0]), np.log(zeta[0]), np.full(m, log_fz[0])]
+        high = [[tau], np.full(n, log_f[1]), np.full(n, np.log(zeta[1])), np.full(m, log_fz[1])]
         if minimum_phase:
             low[0] = [0.0]
         least = 1e-3 if minimum_phase else -zz
