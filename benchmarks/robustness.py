@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_folder
 
-from compensation.base import DesignError, compensator
+from compensation.base import DesignError
+from compensation.registry import compensator
 from compensation.shapers import SHAPERS, shape, shaper_pulses
 from models.machine import Machine
 from models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set

@@ -1,27 +1,15 @@
-"""What every compensator offers, and the list of them by name."""
+"""What every compensator offers."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
 from models.schedule import OperatingPoint
 
-__all__ = [
-    "COMPENSATORS",
-    "INVERSIONS",
-    "Compensator",
-    "DesignError",
-    "Memoryless",
-    "compensator",
-]
-
-INVERSIONS = ("npz-ignore", "zmetc", "zpetc", "ebzpetc", "ts")
-COMPENSATORS = ("fbf", *INVERSIONS, "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
-                "shaper:3hump_ei")  # fmt: skip
+__all__ = ["Compensator", "DesignError", "Memoryless"]
 
 
 class DesignError(ValueError):
@@ -99,42 +87,3 @@ class Memoryless:
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Do nothing."""
-
-
-def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
-    """Make the compensator `name` for a machine, at the sampling time `dt_s`.
-
-    ``NAME+ripple``, and ``none+ripple``, undo the machine's ripple as well (`compensation.ripple`).
-    For a machine with schedules it follows the plants (`compensation.scheduled`).
-
-    Raises
-    ------
-    DesignError
-        If there is no such compensator or it cannot be designed for this machine.
-    """
-    made: Compensator
-    if name.endswith("+ripple"):
-        from compensation.ripple import with_ripple
-
-        made = with_ripple(name.removesuffix("+ripple"), machine, dt_s, **settings)
-    elif machine.schedules:
-        from compensation.scheduled import ScheduledCompensator
-
-        made = ScheduledCompensator(
-            machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
-        )
-    elif name == "fbf":
-        from compensation.fbf import PreviewFbf
-
-        made = PreviewFbf(machine, dt_s, **settings)
-    elif name in INVERSIONS:
-        from compensation.inverting import InversionCompensator
-
-        made = InversionCompensator(machine, dt_s, kind=name, **settings)
-    elif name.startswith("shaper:"):
-        from compensation.shapers import ShaperCompensator
-
-        made = ShaperCompensator(machine, dt_s, shaper=name.removeprefix("shaper:"), **settings)
-    else:
-        raise DesignError(f"no compensator is called {name!r}; there are {', '.join(COMPENSATORS)}")
-    return made

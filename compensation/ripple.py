@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import firwin
 
-from compensation.base import Compensator, DesignError, Memoryless, compensator
+from compensation.base import Compensator, DesignError, Memoryless
 from compensation.holds import stand_still
 from compensation.inversion import Inversion, invert
 from models.machine import Machine
@@ -38,7 +37,6 @@ __all__ = [
     "input_command",
     "output_command",
     "wave_shares",
-    "with_ripple",
 ]
 
 Array = NDArray[np.float64]
@@ -54,20 +52,6 @@ _MOST_STEPS, _CLOSE_MM = 20, 1e-12
 _SLOWEST_ZERO = 0.97
 """Zeros of the plant nearer the unit circle are not cancelled: their inverse rings."""
 _EXTRA_TERMS = 3
-
-
-def with_ripple(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
-    """Make `RippleCompensator` around the compensator `name`; ``none``: around the plan itself.
-
-    Raises
-    ------
-    DesignError
-        See `RippleCompensator` and `compensation.base.compensator`.
-    """
-    inner: Compensator = PassThrough()
-    if name != "none":
-        inner = compensator(name, machine, dt_s, **settings)
-    return RippleCompensator(inner, machine, dt_s)
 
 
 def input_command(wanted_mm: Array, table: RippleTable, share: Array | None = None) -> Array:

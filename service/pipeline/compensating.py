@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import Compensator, DesignError, compensator
+from compensation.base import Compensator, DesignError
+from compensation.registry import compensator
 from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.encoder import Encoded, KlipperEncoder

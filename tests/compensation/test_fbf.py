@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.base import DesignError, compensator
+from compensation.base import DesignError
 from compensation.fbf import PreviewFbf
+from compensation.registry import compensator
 from models.machine import CommandLimits, Machine
 from models.plants import plant_set
 from models.store import load_machine

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from compensation.base import COMPENSATORS, INVERSIONS, DesignError
+from compensation.base import DesignError
 from compensation.inversion import KINDS, Inversion, TwoSidedFilter, invert
+from compensation.registry import COMPENSATORS, INVERSIONS
 from models.plants import DiscretePlant, ZpkSpec, discretise
 
 F_HZ = np.linspace(0.5, 499.0, 150)

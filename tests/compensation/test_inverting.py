@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.base import DesignError, compensator
+from compensation.base import DesignError
 from compensation.holds import stand_still
 from compensation.inversion import invert
 from compensation.inverting import InversionCompensator, zero_phase_fir
+from compensation.registry import compensator
 from models.machine import Machine
 from models.plants import ZpkSpec, plant_set
 from models.store import load_machine

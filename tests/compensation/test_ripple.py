@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError, compensator
+from compensation.base import DesignError
+from compensation.registry import compensator
 from compensation.ripple import PassThrough, RippleCompensator, input_command, wave_shares
 from models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
 from models.machine import CommandLimits, Machine

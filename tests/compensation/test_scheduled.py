@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.base import Compensator, DesignError, compensator
+from compensation.base import Compensator, DesignError
 from compensation.fbf import LADDER, PreviewFbf
 from compensation.preview_axis import BAND_MARGIN, functions_within
+from compensation.registry import compensator
 from compensation.scheduled import ScheduledCompensator
 from models.machine import CommandLimits, Machine
 from models.operating import machine_at

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from compensation.base import COMPENSATORS, DesignError, compensator
+from compensation.base import DesignError
+from compensation.registry import COMPENSATORS, compensator
 from compensation.shapers import SHAPERS, ShaperCompensator, shape, shaper_pulses
 from models.store import load_machine
 

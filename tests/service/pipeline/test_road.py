@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compensation.base import INVERSIONS, DesignError
+from compensation.base import DesignError
+from compensation.registry import INVERSIONS
 from gcode.errors import GcodeError
 from gcode.interpreter import Interpreter
 from models.machine import AxisTravel, Machine

@@ -1,0 +1,50 @@
+"""The list of compensators by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from compensation.base import Compensator, DesignError
+from compensation.fbf import PreviewFbf
+from compensation.inverting import InversionCompensator
+from compensation.ripple import PassThrough, RippleCompensator
+from compensation.scheduled import ScheduledCompensator
+from compensation.shapers import ShaperCompensator
+from models.machine import Machine
+
+__all__ = ["COMPENSATORS", "INVERSIONS", "compensator"]
+
+INVERSIONS = ("npz-ignore", "zmetc", "zpetc", "ebzpetc", "ts")
+COMPENSATORS = ("fbf", *INVERSIONS, "shaper:zv", "shaper:mzv", "shaper:ei", "shaper:2hump_ei",
+                "shaper:3hump_ei")  # fmt: skip
+_RIPPLE = "+ripple"
+
+
+def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Compensator:
+    """Make the compensator `name` for a machine, at the sampling time `dt_s`.
+
+    ``NAME+ripple``, and ``none+ripple``, undo the machine's ripple as well (`compensation.ripple`).
+    For a machine with schedules it follows the plants (`compensation.scheduled`).
+
+    Raises
+    ------
+    DesignError
+        If there is no such compensator or it cannot be designed for this machine.
+    """
+    if name.endswith(_RIPPLE):
+        within = name.removesuffix(_RIPPLE)
+        plain = within == "none"
+        inner = PassThrough() if plain else compensator(within, machine, dt_s, **settings)
+        return RippleCompensator(inner, machine, dt_s)
+    if machine.schedules:
+        return ScheduledCompensator(
+            machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
+        )
+    if name == "fbf":
+        return PreviewFbf(machine, dt_s, **settings)
+    if name in INVERSIONS:
+        return InversionCompensator(machine, dt_s, kind=name, **settings)
+    if name.startswith("shaper:"):
+        shaper = name.removeprefix("shaper:")
+        return ShaperCompensator(machine, dt_s, shaper=shaper, **settings)
+    raise DesignError(f"no compensator is called {name!r}; there are {', '.join(COMPENSATORS)}")
