@@ -19,6 +19,7 @@ from service.identification import commands as identification
 from service.interruption import Interrupted
 from service.machines import commands as machines
 from service.proof import commands as proof
+from service.scanning import commands as scanning
 
 __all__ = ["app", "main", "run"]
 
@@ -266,6 +267,7 @@ def serve(
 identification.register(app)
 proof.register(app)
 controllers.register(app)
+scanning.register(app)
 
 
 def _options(**values: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from compensation.base import DesignError
 from models.diagrams import Block, Diagram
 from models.loops import LoopSpec
 from service.controllers.options import ControllerOptions
+from service.controllers.response import settling_ticks
 
 __all__ = ["LoadedController", "load_controller", "read_controller"]
 
@@ -35,6 +37,8 @@ class LoadedController:
     blocks : tuple of Block
     every : int
         Ticks of the blocks per sample of the machine's loop.
+    settling : int
+        Samples of the loop in which the slowest transient decays to 1e-3.
     """
 
     method: str
@@ -42,6 +46,7 @@ class LoadedController:
     options: ControllerOptions
     blocks: tuple[Block, ...]
     every: int
+    settling: int
 
 
 def load_controller(path: Path) -> LoadedController:
@@ -69,9 +74,9 @@ def read_controller(document: str | bytes, source: str = "controller") -> Loaded
             "`stillpath controller --json` is needed"
         ) from None
     blocks = tuple(equation.block() for equation in found.difference_equations)
-    loaded = LoadedController(found.method, found.loop, found.options, blocks, found.every)
-    _check(loaded, source)
-    return loaded
+    radius = _checked_radius(found, blocks, source)
+    settling = math.ceil(settling_ticks(radius) / found.every)
+    return LoadedController(found.method, found.loop, found.options, blocks, found.every, settling)
 
 
 class _Equation(BaseModel):
@@ -110,9 +115,10 @@ class _Document(BaseModel):
     difference_equations: Annotated[tuple[_Equation, ...], Field(min_length=1, max_length=256)]
 
 
-def _check(loaded: LoadedController, source: str) -> None:
-    nominal, sensor = loaded.spec.nominal(), loaded.spec.sensor
-    whole = Diagram((*nominal.blocks(every=loaded.every, sensor=sensor), *loaded.blocks))
+def _checked_radius(found: _Document, blocks: tuple[Block, ...], source: str) -> float:
+    nominal = found.loop.nominal()
+    servo = nominal.blocks(every=found.every, sensor=found.loop.sensor)
+    whole = Diagram((*servo, *blocks))
     known = set(Diagram(nominal.blocks()).sources)
     if "c" in whole.sources or not known >= set(whole.sources):
         raise DesignError(f"{source}: the equations must read ym, u, v, r and write c")
@@ -123,6 +129,7 @@ def _check(loaded: LoadedController, source: str) -> None:
     radius = whole.spectral_radius()
     if radius >= 1.0:
         raise DesignError(
-            f"{source}: not stable with {loaded.spec.name!r}, largest |z| = {radius:.8f}; design "
+            f"{source}: not stable with {found.loop.name!r}, largest |z| = {radius:.8f}; design "
             "the controller anew"
         )
+    return radius

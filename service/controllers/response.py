@@ -34,11 +34,13 @@ from service.controllers.options import (
 )
 from simulation.closed_loop import ClosedLoop, simulate
 
-__all__ = ["Trace", "adapted", "answer", "disturbance_of", "time_figures"]
+__all__ = ["Trace", "adapted", "answer", "disturbance_of", "settling_ticks", "time_figures", "told"]
 
 Array = NDArray[np.float64]
 
 _LEAST_SAMPLES, _MOST_SAMPLES = 2000, 200_000
+_MOST_TICKS = 3e7
+"""Of all plants together: some ten seconds."""
 _POINTS = 400
 _PERIODS_SHOWN = 12
 _PART_SAMPLES = 3000
@@ -153,9 +155,11 @@ def time_figures(
     every = round(nominal.dt_s / controller.dt_s)
     if trace is None:
         _check(disturbance)
-        settled = _settling(max(controller.spectral_radii)) / every
+        settled = settling_ticks(max(controller.spectral_radii)) / every
         periods = _PERIODS_SHOWN / (min(_frequencies(disturbance), default=math.inf) * nominal.dt_s)
-        samples = _samples(options.duration_s, nominal.dt_s, int(max(1.5 * settled, 2 * periods)))
+        needed = int(max(1.5 * settled, 2 * periods))
+        ticks = len(loops) * (1 + every)
+        samples = _samples(options.duration_s, nominal.dt_s, needed, ticks)
         d = sample(disturbance, samples, nominal.dt_s, np.random.default_rng(_SEED))
     else:
         d = trace.d
@@ -168,14 +172,14 @@ def time_figures(
     shown = runs[0]["y"] if trace is None else trace.after
     end = _last_periods(disturbance, nominal.dt_s, len(d))
     return TimeFigures(
-        disturbance=_told(disturbance),
+        disturbance=told(disturbance),
         enters=enters,
         duration_s=len(d) * nominal.dt_s,
         before=_response(before[0], nominal.dt_s, end),
         after=_response(shown, nominal.dt_s, end),
         members=tuple(
             MemberFigures(
-                name=loop.name,
+                name=loop.name.removeprefix(spec.name).strip(" ()") or "nominal",
                 before_rms=_rms(before[i]),
                 after_rms=_rms(shown if i == 0 else runs[i]["y"]),
                 spectral_radius=controller.spectral_radii[i],
@@ -184,6 +188,23 @@ def time_figures(
         ),
         predictor=_predictor(runs[0], d, nominal.dt_s, end) if "dhat" in runs[0] else None,
     )
+
+
+def settling_ticks(radius: float) -> float:
+    """Return the ticks in which the slowest transient decays to 1e-3."""
+    return math.log(1e-3) / math.log(max(radius, 1e-6))
+
+
+def told(disturbance: Disturbance) -> str:
+    """Return the disturbance in words."""
+    if isinstance(disturbance, Wideband):
+        return f"random, {len(disturbance.peaks)} humps in its spectrum"
+    if isinstance(disturbance, Periodic):
+        return f"{len(disturbance.amplitudes)} harmonics of {disturbance.f_hz:g} Hz"
+    if isinstance(disturbance, Switched):
+        jumps = ("+".join(f"{tone.f_hz:g}" for tone in part) for part in disturbance.parts)
+        return f"tones that jump: {', '.join(j or 'silence' for j in jumps)} Hz"
+    return f"tones of {', '.join(f'{tone.f_hz:g}' for tone in disturbance.tones)} Hz"
 
 
 def _check(disturbance: Disturbance) -> None:
@@ -218,19 +239,15 @@ def _spoken(disturbance: Disturbance, dt_s: float) -> int:
     return round(last / dt_s) + 2 * _PART_SAMPLES
 
 
-def _settling(radius: float) -> float:
-    """Return the ticks in which the slowest transient decays to 1e-3."""
-    return math.log(1e-3) / math.log(max(radius, 1e-6))
-
-
-def _samples(duration_s: float | None, dt_s: float, needed: int) -> int:
+def _samples(duration_s: float | None, dt_s: float, needed: int, ticks: int = 1) -> int:
+    """Return the samples of a run, `ticks` of all plants for each."""
+    most = min(_MOST_SAMPLES, int(_MOST_TICKS / ticks))
     if duration_s is None:
-        return min(max(needed, _LEAST_SAMPLES), _MOST_SAMPLES)
+        return min(max(needed, _LEAST_SAMPLES), most)
     samples = round(duration_s / dt_s)
-    if not 100 <= samples <= _MOST_SAMPLES:
+    if not 100 <= samples <= most:
         raise DesignError(
-            f"a time response of {duration_s:g} s has {samples} samples; 100 to {_MOST_SAMPLES} "
-            "are possible"
+            f"a time response of {duration_s:g} s has {samples} samples; 100 to {most} are possible"
         )
     return samples
 
@@ -248,18 +265,6 @@ def _frequencies(disturbance: Disturbance) -> list[float]:
         return [peak.f_hz for peak in disturbance.peaks]
     parts = disturbance.parts if isinstance(disturbance, Switched) else (disturbance.tones,)
     return [tone.f_hz for tone in parts[-1]]
-
-
-def _told(disturbance: Disturbance) -> str:
-    """Return the disturbance in words."""
-    if isinstance(disturbance, Wideband):
-        return f"random, {len(disturbance.peaks)} humps in its spectrum"
-    if isinstance(disturbance, Periodic):
-        return f"{len(disturbance.amplitudes)} harmonics of {disturbance.f_hz:g} Hz"
-    if isinstance(disturbance, Switched):
-        jumps = ("+".join(f"{tone.f_hz:g}" for tone in part) for part in disturbance.parts)
-        return f"tones that jump: {', '.join(j or 'silence' for j in jumps)} Hz"
-    return f"tones of {', '.join(f'{tone.f_hz:g}' for tone in disturbance.tones)} Hz"
 
 
 def _response(y: Array, dt_s: float, end: int) -> ResponseFigures:

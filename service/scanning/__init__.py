@@ -1,0 +1,1 @@
+"""Scanning (laser) machines: hatches in, commands and predicted residuals out."""

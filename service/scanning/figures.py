@@ -1,0 +1,62 @@
+"""The figures of a scan: what `scan_file` returns and the page shows."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+__all__ = ["ScanReport", "TrackFigures", "VariantFigures"]
+
+
+class _Figures(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TrackFigures(_Figures):
+    """One track: where it lies in the file and on the work, and its errors by variant, in um."""
+
+    line: int
+    last_line: int
+    length_mm: float
+    x_mm: tuple[float, ...]
+    y_mm: tuple[float, ...]
+    rms_um: dict[str, float]
+    largest_um: dict[str, float]
+    across_um: dict[str, float]
+
+
+class VariantFigures(_Figures):
+    """One way to drive the scanner, over all samples of all tracks.
+
+    `across_um`: rms of the error across the tracks.
+    """
+
+    name: str
+    label: str
+    rms_um: float
+    largest_um: float
+    across_um: float
+
+
+class ScanReport(_Figures):
+    """What a scan leaves; the variants from as sent to the best there is."""
+
+    version: str
+    source: str
+    machine: str
+    title: str
+    unit: str
+    um_per_unit: float
+    rate_hz: float
+    prefilter: str
+    preview_samples: int
+    peak_gain: float | None
+    """Largest gain of the prefilter over frequency; None if it is no filter (fbf)."""
+    controller: str | None
+    disturbance: str | None
+    enters: str | None
+    duration_s: float
+    drawn_s: float
+    drawn_mm: float
+    variants: tuple[VariantFigures, ...]
+    tracks: tuple[TrackFigures, ...]
+    notes: tuple[str, ...]
