@@ -198,6 +198,15 @@ def test_refusals_say_why(name: str, document: dict[str, Any], words: str) -> No
         design_controller(load_loop(name), read_options(document))
 
 
+def test_documented_options_are_right() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "controllers.md").read_text()
+    document = text.split("```json")[1].split("```")[0]
+    report = design_controller(load_loop("galvo-40khz"), read_options(json.loads(document))).report
+    assert report.time.duration_s == pytest.approx(0.5)
+    for method in METHODS:
+        assert f"| `{method}` |" in text
+
+
 def test_options_hold_no_paths(tmp_path: Path) -> None:
     with pytest.raises(DesignError):
         read_options(FMSDOB | {"method": "rc-multirate", "fast": "../x.json"})
