@@ -59,6 +59,7 @@ _BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectr
 _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _MOSTLY = 0.8
+_POOR, _POOR_DB = 0.15, 1.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +171,8 @@ class _AxisWork:
             )
         for response in found.measured:
             notes += [f"{response.source}: {n}" for n in response.notes]
-        return replace(found, notes=tuple(dict.fromkeys(notes)))
+        warnings = (*_fit_warnings(found.fit), *found.warnings) if found.fit else found.warnings
+        return replace(found, notes=tuple(dict.fromkeys(notes)), warnings=warnings)
 
     def _from_model(self) -> AxisIdentification:
         if len(self._used) > 1:
@@ -306,6 +308,20 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
             "X and Y from tests along X and along Y"
         )
     return "x" if abs(x) > abs(y) else "y"
+
+
+def _fit_warnings(fit: Fit) -> tuple[str, ...]:
+    """Tell of a model that should not be relied on."""
+    if fit.magnitude_only:
+        poor, missed = fit.residual > _POOR_DB, f"{fit.residual:.1f} dB"
+    else:
+        poor, missed = fit.residual > _POOR, f"{fit.residual:.0%}"
+    text = (
+        f"the model misses {missed} of what was measured: look at the curves before it is used. "
+        "Allow more modes (max_order), leave out files of another state of the machine, or "
+        "measure again"
+    )
+    return (text,) if poor else ()
 
 
 def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

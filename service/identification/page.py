@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ _WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 320.0), (480.0, 250.0)
 _MEASURED = ("before thin", "before thin d1", "before thin d2", "before thin d3", "before thin d5")
 _LARGEST_LABEL, _MOST_NAMES = 18, 6
 _SAME_MODE = 0.25
+_OF_KLIPPER = re.compile(r"^(?:resonances|calibration_data|raw_data)_(.*)\.csv.*$")
 
 
 def write_identification(report: IdentificationReport, directory: Path) -> None:
@@ -88,56 +90,48 @@ def _figures(axis: AxisFigures) -> list[_Figure]:
 
 
 def _magnitude(axis: AxisFigures) -> _Figure:
-    measured = [
-        Line(r.f_hz, r.magnitude, style, _name(r.label, len(axis.responses)))
-        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
-    ]
+    named = zip(axis.responses, _named([r.label for r in axis.responses]), strict=True)
+    measured = [Line(r.f_hz, r.magnitude, style, name) for r, (style, name) in named]
     members = [Line(m.f_hz, m.magnitude, "soft thin member") for m in axis.members]
     model = Line(axis.model.f_hz, axis.model.magnitude, "after main", "model")
     note = "How much further the nozzle moves than it is told: 1 is rigid."
     if members:
         note += " Grey: members of the set."
-    marks = [Mark(mode.f_hz, f"{mode.f_hz:.1f} Hz") for mode in _apart(axis.modes)]
-    return _figure("Magnitude", note, "|G|", [*members, *measured, model], True, marks)
+    last = axis.model.f_hz[-1]
+    marks = [Mark(m.f_hz, f"{m.f_hz:.1f} Hz") for m in _apart(axis.modes) if m.f_hz <= last]
+    # The measured ones on top: a good model would hide them.
+    return _figure("Magnitude", note, "|G|", [*members, model, *measured], True, marks)
 
 
 def _phase(axis: AxisFigures) -> _Figure:
-    measured = [
-        Line(r.f_hz, r.phase_deg, style)
-        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
-    ]
+    measured = [Line(r.f_hz, r.phase_deg, _style(k)) for k, r in enumerate(axis.responses)]
     model = Line(axis.model.f_hz, axis.model.phase_deg, "after main")
     note = "Degrees; a delay of the recording is taken out."
-    return _figure("Phase", note, "phase, °", [*measured, model], False)
+    return _figure("Phase", note, "phase, °", [model, *measured], False)
 
 
 def _coherence(axis: AxisFigures) -> _Figure:
-    lines = [
-        Line(r.f_hz, r.coherence, style)
-        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
-    ]
+    lines = [Line(r.f_hz, r.coherence, _style(k)) for k, r in enumerate(axis.responses)]
     note = "How much of the measured motion follows the command; below 0.95 is not fitted."
     return _figure("Coherence", note, "coherence", lines, False)
 
 
 def _residual(axis: AxisFigures) -> _Figure:
     lines = [
-        Line(r.f_hz, [None if v is None else 100 * v for v in r.residual], style)
-        for r, style in zip(axis.responses, _styles(len(axis.responses)), strict=True)
+        Line(r.f_hz, [None if v is None else 100 * v for v in r.residual], _style(k))
+        for k, r in enumerate(axis.responses)
     ]
     note = "Measured against model: |H / G − 1|."
     return _figure("What the model misses", note, "%", lines, True)
 
 
 def _spectrum(axis: AxisFigures) -> _Figure:
-    measured = [
-        Line(s.f_hz, s.measured, style, _name(s.label, len(axis.spectra)))
-        for s, style in zip(axis.spectra, _styles(len(axis.spectra)), strict=True)
-    ]
+    named = zip(axis.spectra, _named([s.label for s in axis.spectra]), strict=True)
+    measured = [Line(s.f_hz, s.measured, style, name) for s, (style, name) in named]
     first = axis.spectra[0]
     model = Line(first.f_hz, first.predicted, "after main", "model")
     note = "Acceleration, as the printer's own test recorded it, and as the model predicts it."
-    return _figure("Power spectrum", note, "(mm/s²)²/Hz", [*measured, model], True)
+    return _figure("Power spectrum", note, "(mm/s²)²/Hz", [model, *measured], True)
 
 
 def _figure(
@@ -160,12 +154,19 @@ def _figure(
     return _Figure(title, note, draw(chart, *(_WIDE if wide else _SMALL)), draw(chart, *_NARROW))
 
 
-def _name(label: str, count: int) -> str:
-    return "measured" if count == 1 else label[:_LARGEST_LABEL] if count <= _MOST_NAMES else ""
+def _named(labels: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the style of every measured line, and the name of the first of each label."""
+    short = [_OF_KLIPPER.sub(r"\1", label)[:_LARGEST_LABEL] for label in labels]
+    if len(short) == 1:
+        short = ["measured"]
+    names = dict.fromkeys(short)
+    if len(names) > _MOST_NAMES:
+        return [(_style(k), "") for k in range(len(labels))]
+    return [(_style(k), "" if n in short[:k] else n) for k, n in enumerate(short)]
 
 
-def _styles(count: int) -> list[str]:
-    return [_MEASURED[i % len(_MEASURED)] for i in range(count)]
+def _style(number: int) -> str:
+    return _MEASURED[number % len(_MEASURED)]
 
 
 def _apart(modes: Sequence[MeasuredMode]) -> list[MeasuredMode]:

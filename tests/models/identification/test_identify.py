@@ -189,6 +189,14 @@ def test_delays_of_responses_are_compared() -> None:
     )
 
 
+def test_a_poor_fit_is_told() -> None:
+    two = PairsSpec(poles=two_modes(33.0, 55.0).poles)
+    (warning, *_) = identify([at(response(two))], max_order=1)["x"].warnings
+    assert warning.startswith("the model misses")
+    assert "max_order" in warning
+    assert identify([at(response(two))])["x"].warnings == ()
+
+
 # A weight on the bed
 
 
