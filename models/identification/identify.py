@@ -221,7 +221,8 @@ class _AxisWork:
             spectrum = one.measurement
             assert isinstance(spectrum, Spectrum)
             spectra.append((spectrum, excitation_for(spectrum, self._settings), one.condition))
-            notes += excitation_notes(spectrum, self._settings)
+            assumed = excitation_notes(spectrum, self._settings)
+            notes += [f"{spectrum.source}: {note}" for note in assumed]
             self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
         common = usual([c for _, _, c in spectra], self._axis)
         chosen = [(s, e) for s, e, c in spectra if c in common]
