@@ -69,7 +69,7 @@ def render_controller(report: ControllerReport) -> str:
         "service.controllers",
         "controller.html.j2",
         "".join(asset(package, name) for package, name in STYLES),
-        {"short": short, "db": decibels},
+        {"short": short, "db": decibels, "setting": _setting},
         d=report,
         sensitivity=_sensitivity(report),
         response=_response(report),
@@ -93,6 +93,13 @@ def decibels(value: float, digits: int = 2) -> str:
     """Return dB with a proper minus, and none before zero."""
     text = f"{value:.{digits}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
+
+
+def _setting(value: object) -> str:
+    """Return a setting, or a list of them, without the digits of rounding."""
+    if isinstance(value, float):
+        return f"{value:.7g}"
+    return ", ".join(map(_setting, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def _sensitivity(d: ControllerReport) -> Figure:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from compensation.base import DesignError
 from compensation.feedback.adaptive import AdaptiveFmsdob
 from compensation.feedback.controller import Controller
+from compensation.feedback.fmsdob import fmsdob
 from models.diagrams import Block
 from models.disturbances import Narrowband, Periodic, SensorSpec, Switched, Tone, Wideband, sample
 from models.loops import Loop, LoopSpec
@@ -111,7 +112,7 @@ def adapted(
     Raises
     ------
     DesignError
-        If it works on no tone at the end.
+        If it works on no tone at the end, or that controller is refused.
     """
     _check(disturbance)
     nominal = loops[0]
@@ -130,7 +131,15 @@ def adapted(
         change = observer.hear(out["dhat"])
         if change is not None:
             running.retune(change.blocks, reset=change.reset)
-    return observer.controller(), Trace(d, y)
+    controller = observer.controller()
+    if options.uncertainty is not None:
+        controller = fmsdob(
+            loops,
+            observer.targets_hz,
+            bandwidth_hz=options.bandwidth_hz,
+            uncertainty=options.uncertainty,
+        )
+    return controller, Trace(d, y)
 
 
 def time_figures(

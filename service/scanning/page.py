@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.controllers.page import STYLES, charted, short
+from service.controllers.page import STYLES, Figure, charted, short
 from service.design.charts import Chart, Line
 from service.pipeline.files import replacing
 from service.reports.pages import asset, rendered, write_texts
@@ -18,12 +18,13 @@ from service.scanning.scan import Scan
 
 __all__ = ["render_scan", "worst_tracks", "write_command", "write_scan"]
 
+_STYLE = ("service.scanning", "scan.css")
 _CLASSES = 6
 _SIZE = 470.0
 _MARGIN = 8.0
 _MOST_DRAWN = 5000
 _SHOWN = 12
-_STYLES = {"sent": "before thin", "prefilter": "shaper thin", "add-on": "after main"}
+_LINES = {"sent": "before thin", "prefilter": "shaper thin", "add-on": "after main"}
 
 
 def write_scan(report: ScanReport, directory: Path) -> None:
@@ -92,22 +93,19 @@ def worst_tracks(report: ScanReport) -> list[TrackFigures]:
     return sorted(report.tracks, key=lambda track: -track.rms_um[name])
 
 
-_STYLE = ("service.scanning", "scan.css")
-
-
 @dataclass(frozen=True, slots=True)
 class _Plate:
     title: str
     svg: str
 
 
-def _by_track(report: ScanReport) -> object:
+def _by_track(report: ScanReport) -> Figure:
     numbers = range(1, len(report.tracks) + 1)
     lines = [
         Line(
             list(numbers),
             [track.rms_um[v.name] or None for track in report.tracks],
-            _STYLES[v.name],
+            _LINES[v.name],
             v.label.split(" and ")[-1] if v.name == "add-on" else v.label,
         )
         for v in report.variants

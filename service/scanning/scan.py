@@ -109,7 +109,7 @@ def scan_file(
     """
     loop = spec.nominal()
     scale = _scale(spec, settings)
-    if controller is not None and controller.spec.loop != spec.loop:
+    if controller is not None and _machine(controller.spec) != _machine(spec):
         raise DesignError(
             f"the controller was designed for {controller.spec.name!r}, not for the loop of "
             f"{spec.name!r}; design it anew"
@@ -240,6 +240,11 @@ def _expecting(blocks: Sequence[Block], loop: Loop, every: int) -> tuple[Block, 
         for b in blocks
     ]
     return (expected, *changed)
+
+
+def _machine(spec: LoopSpec) -> tuple[object, object]:
+    """Return what a controller is made for, apart from names."""
+    return spec.loop, spec.sensor
 
 
 def _scale(spec: LoopSpec, settings: ScanSettings) -> float:

@@ -184,6 +184,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
     ("galvo-40khz", {"method": "rc-quasi", "fundamental_hz": 1201}, "rc-wide"),
     ("galvo-40khz", FMSDOB | {"duration_s": 50}, "200000"),
     ("galvo-10khz", {"method": "fmsdob-adaptive", "floor_rms": 100}, "no tone"),
+    ("galvo-10khz", {"method": "fmsdob-adaptive", "uncertainty": 2}, "allows"),
     (
         "galvo-10khz",
         {"method": "rc-multirate", "fundamental_hz": 1200, "fast": "galvo-10khz"},
