@@ -48,7 +48,9 @@ _PLATEAU_HZ = (8.0, 15.0)
 _PLATEAU_TOLERANCE = 0.15
 _NOT_MOVING = 0.3
 _LEAST_COHERENCE = 0.95
-_LEAST_FOLLOWED = 0.4
+_LEAST_FOLLOWED = 0.15
+_DRIFT_S = 0.05
+"""Modes delay the upper half of the band by some 10 ms more or less than the lower one."""
 _LEVEL_UNKNOWN = "level not checked: nothing between 8 and 15 Hz follows the command"
 _WEAKEST_DRIVE = 1e-5
 _SEGMENTS = 12
@@ -257,14 +259,39 @@ def estimate_welch(
 
 def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None:
     coherent = response.coherence >= _LEAST_COHERENCE
-    if np.mean(coherent) >= _LEAST_FOLLOWED:
-        return
-    raise ModelError(
-        f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
-        f"{np.mean(coherent):.0%} of its frequencies (coherence of at least {_LEAST_COHERENCE}; "
-        f"at least {_LEAST_FOLLOWED:.0%} are needed): the sweep was another one, see hz_per_sec "
-        "in printer.cfg, or the sensor is too noisy or loose"
-    )
+    if np.mean(coherent) < _LEAST_FOLLOWED:
+        raise ModelError(
+            f"{response.source}: the log follows a sweep at {excitation.hz_per_s:g} Hz/s at only "
+            f"{np.mean(coherent):.0%} of its frequencies (coherence of at least "
+            f"{_LEAST_COHERENCE}; at least {_LEAST_FOLLOWED:.0%} are needed): the sensor is too "
+            "noisy or loose, or the sweep was another one, see hz_per_sec in printer.cfg"
+        )
+    drift_s, per_hz_s = _drift(response.f_hz[coherent], response.response[coherent])
+    if abs(drift_s) > _DRIFT_S:
+        rate = 1.0 / (1.0 / excitation.hz_per_s + per_hz_s)
+        raise ModelError(
+            f"{response.source}: the log drifts away from a sweep at {excitation.hz_per_s:g} Hz/s, "
+            f"by {abs(drift_s):.2g} s over half of it; it looks like hz_per_sec = {rate:.4g}: see "
+            "printer.cfg"
+        )
+
+
+def _drift(f_hz: Array, response: NDArray[np.complex128]) -> tuple[float, float]:
+    """Return by how much later the upper half follows than the lower one, and that per Hz.
+
+    Medians of the group delay: a resonance delays much, but only near its frequency.
+    """
+    steps = np.diff(f_hz)
+    near = steps < 1.5 * _STEP_HZ
+    turned = np.angle(response[1:] * response[:-1].conj())[near]
+    delay_s = -turned / (2 * np.pi * steps[near])
+    half = len(delay_s) // 2
+    if half < 2:
+        return 0.0, 0.0
+    centres = f_hz[1:][near]
+    apart_hz = float(np.median(centres[half:]) - np.median(centres[:half]))
+    later_s = float(np.median(delay_s[half:]) - np.median(delay_s[:half]))
+    return later_s, later_s / apart_hz
 
 
 def _transformed(command: Array, measured: Array, rate_hz: float, *, taper: float) -> Transformed:

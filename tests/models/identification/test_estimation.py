@@ -165,9 +165,21 @@ def test_a_sensor_that_is_only_shaken_along_has_its_own_message() -> None:
         estimate_response(log, SHORT)
 
 
-def test_a_sweep_that_drifts_away_has_its_own_message() -> None:
-    with pytest.raises(ModelError, match=r"follows a sweep at 0.985 Hz/s at only .* hz_per_sec"):
-        estimate_response(measured(MODES, NEW), replace(NEW, hz_per_s=0.985))
+@pytest.mark.parametrize("rate_hz_s", [0.985, 0.998, 1.015])
+def test_a_sweep_that_drifts_away_has_its_own_message(rate_hz_s: float) -> None:
+    like = r"drifts away from .* like hz_per_sec = (1|0\.999\d|1\.000\d):"
+    with pytest.raises(ModelError, match=like):
+        estimate_response(measured(MODES, NEW), replace(NEW, hz_per_s=rate_hz_s))
+
+
+def test_a_soft_axis_with_a_noisy_sensor_is_used_where_it_follows() -> None:
+    soft = PairsSpec(poles=(PolePair(f_hz=26.5, zeta=0.2),))
+    log = measured(soft, NEW, sensor=Sensor(rate_hz=800.0, noise_mm_s2=300.0))
+    found = estimate_response(log, NEW)
+    assert np.mean(found.coherence > 0.95) < 0.45
+    used = found.coherence > 0.99
+    truth = np.abs(frequency_response(soft, found.f_hz[used]))
+    np.testing.assert_allclose(np.abs(found.response[used]), truth, rtol=0.1)
 
 
 def test_a_level_that_cannot_be_checked_is_noted() -> None:
@@ -237,7 +249,7 @@ def test_local_model_is_exact_for_one_pole_and_transients() -> None:
     at = np.arange(30.0, 50.0, 0.5)
     found = local_response([Transformed(0.1, u, y)], at, 1.0, transient=True)
     index = np.round(at / 0.1).astype(int)
-    np.testing.assert_allclose(found.response, truth[index], rtol=1e-6)
+    np.testing.assert_allclose(found.response, truth[index], rtol=1e-4)
     assert found.coherence.min() > 0.9999
 
 
@@ -281,3 +293,18 @@ def test_a_real_flexible_arm_has_its_two_modes(shared_dir: Path) -> None:
     assert np.median(found.coherence[band]) > 0.99
     peak = found.f_hz[band][np.argmax(np.abs(found.response[band]))]
     assert peak == pytest.approx(2.12, abs=0.2)
+
+
+def test_two_modes_within_one_band_stay_two() -> None:
+    """Modes 5 % apart, closer than the band of the local fit is wide."""
+    plant = ModesSpec(
+        modes=(Mode(f_hz=34.6, zeta=0.011, gain=0.6), Mode(f_hz=36.4, zeta=0.008, gain=0.4))
+    )
+    test = Excitation((1.0, 0.0), 5.0, 65.0, 60.0, 1.0, 0.0)
+    rng = np.random.default_rng(0)
+    sensor = Sensor(rate_hz=800.0, noise_mm_s2=60.0)
+    log = simulate_log({"x": plant}, test, sensor=sensor, rng=rng)
+    found = estimate_response(log, test)
+    truth = np.abs(frequency_response(plant, found.f_hz))
+    near = truth > 0.3
+    np.testing.assert_allclose(np.abs(found.response[near]), truth[near], rtol=0.02)
