@@ -21,6 +21,8 @@ _RELATIVE_FLOOR = 0.02
 """Nonlinearity of a real axis: no point counts as better known than this share of the response
 or, where it has fallen below that, of its value at low frequency."""
 _LEAST_POINTS = 12
+_LEAST_RUN = 0.01
+"""Share of all points that must be coherent side by side: a few among noise are so by chance."""
 _UNKNOWN_NOISE = 0.005
 
 
@@ -79,7 +81,7 @@ def response_data(
     f, h = measured.f_hz, measured.response
     low, high = band_hz or (0.0, np.inf)
     inside = (f > 0) & (f >= low) & (f <= high) & np.isfinite(h) & (np.abs(h) > 0)
-    unclear = inside & (measured.coherence < _LEAST_COHERENCE)
+    unclear = inside & ~_coherent(measured.coherence)
     use = np.flatnonzero(inside & ~unclear)
     if len(use) < _LEAST_POINTS:
         raise ModelError(
@@ -107,6 +109,16 @@ def response_data(
     weight = 1 / np.maximum(np.where(known, sd, 0.0), floor)
     share = float(np.linalg.norm(noise) / np.linalg.norm(size))
     return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(notes))
+
+
+def _coherent(coherence: Array) -> NDArray[np.bool_]:
+    """Return which points are coherent, or not known not to be; short runs of them are not."""
+    coherent = ~(coherence < _LEAST_COHERENCE)
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], coherent, [False]]).astype(int)))
+    for first, end in ends.reshape(-1, 2):
+        if end - first < _LEAST_RUN * len(coherence):
+            coherent[first:end] = False
+    return np.asarray(coherent, np.bool_)
 
 
 def _roughness(h: ComplexArray) -> float:

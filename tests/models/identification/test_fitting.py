@@ -117,6 +117,15 @@ def test_zero_beyond_the_band_is_taken_as_minimum_phase() -> None:
     assert fit.modes[0].f_hz == pytest.approx(47.0, rel=0.01)
 
 
+def test_points_coherent_by_chance_do_not_widen_the_band() -> None:
+    clean = measured(modal(TRUTH[:1], (1.0,)))
+    coherence = np.where((clean.f_hz < 80) | (clean.f_hz == 125.0), 0.99, 0.3)
+    noisy = np.where(clean.f_hz < 80, clean.response, 0.5 + 0j)
+    fit = fit_response(replace(clean, response=noisy, coherence=coherence))
+    assert fit.band_hz == (5.0, 79.5)
+    assert fit.residual < 0.005
+
+
 def test_noise_only_in_incoherent_points_is_left_out() -> None:
     clean = measured(modal(TRUTH[:2], (0.7, 0.3)))
     bad = (clean.f_hz > 60) & (clean.f_hz < 75)
