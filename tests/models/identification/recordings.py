@@ -145,7 +145,7 @@ BROKEN = {
     "gap": ["line 4001: gap in time", "10 samples are missing", "Measure again"],
     "overflow of M956": ["overflowed 3 times", "record again"],
     "overflow of Klipper": ["overflowed 7 times", "record again"],
-    "accel_per_hz": ["1.25 times as much", "looks like accel_per_hz = 74.8", "printer.cfg"],
+    "accel_per_hz": ["1.25 times as much", "looks like accel_per_hz = 74.", "printer.cfg"],
     "empty": ["the file is empty"],
     "cut off": ["the log ends", "before the end of the test", "record the whole test"],
     "other sweep": ["the test is not in the log", "check min_freq, max_freq, hz_per_sec"],
