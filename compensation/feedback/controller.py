@@ -36,6 +36,8 @@ Complex = NDArray[np.complex128]
 Values = float | int | tuple[float, ...] | tuple[tuple[float, ...], ...]
 Uncertainty = float | Callable[[Array], Array]
 """Bound of the relative plant error |Delta(f)|: one number, or a function of the frequencies."""
+_BEST_KNOWN = 1e-4
+"""No plant is known better. Below, rounding alone would decide whether a loop is stable."""
 
 
 class Refusal(DesignError):
@@ -247,7 +249,7 @@ def judged(
         The nominal loop first, then the members it may turn into.
     uncertainty : float or function of f_hz, optional
         Relative plant error that must be survived at every frequency (small gain; sufficient,
-        not necessary). The members are always checked, exactly.
+        not necessary), at least 1e-4. The members are always checked, exactly.
     noise_gain : float, optional
         Left out: the rms of T over frequency.
     every : int
@@ -258,8 +260,7 @@ def judged(
     Refusal
         If the loop with the add-on is unstable for a member, or |Delta| >= 1/|T| somewhere.
     """
-    if uncertainty is not None:
-        _check_small_gain(method, prediction, uncertainty)
+    _check_small_gain(method, prediction, uncertainty)
     radii = []
     for loop in loops:
         whole = Diagram((*loop.blocks(every=every, sensor=sensor), *blocks))
@@ -279,7 +280,7 @@ def judged(
     return Controller(
         method,
         nominal.name,
-        nominal.dt_s / every,
+        float(nominal.dt_s) / every,
         tuple(coefficients),
         tuple(blocks),
         prediction,
@@ -302,19 +303,27 @@ def frequency_grid(
         for offsets in (width * np.geomspace(1e-4, 30, 200),)
     ]
     grid = np.unique(np.concatenate([coarse, *near]))
-    return grid[(grid >= top / 8192) & (grid <= top)]
+    lowest = min([top / 8192, *(0.5 * f for f in targets_hz)])
+    return grid[(grid >= lowest) & (grid <= top)]
 
 
-def _check_small_gain(method: str, prediction: Prediction, uncertainty: Uncertainty) -> None:
-    f = prediction.f_hz
-    bound = uncertainty(f) if callable(uncertainty) else np.full(len(f), uncertainty)
-    product = np.abs(bound) * np.abs(prediction.t)
+def _check_small_gain(method: str, prediction: Prediction, uncertainty: Uncertainty | None) -> None:
+    f, t = prediction.f_hz, np.abs(prediction.t)
+    given = uncertainty(f) if callable(uncertainty) else np.full(len(f), uncertainty or 0.0)
+    bound = np.maximum(np.abs(given), _BEST_KNOWN)
+    product = bound * t
+    if not np.all(np.isfinite(product)):
+        at = float(f[np.argmin(np.isfinite(product))])
+        raise Refusal(
+            "small gain", f"{method}: no finite prediction or plant error at {at:.5g} Hz", at
+        )
     worst = int(np.argmax(product))
     if product[worst] >= 1.0:
+        off = "is never known better than" if bound[worst] == _BEST_KNOWN else "may be off by"
         raise Refusal(
             "small gain",
-            f"{method}: the plant may be off by {bound[worst]:.3g} at {f[worst]:.5g} Hz, but the "
-            f"loop allows 1/|T| = {1 / np.abs(prediction.t[worst]):.3g} there; narrow the band, "
+            f"{method}: the plant {off} {bound[worst]:.3g}, at {f[worst]:.5g} Hz the "
+            f"loop allows 1/|T| = {1 / t[worst]:.3g}; narrow the band, "
             "detune, drop that target, or identify the plant better",
             float(f[worst]),
         )
@@ -355,7 +364,7 @@ def _c_definition(name: str, value: Values) -> str:
     if isinstance(value, int):
         return f"enum {{ {name} = {value} }};"
     if isinstance(value, float):
-        return f"static const double {name} = {value!r};"
+        return f"static const double {name} = {float(value)!r};"
     if value and isinstance(value[0], tuple):
         rows = [row for row in value if isinstance(row, tuple)]
         inner = ",\n  ".join("{" + ", ".join(repr(float(v)) for v in row) + "}" for row in rows)

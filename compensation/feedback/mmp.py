@@ -235,6 +235,11 @@ def mmp(
         Singular tones, too much noise gain, an unstable member, or small gain violated.
     """
     nominal = loops[0]
+    if nominal.fed_back:
+        raise DesignError(
+            f"mmp on {nominal.name!r}: the servo is fed back and would hear the slow sensor; "
+            "mmp is for sensors beside the servo (disturbed: outside)"
+        )
     made = (
         predictor_of_gain(targets_hz, sensor.every, nominal.dt_s, noise_gain, sensor.delay_samples)
         if alpha is None

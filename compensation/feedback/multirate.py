@@ -12,10 +12,8 @@ up to half the fast rate (`alias_spectra`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,11 +29,11 @@ from compensation.feedback.controller import (
 from compensation.feedback.repetitive import (
     InternalModel,
     ServoInverse,
-    exact_frequency,
     internal_model,
     invert_servo,
     repetitive_blocks,
     repetitive_coefficients,
+    shared_period,
 )
 from models.diagrams import Block
 from models.loops import Loop
@@ -95,6 +93,7 @@ def design_multirate(
         )
     model = internal_model(fast.dt_s, rates.period, alpha, nyquist_pairs, notches_hz)
     inverse = invert_servo(fast.servo_num, fast.t0_den)
+    model = replace(model, mean_free=inverse.blocks_constants)
     upsampled = Block("up", (("ym", 1.0), ("r", -1.0)), every=rates.factor, zero_between=True)
     kept = Block("c", (("w", 1.0),), every=rates.factor)
     blocks = (upsampled, *repetitive_blocks(model, inverse, (("up", 1.0),), "w"), kept)
@@ -126,20 +125,18 @@ def fast_rate(rate_hz: float, fundamental_hz: float) -> FastRate:
         If it is more than 32 times the sampling rate (paper 004 prints 1918.4 kHz for 16 kHz and
         1199 Hz; it is 19184 kHz, 1199 times).
     """
-    rate, wanted = exact_frequency(rate_hz), exact_frequency(fundamental_hz)
-    common = Fraction(
-        math.lcm(rate.numerator * wanted.denominator, wanted.numerator * rate.denominator),
-        rate.denominator * wanted.denominator,
-    )
-    factor = int(common / rate)
+    share = shared_period(rate_hz, fundamental_hz)
+    factor, period = share.numerator, share.denominator
     if factor > _LARGEST_FACTOR:
+        fits_hz = rate_hz / float((1 / share).limit_denominator(_LARGEST_FACTOR))
         raise Refusal(
             "singular",
             f"the least common multiple of {rate_hz:g} and {fundamental_hz:g} Hz is "
-            f"{float(common):.10g} Hz, {factor} times the sampling rate (limit {_LARGEST_FACTOR}): "
-            "use the wide-band design, or round the fundamental",
+            f"{factor * rate_hz:.10g} Hz, {factor} times the sampling rate (limit "
+            f"{_LARGEST_FACTOR}): use the wide-band design, or round the fundamental (the nearest "
+            f"that fits is {fits_hz:.7g} Hz)",
         )
-    return FastRate(float(common), factor, int(common / wanted))
+    return FastRate(factor * rate_hz, factor, period)
 
 
 def alias_spectra(

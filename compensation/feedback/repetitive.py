@@ -16,17 +16,22 @@ takes the least common multiple for the rate.
 The inverse: zeros of V up to radius 0.97 are cancelled; those near the circle are cancelled as if
 they lay at 0.97 (an exact inverse rings there: paper 004's own fast plant has two at |z| = 1), and
 those outside are expanded into the future, which the period's delay has room for.
+
+A baseline with integral action lets no constant of the add-on through, V(1) = 0. A memory of
+constants would drift there for ever without a trace in y, so the mean over a period is taken out
+of it: zero at constants, untouched at the harmonics.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import diric
 
 from compensation.feedback.controller import (
     CoefficientSet,
@@ -54,6 +59,7 @@ __all__ = [
     "plug_in_factor",
     "repetitive_blocks",
     "repetitive_coefficients",
+    "shared_period",
 ]
 
 Array = NDArray[np.float64]
@@ -62,6 +68,7 @@ Complex = NDArray[np.complex128]
 _RADIUS = 0.97
 _SERIES_LEFT = 1e-3
 _LARGEST_PERIOD = 1000
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,22 +85,29 @@ class InternalModel:
         n0: the low-pass is cos(w/2)^(2 n0).
     notches : tuple of float
         Further zero-phase pairs, rad per sample: ((cos w - cos W) / (1 - cos W))^2.
+    mean_free : bool
+        Take the mean over a period out: nothing is done against constants.
     """
 
     period: int
     alpha: float
     nyquist_pairs: int = 3
     notches: tuple[float, ...] = ()
+    mean_free: bool = False
 
     @property
     def taps(self) -> Array:
-        """The zero-phase low-pass, symmetric, sum 1."""
+        """The zero-phase filter, symmetric: a low-pass of sum 1, less the mean if that is out."""
         taps = np.ones(1)
         for _ in range(self.nyquist_pairs):
             taps = np.convolve(taps, [0.25, 0.5, 0.25])
         for notch in self.notches:
             pair = np.array([0.5, -math.cos(notch), 0.5]) / (1 - math.cos(notch))
             taps = np.convolve(taps, np.convolve(pair, pair))
+        if self.mean_free:
+            mean = self._mean()
+            half = max(len(mean), len(taps)) // 2
+            taps = _centred(taps, half) - _centred(mean, half)
         return np.asarray(taps)
 
     @property
@@ -107,6 +121,9 @@ class InternalModel:
         value = np.cos(w / 2) ** (2 * self.nyquist_pairs)
         for notch in self.notches:
             value = value * ((np.cos(w) - math.cos(notch)) / (1 - math.cos(notch))) ** 2
+        if self.mean_free:
+            even = np.cos(w / 2) if self.period % 2 == 0 else 1.0
+            value = value - diric(w, self.period) * even
         return np.asarray(value)
 
     def response(self, angle: ArrayLike) -> Complex:
@@ -124,6 +141,13 @@ class InternalModel:
         den[self.period - self.lead :] -= (1 - share) * self.taps
         return (1 - share) * self.taps, den
 
+    def _mean(self) -> Array:
+        """Return the mean over a period; an even one has half samples at its ends."""
+        taps = np.full(2 * (self.period // 2) + 1, 1.0 / self.period)
+        if self.period % 2 == 0:
+            taps[[0, -1]] *= 0.5
+        return taps
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ServoInverse:
@@ -136,12 +160,15 @@ class ServoInverse:
     preview : int
         Samples that have to be given away elsewhere.
     notes : tuple of str
+    blocks_constants : bool
+        V(1) = 0: what is put in front must be free of constants.
     """
 
     num: tuple[float, ...]
     den: tuple[float, ...]
     preview: int
     notes: tuple[str, ...] = ()
+    blocks_constants: bool = False
 
     def response(self, angle: ArrayLike) -> Complex:
         """Return the approximate 1/V itself at `angle` rad per sample."""
@@ -198,17 +225,34 @@ def design_quasi(
     Parameters and errors as `design_wide_band`; a divisor far below the fundamental makes a long
     memory of which most notches lie where nothing is to be rejected (a note says how many).
     """
-    rate = exact_frequency(1.0 / loops[0].dt_s)
-    wanted = exact_frequency(fundamental_hz)
-    divisor = Fraction(
-        math.gcd(rate.numerator * wanted.denominator, wanted.numerator * rate.denominator),
-        rate.denominator * wanted.denominator,
-    )
-    model = internal_model(loops[0].dt_s, int(rate / divisor), alpha, nyquist_pairs, notches_hz)
-    asked = {"fundamental_hz": fundamental_hz, "divisor_hz": float(divisor), "alpha": alpha,
-             "nyquist_pairs": nyquist_pairs, "notches_hz": tuple(notches_hz)}  # fmt: skip
-    note = f"one notch of {wanted / divisor} lies on the disturbance"
+    rate_hz = 1.0 / loops[0].dt_s
+    share = shared_period(rate_hz, fundamental_hz)
+    if share.denominator > _LARGEST_PERIOD:
+        fits_hz = float(share.limit_denominator(_LARGEST_PERIOD)) * rate_hz
+        raise Refusal(
+            "singular",
+            f"{fundamental_hz:g} and {rate_hz:g} Hz share a period of {share.denominator} samples "
+            f"only (limit {_LARGEST_PERIOD}): the nearest fundamental that fits is {fits_hz:.7g} "
+            "Hz; or use the wide-band design",
+        )
+    model = internal_model(loops[0].dt_s, share.denominator, alpha, nyquist_pairs, notches_hz)
+    asked = {"fundamental_hz": fundamental_hz, "divisor_hz": rate_hz / share.denominator,
+             "alpha": alpha, "nyquist_pairs": nyquist_pairs,
+             "notches_hz": tuple(notches_hz)}  # fmt: skip
+    note = f"one notch of {share.numerator} lies on the disturbance"
     return _designed("rc-quasi", loops, model, fundamental_hz, asked, uncertainty, (note,))
+
+
+def shared_period(rate_hz: float, fundamental_hz: float) -> Fraction:
+    """Return fundamental over rate as M/N: N samples hold M periods.
+
+    Both are taken to 1 mHz as they are named. Where that makes N longer than any memory, a
+    shorter N is taken if it, too, names the fundamental to 1 mHz: 1230.769 Hz at 16 kHz is 1/13.
+    """
+    rate, wanted = exact_frequency(rate_hz), exact_frequency(fundamental_hz)
+    share = wanted / rate
+    short = share.limit_denominator(_LARGEST_PERIOD)
+    return short if abs(short * rate - wanted) <= Fraction(1, 2000) else share
 
 
 def exact_frequency(f_hz: float) -> Fraction:
@@ -238,7 +282,12 @@ def invert_servo(
     """
     top = np.trim_zeros(np.asarray(num, float), "b")
     delay = int(np.flatnonzero(top)[0])
-    zeros = np.roots(top[delay:])
+    top = top[delay:]
+    blocked = abs(float(top.sum())) <= _NOTHING * float(np.abs(top).sum())
+    if blocked:
+        # Apart, because the gain is matched at constants and this zero leaves none there.
+        top = np.polydiv(top, [1.0, -1.0])[0]
+    zeros = np.roots(top)
     size = np.abs(zeros)
     near = (size > radius) & (size <= 1 / radius)
     far = zeros[size > 1 / radius]
@@ -248,6 +297,8 @@ def invert_servo(
     # The steady gain counts; moving a pole would change it.
     bottom = np.real(np.poly(pulled)) if len(pulled) else np.ones(1)
     left = float(top.sum() / bottom.sum())
+    if blocked:
+        bottom = np.convolve(bottom, [1.0, -radius])
     series, preview = np.ones(1), delay
     for zero in far:
         # 1 / (1 - a/z) = -(z/a) (1 + z/a + (z/a)^2 + ...), |a| > 1: the future.
@@ -259,7 +310,11 @@ def invert_servo(
     numerator = np.convolve(np.asarray(den, float), series / series.sum()) / left
     notes = [f"zero at |z| = {s:.4f} inverted as if at {radius:g}" for s in size[near][::2]]
     notes += [f"zero at |z| = {abs(zero):.4g} inverted into the future" for zero in far]
-    return ServoInverse(tuple(numerator.tolist()), tuple(bottom.tolist()), preview, tuple(notes))
+    if blocked:
+        notes.append("constants are left to the baseline: its own integrator removes them")
+    return ServoInverse(
+        tuple(numerator.tolist()), tuple(bottom.tolist()), preview, tuple(notes), blocked
+    )
 
 
 def internal_model(
@@ -305,7 +360,6 @@ def repetitive_blocks(
     Refusal
         If the period is shorter than what low-pass and inverse look ahead.
     """
-    num, den = model.generator()
     spare = model.period - model.lead - inverse.preview
     if spare < 0:
         raise Refusal(
@@ -313,6 +367,7 @@ def repetitive_blocks(
             f"a period of {model.period} samples is shorter than the {model.lead} samples of the "
             f"low-pass and the {inverse.preview} of the inverse; fewer zero pairs, or multirate",
         )
+    num, den = model.generator()
     generator = Block("rc", source, tuple(num.tolist()), tuple(den.tolist()), delay=spare)
     return generator, Block(target, (("rc", 1.0),), inverse.num, inverse.den)
 
@@ -368,6 +423,7 @@ def _designed(
 ) -> Controller:
     nominal = loops[0]
     inverse = invert_servo(nominal.servo_num, nominal.t0_den)
+    model = replace(model, mean_free=inverse.blocks_constants)
     blocks = repetitive_blocks(model, inverse, (("ym", 1.0), ("r", -1.0)), "c")
     targets = np.arange(fundamental_hz, 0.5 / nominal.dt_s, fundamental_hz)[:64]
     widths = np.full(len(targets), max(0.05 * fundamental_hz, 1.0))
@@ -385,3 +441,8 @@ def _designed(
         settings=asked | {"period": model.period},
         notes=(*inverse.notes, *notes),
     )
+
+
+def _centred(taps: Array, half: int) -> Array:
+    """Pad symmetric taps to 2 half + 1 of them."""
+    return np.pad(taps, half - len(taps) // 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import control
 import numpy as np
@@ -254,6 +255,21 @@ def test_small_gain() -> None:
     fmsdob(loops, [1500.0], uncertainty=lambda f: np.where(f > 4000, 0.9, 0.3))
 
 
+def test_no_plant_is_known_to_the_last_digit() -> None:
+    """A target beside Nyquist: |T| of 1e8, where rounding alone decides on stability."""
+    with pytest.raises(Refusal, match="never known better") as refused:
+        fmsdob([FAST.nominal()], [19999.9], bandwidth_hz=None)
+    assert refused.value.reason == "small gain"
+    with pytest.raises(Refusal, match="no finite"):
+        fmsdob(SLOW.loops(), [1500.0], uncertainty=float("nan"))
+
+
+def test_low_targets_lie_on_the_grid() -> None:
+    made = fmsdob(SLOW.loops(), [0.4], bandwidth_hz=0.2)
+    at = np.flatnonzero(made.prediction.f_hz == 0.4)
+    assert np.abs(made.prediction.add_on[at]) == pytest.approx([0.0], abs=1e-6)
+
+
 def test_members_are_checked() -> None:
     loop = SLOW.nominal()
     wild = (loop, loop.varied(gain=1.0, delay_samples=1))
@@ -300,6 +316,8 @@ def test_documents(tmp_path: object) -> None:
     q = [float(v) for v in header.split("fmsdob_q_taps[2] = {")[1].split("}")[0].split(",")]
     assert q == list(design_q(SLOW.nominal(), [1500.0]).taps)
     assert header.count("#ifndef") == header.count("#endif") == 1
+    numpy_numbers = fmsdob([replace(SLOW.nominal(), dt_s=np.float64(1e-4))], [1500.0])
+    assert "np." not in numpy_numbers.to_c_header()
 
 
 def test_coefficients_are_the_blocks() -> None:

@@ -197,3 +197,8 @@ def test_what_is_returned_is_stable_on_every_member(
 def test_impossible_predictors(f_hz: list[float], ratio: int, alpha: float) -> None:
     with pytest.raises(DesignError):
         predictor(f_hz, ratio, TS, alpha)
+
+
+def test_a_servo_on_the_slow_sensor_is_refused() -> None:
+    with pytest.raises(DesignError, match="beside the servo"):
+        mmp(load_loop("galvo-10khz").loops(), [300.0], SensorSpec(every=4))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from compensation.feedback.controller import Refusal
+from compensation.feedback.controller import Controller, Refusal
 from compensation.feedback.multirate import (
     alias_spectra,
     design_multirate,
@@ -24,8 +25,9 @@ from compensation.feedback.repetitive import (
     invert_servo,
     periodic_residual,
     plug_in_factor,
+    shared_period,
 )
-from models.loops import Loop, load_loop
+from models.loops import Loop, PidLoop, load_loop
 from simulation.closed_loop import simulate
 
 HARMONICS = 1200.0 * np.arange(1, 6)
@@ -213,12 +215,63 @@ class TestInverse:
             design_wide_band(LOOPS, 4000.0)
         assert refused.value.reason == "inverse"
 
+    def test_a_period_shorter_than_the_low_pass_is_refused(self) -> None:
+        with pytest.raises(Refusal, match="shorter"):
+            design_wide_band(LOOPS, 7900.0, nyquist_pairs=4)
+
+
+class TestIntegralAction:
+    """C with an integrator: V = P/(1 + PC) lets no constant through."""
+
+    PI = PidLoop(
+        plant_num=(0.0, 3e-5, 3e-5), plant_den=(1.0, -2.0, 1.0), delay_samples=1, dt_s=1e-4,
+        kp=9.0, ki=90.0, kv=720.0, velocity_corner_hz=1000.0,
+    ).loop("pi")  # fmt: skip
+
+    @pytest.mark.parametrize("design", [design_wide_band, design_quasi])
+    def test_the_mean_is_left_to_the_baseline(self, design: Callable[..., Controller]) -> None:
+        made = design((self.PI, self.PI.varied(1.05)), 100.0)
+        assert max(made.spectral_radii) < 1
+        t = np.arange(60_000) * 1e-4
+        ripple = np.sin(2 * np.pi * 100 * t) + 0.3 * np.sin(2 * np.pi * 200 * t) + 5.0
+        before = simulate(self.PI, (), {"d_out": ripple})["y"][-2000:]
+        after = simulate(self.PI, made.blocks, {"d_out": ripple}, ("y", "c"))
+        assert np.std(after["y"][-2000:]) < 0.03 * np.std(before)
+        assert np.abs(np.mean(after["y"][-2000:])) < 1e-3
+        assert np.abs(np.mean(after["c"][-2000:])) < 1e-3
+
+    @pytest.mark.parametrize("period", [6, 7])
+    def test_the_mean_alone_is_taken_out(self, period: int) -> None:
+        model, whole = (InternalModel(period, 0.9, 1, (), out) for out in (True, False))
+        w = 2 * np.pi * np.arange(4) / period
+        assert model.response(w[0]) == pytest.approx(0.0, abs=1e-12)
+        assert model.response(w[1:]) == pytest.approx(whole.response(w[1:]))
+        at = np.array([0.3, 1.1, 2.9])
+        reach = np.arange(-model.lead, model.lead + 1)
+        assert np.cos(np.outer(at, reach)) @ model.taps == pytest.approx(model.lowpass(at))
+
 
 def test_refuses_what_small_gain_forbids() -> None:
     with pytest.raises(Refusal, match="may be off") as refused:
         design_quasi(LOOPS, 1200.0, uncertainty=0.9)
     assert refused.value.reason == "small gain"
     design_quasi(LOOPS, 1200.0, uncertainty=0.7)
+
+
+@pytest.mark.parametrize(
+    ("fundamental_hz", "periods", "samples"),
+    [(1200.0, 3, 40), (16000 / 13, 1, 13), (1230.769, 1, 13), (1199.0, 1199, 16000)],
+)
+def test_shared_period(fundamental_hz: float, periods: int, samples: int) -> None:
+    share = shared_period(16000.0, fundamental_hz)
+    assert (share.numerator, share.denominator) == (periods, samples)
+
+
+def test_a_refusal_names_what_fits() -> None:
+    with pytest.raises(Refusal, match=r"1230\.769 Hz"):
+        design_quasi(LOOPS, 1230.78)
+    with pytest.raises(Refusal, match=r"1230\.769 Hz"):
+        fast_rate(16000.0, 1230.78)
 
 
 @pytest.mark.parametrize(
