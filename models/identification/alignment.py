@@ -268,7 +268,7 @@ def _check_ends(
         raise ModelError(
             f"{log.source}: the log begins {late_s:.1f} s after the start of the test, at "
             f"{excitation.f_start_hz + excitation.hz_per_s * late_s:.1f} Hz of the sweep; "
-            "record from before its start, or correct f_start_hz (min_freq in printer.cfg)"
+            "record from before its start, or correct min_freq"
         )
     lasted_s = float(grid_s[-1]) - start_s
     f_reached_hz = min(excitation.f_start_hz + excitation.hz_per_s * lasted_s, excitation.f_end_hz)
@@ -278,7 +278,7 @@ def _check_ends(
         raise ModelError(
             f"{log.source}: the log ends {profile.duration_s - lasted_s:.1f} s before the end of "
             f"the test, at {f_reached_hz:.1f} Hz of {excitation.f_end_hz:g} Hz; record the whole "
-            f"test, or give f_end_hz = {np.floor(f_reached_hz):g} to use what is there"
+            f"test, or give max_freq = {np.floor(f_reached_hz):g} to use what is there"
         )
     return f_reached_hz, (f"the log ends at {f_reached_hz:.1f} Hz of the sweep",)
 

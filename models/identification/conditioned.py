@@ -89,7 +89,7 @@ def scheduled(
     plants = found.plants
     if grid is not None:
         plants, varied = _followed(plants, kind)
-        notes = (*notes, *varied)
+        notes = (*notes, _grid_note(placed), *varied)
     schedule = AxisSchedule(mass=mass, grid=grid)
     schedule.check(plants)
     return replace(found, plants=plants, schedule=schedule, notes=(*found.notes, *notes))
@@ -155,6 +155,12 @@ def _grid(placed: Mapping[Condition, Fit]) -> GridSchedule:
         return GridSchedule(nodes=tuple(_node(c, f) for c, f in rising))
     except ValidationError as error:
         raise ModelError(f"the places: {explain(error).partition(': ')[2]}") from None
+
+
+def _grid_note(placed: Mapping[Condition, Fit]) -> str:
+    rising = sorted(placed.items(), key=lambda item: item[0].position_mm)
+    seen = "; ".join(f"{condition.label} {fit.modes[0].f_hz:.2f} Hz" for condition, fit in rising)
+    return f"the plant follows the place; lowest resonance at {seen}"
 
 
 def _node(condition: Condition, fit: Fit) -> GridNode:

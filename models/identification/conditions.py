@@ -48,6 +48,11 @@ class Condition:
             if kg == 0.0:
                 raise ModelError(f"condition {text!r}: a weight of 0 kg tells nothing")
             return cls(f"+{kg:g}kg", added_kg=kg)
+        if _WEIGHT.fullmatch(f"+{text}"):
+            raise ModelError(
+                f"condition {text!r}: a weight is written with its sign, +{text}; if none is "
+                "meant, take another label"
+            )
         if text.startswith("+") or "=" in text:
             place = _place(text)
             return cls(",".join(f"{axis}={at:g}" for axis, at in place), position_mm=place)

@@ -6,7 +6,7 @@ a set. What was measured with a weight on the bed or at different places becomes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -162,15 +162,14 @@ class _AxisWork:
             found = self._from_responses()
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = list(found.notes)
-        for one in self._used:
-            notes += [f"{one.measurement.source}: {n}" for n in one.measurement.notes]
+        used = [one.measurement for one in self._used]
+        notes += _by_file((m.source, n) for m in used for n in m.notes)
         for one in self._left_out:
             notes.append(
                 f"{one.measurement.source}: not used, because a {self._kind} of axis {self._axis} "
                 "says more"
             )
-        for response in found.measured:
-            notes += [f"{response.source}: {n}" for n in response.notes]
+        notes += _by_file((r.source, n) for r in found.measured for n in r.notes)
         warnings = (*_fit_warnings(found.fit), *found.warnings) if found.fit else found.warnings
         return replace(found, notes=tuple(dict.fromkeys(notes)), warnings=warnings)
 
@@ -216,13 +215,13 @@ class _AxisWork:
 
     def _from_spectra(self) -> AxisIdentification:
         spectra: list[tuple[Spectrum, Excitation, Condition]] = []
-        notes: list[str] = []
+        notes: list[tuple[str, str]] = []
         for one in self._used:
             spectrum = one.measurement
             assert isinstance(spectrum, Spectrum)
             spectra.append((spectrum, excitation_for(spectrum, self._settings), one.condition))
             assumed = excitation_notes(spectrum, self._settings)
-            notes += [f"{spectrum.source}: {note}" for note in assumed]
+            notes += [(spectrum.source, note) for note in assumed]
             self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
         common = usual([c for _, _, c in spectra], self._axis)
         chosen = [(s, e) for s, e, c in spectra if c in common]
@@ -248,7 +247,7 @@ class _AxisWork:
             for condition in special([c for _, _, c in spectra])
         }
         others = tuple(s for s, _, c in spectra if c not in common)
-        found = replace(found, measured=(*found.measured, *others), notes=tuple(notes))
+        found = replace(found, measured=(*found.measured, *others), notes=tuple(_by_file(notes)))
         return scheduled(found, nominal, fits, self._kind)
 
     def _response(self, one: Measured) -> FrequencyResponse:
@@ -284,12 +283,12 @@ class _AxisWork:
             along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
             most = max(along, key=along.__getitem__, default=self._axis)
             if most != self._axis and along[most] > _MOSTLY:
-                warnings.append(
-                    f"{response.source}: the sensor's {most} moved in the test of axis "
-                    f"{self._axis}; unless it is mounted so (say it by sensor_axis {most}), "
-                    "another axis was measured"
+                text = (
+                    f"the sensor's {most} moved in the test of axis {self._axis}; unless it is "
+                    f"mounted so (sensor_axis {most} says that), another axis was measured"
                 )
-        return warnings
+                warnings.append((response.source, text))
+        return _by_file(warnings)
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
@@ -309,6 +308,14 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
             "X and Y from tests along X and along Y"
         )
     return "x" if abs(x) > abs(y) else "y"
+
+
+def _by_file(told: Iterable[tuple[str, str]]) -> list[str]:
+    """Put the names of all files before what is said of them, each text once."""
+    sources: dict[str, list[str]] = {}
+    for source, text in dict.fromkeys(told):
+        sources.setdefault(text, []).append(source)
+    return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
 
 
 def _fit_warnings(fit: Fit) -> tuple[str, ...]:

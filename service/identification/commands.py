@@ -55,7 +55,7 @@ High = Annotated[float | None, typer.Option(help="max_freq of [resonance_tester]
 Rate = Annotated[float | None, typer.Option(help="hz_per_sec of [resonance_tester].")]
 Sweep = Annotated[float | None, typer.Option(help="sweeping_accel; 0: none.")]
 Firmware = Annotated[
-    str | None, typer.Option(metavar="DATE", help="Of the Klipper version that measured.")
+    str | None, typer.Option(metavar="YYYY-MM-DD", help="Of the Klipper version that measured.")
 ]
 Sensor = Annotated[
     Literal["x", "y", "z"] | None, typer.Option(help="Sensor axis along the tested axis.")

@@ -152,7 +152,7 @@ def machine_from_config(
     document: dict[str, Any] = {
         "name": name,
         "title": title or name,
-        "source": f"{config.name}; the plants were not measured",
+        "source": config.name,
         "axes": {
             axis: _typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
             for axis, given in zip("xy", f_hz, strict=True)

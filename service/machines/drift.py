@@ -83,14 +83,20 @@ def _of_axis(axis: str, history: Sequence[Revision], since: date | None) -> Drif
 
 
 def _measurements(axis: str, history: Sequence[Revision]) -> list[tuple[Revision, date]]:
-    """Return the revisions that brought a new measurement of the axis, with its day."""
+    """Return the revisions that brought a new measurement of the axis, with its day.
+
+    Nominal plants of machines whose plant follows the place are of some place in the middle: they
+    are not compared with others.
+    """
     found = []
     for earlier, revision in pairwise([None, *history]):
         assert revision is not None
         plants = revision.machine.axes[axis]  # type: ignore[index]
         known = plants.provenance
         same = earlier is not None and earlier.machine.axes[axis] == plants  # type: ignore[index]
-        if known is None or known.kind == "typed in" or same or revision.restored:
+        schedule = revision.machine.schedules.get(axis)  # type: ignore[call-overload]
+        placed = schedule is not None and schedule.grid is not None
+        if known is None or known.kind == "typed in" or same or placed or revision.restored:
             continue
         found.append((revision, known.measured_on or revision.when.date()))
     return found

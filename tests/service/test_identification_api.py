@@ -137,7 +137,7 @@ def test_broken_files_leave_the_store_as_it_was(what: str, client: TestClient, d
         ({"axis": "q"}, ["axis 'q'"]),
         ({"accel_per_hz": -1}, ["accel_per_hz"]),
         ({"accel_per_hz": "nan"}, ["accel_per_hz"]),
-        ({"min_freq": 90}, ["f_start_hz 90"]),
+        ({"min_freq": 90}, ["min_freq 90"]),
         ({"firmware_date": "soon"}, ["firmware_date"]),
         ({"sensor_axis": "q"}, ["sensor_axis"]),
         ({"max_order": 9}, ["max_order"]),

@@ -139,6 +139,17 @@ def test_drift_over_months():
     assert drift(history, since=date(2026, 8, 1)) == ()
 
 
+def test_the_middle_of_a_grid_is_not_compared():
+    nodes = [
+        {"z_mm": z, "plant": {"kind": "modes", "modes": [{"f_hz": f, "zeta": 0.05}]}}
+        for z, f in ((0.0, 52.0), (240.0, 46.0))
+    ]
+    axes = {"x": measured(49.0, date(2026, 9, 2)), "y": make_plants(45.0)}
+    placed = make_machine(axes=axes, schedules={"x": {"grid": {"nodes": nodes}}})
+    later = Revision.of(placed, number=2, when=MARCH, author="anna")
+    assert drift([revision(1, measured(52.0, date(2026, 3, 2))), later]) == ()
+
+
 def test_scatter_is_no_drift():
     """The repeats of one Voron 2.4: 64.8, 65.3 Hz in a session; 66 to 68 Hz over weeks."""
     day = date(2026, 3, 2)

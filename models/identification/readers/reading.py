@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from models.errors import ModelError
@@ -75,10 +76,21 @@ def read_content(
     settings = settings or ReadSettings()
     if not content.strip():
         raise ModelError(f"{name}: the file is empty")
-    axis = axis or settings.axis or _axis_in_name(name)
+    named = _axis_in_name(name)
+    axis = axis or settings.axis or named
     if axis is not None:
         axis = axis.strip().lower()
         direction_of(axis, allow_z=True)
+    found = _from_content(content, name, axis, settings)
+    if named in (None, axis):
+        return found
+    note = f"its name says axis {named}; it was taken as axis {axis}"
+    return tuple(replace(one, notes=(*one.notes, note)) for one in found)
+
+
+def _from_content(
+    content: bytes, name: str, axis: str | None, settings: ReadSettings
+) -> tuple[Measurement, ...]:
     if is_matlab(content):
         return read_matlab_models(content, name, axis, settings)
     if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):

@@ -26,8 +26,18 @@ Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
 _NEW_TEST = date(2024, 12, 1)
+_KLIPPER = {
+    "accel_per_hz_mm_s": "accel_per_hz",
+    "f_start_hz": "min_freq",
+    "f_end_hz": "max_freq",
+    "hz_per_s": "hz_per_sec",
+    "sweeping_accel_mm_s2": "sweeping_accel",
+    "sweeping_period_s": "sweeping_period",
+}
+"""What users call them: options of [resonance_tester]."""
 _OLD = {"accel_per_hz_mm_s": 75.0, "f_end_hz": 10000.0 / 75.0, "sweeping_accel_mm_s2": 0.0}
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
+_DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
 
 
@@ -83,6 +93,13 @@ class ReadSettings(BaseModel):
     repair_rounding: bool = False
     dc_gain: Positive | None = None
 
+    @field_validator("firmware_date", mode="before")
+    @classmethod
+    def _day(cls, day: object) -> object:
+        if isinstance(day, str) and not _DAY.fullmatch(day):
+            raise ModelError("a date is written YYYY-MM-DD")
+        return day
+
     @field_validator("axis")
     @classmethod
     def _known_axis(cls, axis: str | None) -> str | None:
@@ -94,7 +111,7 @@ class ReadSettings(BaseModel):
     def _consistent(self) -> ReadSettings:
         low, high = self.f_start_hz, self.f_end_hz
         if low is not None and high is not None and low >= high:
-            raise ModelError(f"f_start_hz {low:g} must be below f_end_hz {high:g}")
+            raise ModelError(f"min_freq {low:g} must be below max_freq {high:g}")
         if self.repair_rounding and self.dc_gain is not None:
             raise ModelError("repair_rounding makes the DC gain 1; leave out dc_gain")
         return self
@@ -192,11 +209,11 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
         values[name] = _OLD.get(name, getattr(defaults, name)) if old else getattr(defaults, name)
         idle = name == "sweeping_period_s" and values["sweeping_accel_mm_s2"] == 0
         if not idle:
-            assumed.append(f"{name} {values[name]:g}")
+            assumed.append(f"{_KLIPPER[name]} {values[name]:g}")
     if values["f_start_hz"] >= values["f_end_hz"]:
         raise ModelError(
             f"{measurement.source}: the test would run from {values['f_start_hz']:g} to "
-            f"{values['f_end_hz']:g} Hz; give both f_start_hz and f_end_hz"
+            f"{values['f_end_hz']:g} Hz; give both min_freq and max_freq"
         )
     excitation = Excitation(direction=defaults.direction, **values)
     if not assumed:

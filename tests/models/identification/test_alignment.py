@@ -152,7 +152,7 @@ def test_wrong_logs_have_their_own_messages() -> None:
         "the file is a test of axis y": replace(good, axis="y"),
         "more than one test": twice,
         "begins 3.0 s after the start of the test, at 8.0 Hz": log_of(lead_s=-3.0),
-        "at 19.0 Hz of 25 Hz.*give f_end_hz = 18 |at 19.0 Hz of 25 Hz.*give f_end_hz = 19 ": log_of(
+        "at 19.0 Hz of 25 Hz.*give max_freq = 18 |at 19.0 Hz of 25 Hz.*give max_freq = 19 ": log_of(
             tail_s=-6.0
         ),
         "too short to find": log_of(tail_s=-12.0),
@@ -167,8 +167,8 @@ def test_wrong_logs_have_their_own_messages() -> None:
     [
         ({"hz_per_s": 2.0}, "the test is not in the log.*at 2 Hz/s.*check min_freq"),
         ({"hz_per_s": 0.9}, "the test is not in the log"),
-        ({"f_start_hz": 4.0}, "correct f_start_hz"),
-        ({"f_end_hz": 40.0}, "record the whole test, or give f_end_hz = 25"),
+        ({"f_start_hz": 3.5}, "correct min_freq"),
+        ({"f_end_hz": 40.0}, "record the whole test, or give max_freq = 25"),
     ],
 )
 def test_wrong_settings_are_found(wrong: dict[str, float], message: str) -> None:

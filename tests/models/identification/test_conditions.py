@@ -21,7 +21,6 @@ from models.identification.conditions import Condition
         ("z=150.0", Condition("z=150", (("z", 150.0),))),
         ("y=100, x=-50.5", Condition("x=-50.5,y=100", (("x", -50.5), ("y", 100.0)))),
         ("run 2", Condition("run 2")),
-        ("0.5kg", Condition("0.5kg")),
     ],
 )
 def test_what_is_read(text: str, expected: Condition) -> None:
@@ -30,7 +29,21 @@ def test_what_is_read(text: str, expected: Condition) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["+0kg", "+0.5", "+kg", "+-1kg", "+1lb", "z=", "z=high", "z=1e3", "a=1", "x=1;y=2", "z=1,z=2"],
+    [
+        "0.5kg",
+        "500 g",
+        "+0kg",
+        "+0.5",
+        "+kg",
+        "+-1kg",
+        "+1lb",
+        "z=",
+        "z=high",
+        "z=1e3",
+        "a=1",
+        "x=1;y=2",
+        "z=1,z=2",
+    ],
 )
 def test_what_is_refused(text: str) -> None:
     with pytest.raises(ModelError, match="condition"):

@@ -118,9 +118,25 @@ def test_a_model_goes_before_measurements() -> None:
         identify([at(PlantModel(spec, "x", name)) for name in ("a.json", "b.json")])
 
 
+def test_what_is_said_of_several_files_is_said_once() -> None:
+    files = [quick_raw("x", name=f"20260101_12000{i}", seed=i) for i in range(2)]
+    (assumed,) = [note for note in one(*files).notes if "assumed" in note]
+    assert assumed.startswith(
+        "raw_data_x_20260101_120000.csv, raw_data_x_20260101_120001.csv: assumed accel_per_hz 60"
+    )
+
+
+def test_a_name_that_says_another_axis_is_told() -> None:
+    found = one(quick_raw("x"), settings=SETTINGS.model_copy(update={"axis": "y"}))
+    assert found.axis == "y"
+    assert any(
+        note.endswith("its name says axis x; it was taken as axis y") for note in found.notes
+    )
+
+
 def test_assumptions_are_noted_by_file() -> None:
     assert any(
-        note.startswith("raw_data_x_20260101_120000.csv: assumed accel_per_hz_mm_s 60")
+        note.startswith("raw_data_x_20260101_120000.csv: assumed accel_per_hz 60, min_freq 5")
         for note in one(quick_raw("x")).notes
     )
 
@@ -277,6 +293,8 @@ def test_heights_make_a_grid() -> None:
     grid = found.schedule.grid
     assert grid is not None
     assert [node.z_mm for node in grid.nodes] == [0.0, 100.0, 200.0]
+    (told,) = [note for note in found.notes if "follows the place" in note]
+    assert told.endswith("at z=0 44.00 Hz; z=100 42.00 Hz; z=200 40.00 Hz")
     for node, f_hz in zip(grid.nodes, (44.0, 42.0, 40.0), strict=True):
         assert isinstance(node.plant, PairsSpec)
         assert node.plant.poles[0].f_hz == pytest.approx(f_hz, rel=1e-3)
