@@ -1,0 +1,194 @@
+"""Open any print file as plain G-code, and write it back in what it came in.
+
+The text is spooled to disk, in files without a name, of which nothing is left even if the process
+is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+from gcode.containers.bgcode import BinaryGcode
+from gcode.containers.sniff import Kind, kind_named, sniff
+from gcode.containers.threemf import ThreeMf
+from gcode.errors import GcodeError
+
+__all__ = ["Container", "Told", "open_text", "rewriting"]
+
+Told = Callable[[float], None]
+"""Is told the share that is done, now and then; may raise to stop the work."""
+
+_COMPARED_BYTES = 1 << 20
+_NAMES = {Kind.TEXT: "plain G-code", Kind.BGCODE: "binary G-code", Kind.THREEMF: "a 3MF package"}
+
+
+@dataclass(frozen=True, slots=True)
+class Container:
+    """What a text came in.
+
+    Attributes
+    ----------
+    kind : Kind
+    source : Path
+    text : BinaryIO
+        The G-code, seekable, open as long as the block of `open_text`.
+    """
+
+    kind: Kind
+    source: Path
+    text: BinaryIO
+    _packed: BinaryGcode | ThreeMf | None
+
+    def write(self, text: BinaryIO, target: Path, told: Told = lambda _: None) -> None:
+        """Write a text in the same kind of container, with the settings and all else of the old.
+
+        If the text has not changed, the file does not change either.
+
+        Parameters
+        ----------
+        text : BinaryIO
+            Seekable; all of it is written.
+        target : Path
+            Is written in place: guard it.
+        told : callable, optional
+
+        Raises
+        ------
+        GcodeError
+            The container cannot hold this text.
+        """
+        text.seek(0)
+        if self._packed is None:
+            _copy(text, target)
+        elif _same(text, self.text):
+            with self.source.open("rb") as original:
+                _copy(original, target)
+        else:
+            size = max(text.seek(0, io.SEEK_END), 1)
+            text.seek(0)
+            with target.open("wb") as file:
+                self._packed.write(text, file, lambda done: told(done / size))
+
+    def write_plain(self, text: BinaryIO, target: Path) -> None:
+        """Write plain G-code, with what the container knows as comments where it has a form."""
+        text.seek(0)
+        if self._packed is None:
+            _copy(text, target)
+            return
+        with target.open("wb") as file:
+            self._packed.write_plain(text, file)
+
+
+@contextlib.contextmanager
+def open_text(
+    path: Path,
+    *,
+    plate: int | None = None,
+    folder: Path | None = None,
+    told: Told = lambda _: None,
+) -> Iterator[Container]:
+    """Open a print file of any kind for reading its G-code.
+
+    Parameters
+    ----------
+    path : Path
+        Plain or binary G-code or a sliced 3MF package, whatever its name.
+    plate : int, optional
+        Plate of a package with several.
+    folder : Path, optional
+        Where the text is spooled; the system's folder for temporary files by default.
+    told : callable, optional
+
+    Yields
+    ------
+    Container
+        With the text at its beginning.
+
+    Raises
+    ------
+    GcodeError
+        The container is damaged, of an unknown kind, or lacks the plate.
+    """
+    kind = sniff(path)
+    if plate is not None and kind is not Kind.THREEMF:
+        raise GcodeError(f"a plate was chosen, but the file is {_NAMES[kind]} and has no plates")
+    if kind is Kind.TEXT:
+        with path.open("rb") as text:
+            yield Container(kind, path, text, None)
+        return
+    with tempfile.TemporaryFile(dir=folder) as spool:
+        packed = (
+            BinaryGcode(path, spool, told)
+            if kind is Kind.BGCODE
+            else ThreeMf(path, spool, told, plate)
+        )
+        spool.seek(0)
+        yield Container(kind, path, spool, packed)
+
+
+@contextlib.contextmanager
+def rewriting(
+    container: Container, target: Path, *, name: Path, told: Told = lambda _: None
+) -> Iterator[BinaryIO]:
+    """Yield a file for the new text; when the block ends well, `target` holds it in its container.
+
+    Parameters
+    ----------
+    container : Container
+    target : Path
+        Is written in place: guard it.
+    name : Path
+        What the target will be called. A name of plain G-code, where the source has another,
+        asks for plain G-code.
+    told : callable, optional
+
+    Raises
+    ------
+    GcodeError
+        The name asks for another container than the source's.
+    """
+    plain = _asks_for_plain(container, name)
+    if container.kind is Kind.TEXT:
+        with target.open("wb") as text:
+            yield text
+        return
+    with tempfile.TemporaryFile(dir=target.parent) as spool:
+        yield spool
+        if plain:
+            container.write_plain(spool, target)
+        else:
+            container.write(spool, target, told)
+
+
+def _asks_for_plain(container: Container, name: Path) -> bool:
+    wanted = kind_named(name)
+    if wanted in (None, container.kind) or name.suffix.lower() == container.source.suffix.lower():
+        return False
+    if wanted is Kind.TEXT:
+        return True
+    kinds = _NAMES[container.kind], _NAMES[wanted or Kind.TEXT]
+    raise GcodeError(
+        f"{name.name} is a name of {kinds[1]}, and the input is {kinds[0]}: it can be written as "
+        "it came or as plain G-code; choose another name"
+    )
+
+
+def _same(one: BinaryIO, other: BinaryIO) -> bool:
+    one.seek(0)
+    other.seek(0)
+    while (data := one.read(_COMPARED_BYTES)) == other.read(_COMPARED_BYTES):
+        if not data:
+            return True
+    return False
+
+
+def _copy(source: BinaryIO, target: Path) -> None:
+    with target.open("wb") as file:
+        while data := source.read(_COMPARED_BYTES):
+            file.write(data)

@@ -1,0 +1,46 @@
+"""What a file is by its first bytes; its name does not count.
+
+Slicers hand post-processing scripts files without an extension or with one of their own.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+
+__all__ = ["Kind", "kind_named", "sniff"]
+
+
+class Kind(Enum):
+    """The containers of G-code, each with its media type."""
+
+    TEXT = "text/x.gcode"
+    BGCODE = "application/gcode+binary"
+    THREEMF = "model/3mf"
+
+
+_MAGICS = {
+    b"GCDE": Kind.BGCODE,
+    b"PK\x03\x04": Kind.THREEMF,
+    b"PK\x05\x06": Kind.THREEMF,
+}
+_SUFFIXES = {
+    ".gcode": Kind.TEXT,
+    ".gco": Kind.TEXT,
+    ".g": Kind.TEXT,
+    ".nc": Kind.TEXT,
+    ".bgcode": Kind.BGCODE,
+    ".bgc": Kind.BGCODE,
+    ".3mf": Kind.THREEMF,
+}
+
+
+def sniff(path: Path) -> Kind:
+    """Return what a file is, by its magic number; text if it has none."""
+    with path.open("rb") as file:
+        return _MAGICS.get(file.read(4), Kind.TEXT)
+
+
+def kind_named(path: Path) -> Kind | None:
+    """Return what a file to be written shall be by its name; None if the name does not say."""
+    return _SUFFIXES.get(path.suffix.lower())

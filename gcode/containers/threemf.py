@@ -1,0 +1,190 @@
+"""Sliced 3MF packages (.gcode.3mf): a zip archive with the G-code of each plate.
+
+`Metadata/plate_N.gcode` is the G-code, `Metadata/plate_N.gcode.md5` its MD5 in hexadecimal digits
+(upper case from the slicers seen; the case found is kept), which the printer checks. Nothing is
+ever unpacked to names of the archive.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import lzma
+import re
+import shutil
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path, PurePosixPath
+from typing import BinaryIO
+
+from gcode.containers.limits import check_unpacked, largest_unpacked
+from gcode.errors import GcodeError
+
+__all__ = ["ThreeMf"]
+
+_PLATE = re.compile(r"Metadata/plate_(\d{1,4})\.gcode")
+_COPY_BYTES = 1 << 20
+_MOST_MEMBERS = 10_000
+_BROKEN = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    struct.error,
+    NotImplementedError,
+    RuntimeError,
+    ValueError,
+    OverflowError,
+    IndexError,
+)
+"""What zipfile raises for damaged, encrypted and newer archives."""
+
+
+class ThreeMf:
+    """What a package needs to be written anew around another text of one plate.
+
+    Parameters
+    ----------
+    source : Path
+        The file; read again when another is written.
+    text : BinaryIO
+        Receives the G-code.
+    told : callable
+        Is told the share of the plate that was read, now and then.
+    plate : int, optional
+        Which plate; needed if several are sliced.
+
+    Raises
+    ------
+    GcodeError
+        The archive is damaged, encrypted or unpacks to more than is sane, or has no such plate.
+    """
+
+    def __init__(
+        self, source: Path, text: BinaryIO, told: Callable[[float], None], plate: int | None
+    ) -> None:
+        self._source = source
+        with _reading(source) as archive:
+            _check(archive, largest_unpacked(source))
+            self._name = _chosen(archive.namelist(), plate)
+            size = max(archive.getinfo(self._name).file_size, 1)
+            with archive.open(self._name) as member:
+                while data := member.read(_COPY_BYTES):
+                    text.write(data)
+                    told(member.tell() / size)
+
+    def write(self, text: BinaryIO, target: BinaryIO, told: Callable[[float], None]) -> None:
+        """Write a package around a text; its other members and plates are kept as they are."""
+        digest = _md5(text)
+        with _reading(self._source) as archive, zipfile.ZipFile(target, "w") as made:
+            made.comment = archive.comment
+            for info in archive.infolist():
+                with made.open(_like(info), "w") as member:
+                    if info.filename == self._name:
+                        while data := text.read(_COPY_BYTES):
+                            member.write(data)
+                            told(text.tell())
+                    elif info.filename == f"{self._name}.md5":
+                        member.write(_renewed(archive.read(info), digest))
+                    else:
+                        with archive.open(info) as original:
+                            shutil.copyfileobj(original, member, _COPY_BYTES)
+
+    def write_plain(self, text: BinaryIO, target: BinaryIO) -> None:
+        """Write plain G-code: the text as it is."""
+        shutil.copyfileobj(text, target, _COPY_BYTES)
+
+
+@contextlib.contextmanager
+def _reading(source: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; what is wrong with it becomes a `GcodeError`."""
+    try:
+        with warnings.catch_warnings(), zipfile.ZipFile(source) as archive:
+            # Of names that occur twice, which are refused.
+            warnings.simplefilter("ignore", UserWarning)
+            yield archive
+    except GcodeError:
+        raise
+    except _BROKEN as error:
+        raise _broken(error) from None
+    except OSError as error:
+        # A damaged directory makes zipfile seek before the beginning.
+        if error.errno != errno.EINVAL:
+            raise
+        raise _broken(error) from None
+
+
+def _broken(error: Exception) -> GcodeError:
+    reason = str(error) or type(error).__name__
+    return GcodeError(f"the 3MF package cannot be read ({reason}): copy or export it again")
+
+
+def _check(archive: zipfile.ZipFile, largest: int) -> None:
+    members = archive.infolist()
+    if len(members) > _MOST_MEMBERS:
+        raise GcodeError(
+            f"the 3MF package has {len(members)} members, more than {_MOST_MEMBERS}: "
+            "that is no sliced print"
+        )
+    check_unpacked(sum(info.file_size for info in members), largest)
+    names = [info.filename for info in members]
+    if len(set(names)) < len(names):
+        raise GcodeError("the 3MF package has members of the same name: export it again")
+    for name in names:
+        path = PurePosixPath(name.replace("\\", "/"))
+        if path.is_absolute() or ".." in path.parts or ":" in name:
+            raise GcodeError(
+                f"the 3MF package has a member that leads out of it, {name[:80]!r}: "
+                "no slicer made it; export it again"
+            )
+
+
+def _chosen(names: list[str], plate: int | None) -> str:
+    plates = {int(found[1]): name for name in names if (found := _PLATE.fullmatch(name))}
+    if not plates:
+        raise GcodeError(
+            "the package holds no sliced plate (Metadata/plate_N.gcode): slice it, and export the "
+            "sliced file"
+        )
+    listed = ", ".join(str(number) for number in sorted(plates))
+    if plate is None:
+        if len(plates) > 1:
+            raise GcodeError(
+                f"the package holds several sliced plates ({listed}): say which one to work on "
+                "(--plate N, or plate=N over HTTP); the others stay as they are"
+            )
+        (plate,) = plates
+    if plate not in plates:
+        raise GcodeError(f"the package holds no sliced plate {plate}; there is {listed}")
+    return plates[plate]
+
+
+def _md5(text: BinaryIO) -> str:
+    digest = hashlib.md5(usedforsecurity=False)
+    while data := text.read(_COPY_BYTES):
+        digest.update(data)
+    text.seek(0)
+    return digest.hexdigest()
+
+
+def _like(info: zipfile.ZipInfo) -> zipfile.ZipInfo:
+    """Describe a member to be written as the original was, but for sizes and checksum."""
+    made = zipfile.ZipInfo(info.filename, info.date_time)
+    made.compress_type = info.compress_type
+    made.external_attr = info.external_attr
+    made.create_system = info.create_system
+    made.comment = info.comment
+    made.file_size = info.file_size  # tells whether large sizes are needed
+    return made
+
+
+def _renewed(old: bytes, digest: str) -> bytes:
+    """Return the digest in the form of the old one; behind it, say a line end is kept."""
+    form = re.match(rb"\s*([0-9A-Fa-f]{32})", old)
+    lower = form is not None and form[1] != form[1].upper()
+    made = digest if lower else digest.upper()
+    return made.encode("ascii") + (old[form.end() :] if form else b"")
