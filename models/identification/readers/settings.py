@@ -36,6 +36,7 @@ _KLIPPER = {
 }
 """What users call them: options of [resonance_tester]."""
 _OLD = {"accel_per_hz_mm_s": 75.0, "f_end_hz": 10000.0 / 75.0, "sweeping_accel_mm_s2": 0.0}
+_LEAST_END_HZ, _END_DIFFERS_HZ = 40.0, 8.0
 _DIAGONAL = re.compile(r"-?\d+(\.\d+)?,-?\d+(\.\d+)?(,-?\d+(\.\d+)?)?")
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
@@ -200,6 +201,14 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
     }
     if isinstance(measurement, Spectrum) and measurement.accel_per_hz_mm_s is not None:
         given["accel_per_hz_mm_s"] = measurement.accel_per_hz_mm_s
+    found: list[str] = []
+    if isinstance(measurement, Spectrum) and not old and settings.f_end_hz is None:
+        given["f_end_hz"] = _end_of_range(measurement, defaults.f_end_hz)
+        if given["f_end_hz"] is not None:
+            found.append(
+                f"the table reaches {measurement.f_hz[-1]:g} Hz, 1.5 max_freq: so max_freq is "
+                f"{given['f_end_hz']:g}; give it if the table was cut"
+            )
     values: dict[str, float] = {}
     assumed: list[str] = []
     for name, value in given.items():
@@ -216,12 +225,24 @@ def _resolved(measurement: AccelerationLog | Spectrum, settings: ReadSettings) -
             f"{values['f_end_hz']:g} Hz; give both min_freq and max_freq"
         )
     excitation = Excitation(direction=defaults.direction, **values)
-    if not assumed:
-        return _Resolved(excitation, ())
-    return _Resolved(
-        excitation,
-        (f"assumed {', '.join(assumed)}: the defaults of Klipper {_era(made, settings)}",),
-    )
+    if assumed:
+        era = _era(made, settings)
+        found.append(f"assumed {', '.join(assumed)}: the defaults of Klipper {era}")
+    return _Resolved(excitation, tuple(found))
+
+
+def _end_of_range(spectrum: Spectrum, default_hz: float) -> float | None:
+    """Return max_freq if the table tells that it is not the default, nor that of before.
+
+    Since 2024-12 tables end at the last bin up to 1.5 max_freq (klippy/extras/
+    resonance_tester.py), before then at 200 Hz.
+    """
+    bin_hz = float(spectrum.f_hz[-1] - spectrum.f_hz[-2])
+    least = float(spectrum.f_hz[-1]) / 1.5
+    if least < _LEAST_END_HZ or abs(least - default_hz) < _END_DIFFERS_HZ:
+        return None
+    whole = 5.0 * math.ceil(least / 5.0 - 1e-9)
+    return whole if whole < least + bin_hz / 1.5 else least
 
 
 def _era(made: date | None, settings: ReadSettings) -> str:

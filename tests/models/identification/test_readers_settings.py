@@ -46,7 +46,24 @@ def test_defaults_by_date(
     assert excitation_for(spectrum(source), settings) == expected
     (note,) = excitation_notes(spectrum(source), settings)
     assert words in note
-    assert f"accel_per_hz_mm_s {expected.accel_per_hz_mm_s:g}" in note
+    assert f"accel_per_hz {expected.accel_per_hz_mm_s:g}" in note
+
+
+@pytest.mark.parametrize(
+    ("max_freq", "last_hz", "expected"),
+    [(100, 150.0, 100.0), (100, 149.2, 100.0), (300, 449.6, 300.0), (135, 201.6, 135.0),
+     (135, 199.5, 135.0), (112, 167.2, 111.467)],
+)  # fmt: skip
+def test_range_by_where_the_table_ends(max_freq: float, last_hz: float, expected: float) -> None:
+    f_hz = np.arange(0.0, last_hz + 1.0, 1.0) + (last_hz % 1.0)
+    table = Spectrum(f_hz, {"x": np.ones(len(f_hz))}, "x", "resonances_x_20260101.csv")
+    assert table.f_hz[-1] == pytest.approx(last_hz, abs=1.0)
+    assert excitation_for(table).f_end_hz == pytest.approx(expected, abs=0.7)
+    told = any("so max_freq is" in note for note in excitation_notes(table))
+    assert told == (max_freq != 135)
+    old = ReadSettings(firmware_date=date(2023, 1, 1))
+    assert excitation_for(table, old).f_end_hz == pytest.approx(10000 / 75)
+    assert excitation_for(table, ReadSettings(f_end_hz=90)).f_end_hz == 90.0
 
 
 def test_file_before_settings_before_defaults() -> None:
