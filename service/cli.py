@@ -35,7 +35,8 @@ app.add_typer(machines.app, name="machines")
 _INTERRUPTED = 130
 _METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
-    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei"
+    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
+    "it undoes the machine's ripple too"
 )
 
 Input = Annotated[Path, typer.Argument(metavar="IN", help="The sliced file.")]
@@ -161,7 +162,7 @@ def plan(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="motion.npz")],
     rate: Annotated[float, typer.Option(min=1.0, max=100_000.0, help="Samples per second.")] = 1e3,
 ) -> None:
-    """Write the motion the machine will make: t, x, y, z, e, sampled."""
+    """Write the motion the machine will make. Columns t, x, y, z, e."""
     _check_input(source)
     target = _check_output(output)
     if target == source.resolve():
@@ -183,7 +184,7 @@ def simulate(
         Path, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
     ],
 ) -> None:
-    """Report how far the nozzle will be from its path; no G-code is written."""
+    """Report how far the nozzle will be from its path. No G-code is written."""
     _check_input(source)
     _check_folder(report)
     found = _machine(machine)
@@ -208,7 +209,7 @@ def design(
         Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
     ] = None,
 ) -> None:
-    """Look at the design for one axis: plant, metrics, ladder, and what errors of it cost."""
+    """Look at the design for one axis. Plant, metrics, ladder, and what errors of it cost."""
     _check_folder(report)
     found = machines.open_machines().to_look_at(machine, files=True).machine
 

@@ -118,7 +118,7 @@ def run(
     by: By = None,
     message: Message = "",
 ) -> None:
-    """Make a machine of measurements: resonance tests, recorded drives, responses, models.
+    """Make a machine of measurements. Resonance tests, recorded drives, responses, models.
 
     Without --machine and --output nothing is stored: the figures are printed.
     """

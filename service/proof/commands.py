@@ -58,7 +58,7 @@ def coupon(
     start_gcode: StartGcode = None,
     end_gcode: EndGcode = None,
 ) -> None:
-    """Write a first print: its left half as planned, its right half compensated."""
+    """Write a first print: left half as planned, right half compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
     found = open_machines().for_job(machine, files=True)
 
@@ -84,7 +84,7 @@ def tower(
     start_gcode: StartGcode = None,
     end_gcode: EndGcode = None,
 ) -> None:
-    """Write a ringing tower, each band half as planned and half compensated."""
+    """Write a ringing tower: left half as planned, right compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
     found = open_machines().for_job(machine, files=True)
 
@@ -115,7 +115,7 @@ def verify(
         typer.Option("--report", metavar="DIR", file_okay=False, help="For readback.html, .json."),
     ] = None,
 ) -> None:
-    """Compare an accelerometer log of a print with what the model says of that print."""
+    """Compare a log of a print with what the model says of it."""
     found = open_machines().to_look_at(machine, files=True).machine
 
     from service.console import progress_shown

@@ -76,7 +76,7 @@ def scan(
         Path | None, typer.Option("--report", metavar="DIR", help="For scan.html and scan.json.")
     ] = None,
 ) -> None:
-    """Make the command of a hatch file for a scanner, and predict every track."""
+    """Make the command of a hatch file for a scanner. Every track is predicted."""
     if output.suffix not in (".csv", ".npz"):
         raise typer.BadParameter(f"{output}: the command is written as .csv or .npz")
     if output.resolve() == source.resolve():
