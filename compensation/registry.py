@@ -1,15 +1,13 @@
-"""The list of compensators by name."""
+"""The list of compensators by name.
+
+Each is imported when it is asked for: together they load a second's worth of libraries.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 from compensation.base import Compensator, DesignError
-from compensation.fbf import PreviewFbf
-from compensation.inverting import InversionCompensator
-from compensation.ripple import PassThrough, RippleCompensator
-from compensation.scheduled import ScheduledCompensator
-from compensation.shapers import ShaperCompensator
 from models.machine import Machine
 
 __all__ = ["COMPENSATORS", "INVERSIONS", "compensator"]
@@ -32,19 +30,29 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         If there is no such compensator or it cannot be designed for this machine.
     """
     if name.endswith(_RIPPLE):
+        from compensation.ripple import PassThrough, RippleCompensator
+
         within = name.removesuffix(_RIPPLE)
         plain = within == "none"
         inner = PassThrough() if plain else compensator(within, machine, dt_s, **settings)
         return RippleCompensator(inner, machine, dt_s)
     if machine.schedules:
+        from compensation.scheduled import ScheduledCompensator
+
         return ScheduledCompensator(
             machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
         )
     if name == "fbf":
+        from compensation.fbf import PreviewFbf
+
         return PreviewFbf(machine, dt_s, **settings)
     if name in INVERSIONS:
+        from compensation.inverting import InversionCompensator
+
         return InversionCompensator(machine, dt_s, kind=name, **settings)
     if name.startswith("shaper:"):
+        from compensation.shapers import ShaperCompensator
+
         shaper = name.removeprefix("shaper:")
         return ShaperCompensator(machine, dt_s, shaper=shaper, **settings)
     raise DesignError(f"no compensator is called {name!r}; there are {', '.join(COMPENSATORS)}")

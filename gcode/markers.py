@@ -44,8 +44,9 @@ _PATTERNS: tuple[tuple[re.Pattern[str], MarkKind], ...] = tuple(
     (re.compile(pattern), kind)
     for pattern, kind in (
         (r"; ?stillpath\b|; Processed by stillpath ", MarkKind.STAMP),
-        (r"; ?STILLPATH_OFF\s*$", MarkKind.OFF),
-        (r"; ?STILLPATH_ON\s*$", MarkKind.ON),
+        # Typed by people: one that is missed lets moves be changed that shall not be.
+        (r";\s*(?i:stillpath_off)\b", MarkKind.OFF),
+        (r";\s*(?i:stillpath_on)\b", MarkKind.ON),
         (r";LAYER_CHANGE\s*$", MarkKind.LAYER),  # PrusaSlicer, SuperSlicer, Orca, Creality
         (r"; CHANGE_LAYER\s*$", MarkKind.LAYER),  # Bambu
         (r";LAYER:-?\d+", MarkKind.LAYER),  # Cura, ideaMaker

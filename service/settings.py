@@ -9,30 +9,12 @@ from typing import Annotated
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-__all__ = ["MachineSettings", "Settings", "is_loopback"]
+from service.machines.settings import ENV_PREFIX, MachineSettings
+
+__all__ = ["Settings", "is_loopback"]
 
 
-class MachineSettings(BaseSettings):
-    """Settings of the user's machines, for the command line and the service.
-
-    Attributes
-    ----------
-    data_dir : Path, optional
-        Machines lie in its folder `machines`; by default in the user's folder for data.
-    require_approval : bool
-        Jobs use approved revisions of machines only.
-    measurement_max_age_days : float
-        An older measurement of a machine is warned of.
-    """
-
-    model_config = SettingsConfigDict(env_prefix="STILLPATH_", extra="forbid", frozen=True)
-
-    data_dir: Path | None = None
-    require_approval: bool = False
-    measurement_max_age_days: Annotated[float, Field(gt=0)] = 180.0
-
-
-class Settings(MachineSettings):
+class Settings(MachineSettings, BaseSettings):
     """Settings of one service.
 
     Attributes
@@ -51,6 +33,8 @@ class Settings(MachineSettings):
         Serve other computers than this one. There are no keys yet: only behind something that
         checks who is calling.
     """
+
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
     data_dir: Path = Path("stillpath-data")
     max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30

@@ -48,11 +48,11 @@ def open_machines() -> Resolver:
 
     from models.store import explain
     from service.machines.resolve import Resolver, user_data_dir
+    from service.machines.settings import MachineSettings
     from service.machines.store import MachineStore
-    from service.settings import MachineSettings
 
     try:
-        settings = MachineSettings()
+        settings = MachineSettings.from_environment()
     except ValidationError as error:
         raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
     store = MachineStore((settings.data_dir or user_data_dir()) / "machines")

@@ -15,6 +15,9 @@ from simulation.scheduled import BLEND_STEP, STEP
 __all__ = ["Operation"]
 
 _ALL_KNOWN = 7
+_LONGEST_RETRACTION_MM = 20.0
+"""Filament that is pulled back further has left the hotend: a change of filament or tool, behind
+which the firmware may load on its own, and nothing is owed to what was pulled back."""
 
 
 class Operation:
@@ -55,7 +58,7 @@ class Operation:
         """
         if not self._machine.schedules:
             return self._point
-        known = np.flatnonzero(moves.known == _ALL_KNOWN)
+        known = np.flatnonzero((moves.known & _ALL_KNOWN) == _ALL_KNOWN)
         position = (self._point.x_mm, self._point.y_mm, self._point.z_mm)
         if len(known):
             travel = moves.end_mm[known] - moves.start_mm[known]
@@ -97,10 +100,19 @@ class Operation:
         """Filament that the moves lay down, and the extruder's furthest position behind them."""
         if self._kg_per_mm == 0.0 or len(moves) == 0:
             return 0.0, self._furthest_mm
-        start_mm = moves.start_mm[0, 3] if self._furthest_mm is None else self._furthest_mm
-        furthest = np.maximum.accumulate(np.append(start_mm, moves.end_mm[:, 3]))
+        e_mm = moves.end_mm[:, 3]
         moving = np.any(moves.end_mm[:, :2] != moves.start_mm[:, :2], axis=1)
-        return float(np.sum(np.diff(furthest)[moving])), float(furthest[-1])
+        furthest_mm = moves.start_mm[0, 3] if self._furthest_mm is None else self._furthest_mm
+        laid_mm, first = 0.0, 0
+        while first < len(moves):
+            furthest = np.maximum.accumulate(np.append(furthest_mm, e_mm[first:]))
+            unloaded = furthest[1:] - e_mm[first:] > _LONGEST_RETRACTION_MM
+            count = int(np.argmax(unloaded)) + 1 if unloaded.any() else len(unloaded)
+            last = first + count
+            laid_mm += float(np.sum(np.diff(furthest)[:count][moving[first:last]]))
+            furthest_mm = float(e_mm[last - 1] if unloaded.any() else furthest[count])
+            first = last
+        return laid_mm, furthest_mm
 
     def _note_range(self) -> None:
         level = self._grid.level(self._point)

@@ -198,10 +198,17 @@ def test_corpus_is_cut_whole(machine: Machine, shared_dir: Path, folder: str) ->
         check(cut(data, wide), data)
 
 
-def test_moves_between_off_and_on_stay_as_they_came(machine):
+@pytest.mark.parametrize(
+    ("off", "on"),
+    [
+        (";STILLPATH_OFF", "; STILLPATH_ON"),
+        ("  ;  stillpath_off for this bridge", ";STILLPATH_ON; again"),
+    ],
+)
+def test_moves_between_off_and_on_stay_as_they_came(machine, off, on):
     lines = [f"G1 X{60 + 5 * (k % 2)} Y{50 + k} E.1 F6000" for k in range(12)]
-    lines.insert(8, "; STILLPATH_ON")
-    lines.insert(4, ";STILLPATH_OFF")
+    lines.insert(8, on)
+    lines.insert(4, off)
     data = (HEAD + "\n".join(lines) + "\n").encode()
     for chunk in (7, 1 << 17):
         items = cut(data, machine, chunk=chunk)

@@ -233,3 +233,18 @@ def test_help_and_version_are_quick_and_light():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert __version__ in done.stdout
+
+
+def test_a_job_loads_only_what_it_needs():
+    """Each of these costs every job a tenth of a second or more."""
+    program = (
+        "import sys, service.cli, service.pipeline.road\n"
+        "from service.machines.commands import open_machines\n"
+        "open_machines().for_job('ender3', files=True)\n"
+        "heavy = ('scipy.signal', 'scipy.stats', 'pydantic_settings', 'fastapi', 'sqlite3')\n"
+        "print([name for name in heavy if name in sys.modules])\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.strip() == "[]"

@@ -84,14 +84,16 @@ def moves_of(text: str, machine: Machine) -> list[Moves]:
         ("G1 E30 F300\nG1 X50 E10 F3000\nG1 E-1 F1800\nG1 E1.5 F1800\nG1 X60 E1", 11.0),
         ("M82\nG92 E0\nG1 X50 E10 F3000\nG92 E0\nG1 X60 E10", 20.0),
         ("G10\nG11\nG1 X50 E10 F3000\nM221 S150\nG1 X60 E10", 25.0),
+        # Changes of filament: loaded again by the firmware, or by the file where the nozzle stands.
+        ("G1 X50 E10 F3000\nG1 E-80 F1800\nM600\nG1 X60 E5\nG1 X20 E5", 20.0),
+        ("G1 X50 E10 F3000\nG1 E-80 F1800\nT1\nG1 E81 F1800\nG1 X60 E5\nG1 X20 E5", 20.0),
+        ("G1 X50 E10 F3000\nG1 E-15 F1800\nG1 E-65\nT0\nG1 X60 E5\nG1 E-2\nG1 X9 E4", 17.0),
     ],
 )
 def test_what_lies_on_the_bed(text: str, laid_mm: float) -> None:
     machine = bedslinger()
     operation = Operation(machine)
     for moves in moves_of(f"{HEAD}G1 X20 Y20 Z0.2 F3000\n{text}\n", machine):
-        operation.passed(moves)
-        # Once more changes nothing: filament counts beyond the furthest position.
         operation.passed(moves)
     assert operation.printed_kg == pytest.approx(laid_mm * KG_PER_MM, rel=1e-6)
 
@@ -107,6 +109,9 @@ def test_where_a_piece_is() -> None:
     operation.passed(moves)
     assert operation.printed_kg == pytest.approx(20 * KG_PER_MM)
     assert Operation(bedslinger(None)).at(moves).mass_kg == 0.0
+    # Moves that shall stay as they are lie somewhere, too.
+    kept = moves_of(f"{HEAD}; STILLPATH_OFF\nG1 X20 Y20 Z9 F3000\nG1 X50 E10\n", machine)
+    assert Operation(machine).at(kept[0]).z_mm == 9.0
 
 
 def compensated(

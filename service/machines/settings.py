@@ -1,0 +1,44 @@
+"""Settings of the user's machines, from the environment, for the command line and the service."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["ENV_PREFIX", "MachineSettings"]
+
+ENV_PREFIX = "STILLPATH_"
+
+
+class MachineSettings(BaseModel):
+    """Settings of the user's machines.
+
+    Attributes
+    ----------
+    data_dir : Path, optional
+        Machines lie in its folder `machines`; by default in the user's folder for data.
+    require_approval : bool
+        Jobs use approved revisions of machines only.
+    measurement_max_age_days : float
+        An older measurement of a machine is warned of.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    data_dir: Path | None = None
+    require_approval: bool = False
+    measurement_max_age_days: Annotated[float, Field(gt=0)] = 180.0
+
+    @classmethod
+    def from_environment(cls, environment: Mapping[str, str] = os.environ) -> Self:
+        """Read ``STILLPATH_DATA_DIR`` and its like, in upper or lower case.
+
+        Plain, because the library for it costs every command a tenth of a second.
+        """
+        known = {ENV_PREFIX + field.upper(): field for field in cls.model_fields}
+        given = {name.upper(): value for name, value in environment.items()}
+        return cls.model_validate({known[n]: v for n, v in given.items() if n in known})
