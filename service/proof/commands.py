@@ -58,7 +58,7 @@ def coupon(
     start_gcode: StartGcode = None,
     end_gcode: EndGcode = None,
 ) -> None:
-    """Write a first print: left half as planned, right half compensated."""
+    """Write a first print: half as planned, half compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
     found = open_machines().for_job(machine, files=True)
 
@@ -84,7 +84,7 @@ def tower(
     start_gcode: StartGcode = None,
     end_gcode: EndGcode = None,
 ) -> None:
-    """Write a ringing tower: left half as planned, right compensated."""
+    """Write a ringing tower: half as planned, half compensated."""
     settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
     found = open_machines().for_job(machine, files=True)
 
