@@ -1,4 +1,7 @@
-"""Disturbances as they are written down and sampled, and sensors slower than the loop."""
+"""Disturbances in time as they are written down and sampled, and sensors slower than the loop.
+
+Those that repeat with the position of an axis are `models.ripple`.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,11 @@ __all__ = [
     "Narrowband",
     "Peak",
     "Periodic",
-    "Ripple",
     "SensorSpec",
     "Switched",
     "Tone",
     "Wideband",
     "sample",
-    "sample_ripple",
 ]
 
 Array = NDArray[np.float64]
@@ -110,20 +111,8 @@ class Periodic(_Document):
     phases_rad: tuple[Finite, ...] = ()
 
 
-class Ripple(_Document):
-    """Harmonics in position: a belt tooth, a screw, a motor pole.
-
-    sum_h amplitude_h * sin(2 pi h s/pitch + phase_h) at the position s, counted from homing.
-    """
-
-    kind: Literal["ripple"] = "ripple"
-    pitch_mm: Positive
-    amplitudes: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=256)]
-    phases_rad: tuple[Finite, ...] = ()
-
-
 DisturbanceSpec = Annotated[
-    Narrowband | Switched | Wideband | Periodic | Ripple, Field(discriminator="kind")
+    Narrowband | Switched | Wideband | Periodic, Field(discriminator="kind")
 ]
 
 
@@ -165,11 +154,6 @@ def sample(
     return _coloured(spec, samples, dt_s, generator)
 
 
-def sample_ripple(spec: Ripple, position_mm: Array) -> Array:
-    """Return the ripple at the given positions."""
-    return _harmonics(spec, 2 * np.pi * np.asarray(position_mm, float) / spec.pitch_mm)
-
-
 def _tones(tones: tuple[Tone, ...], t: Array, dt_s: float) -> Array:
     out = np.zeros(len(t))
     for tone in tones:
@@ -181,7 +165,7 @@ def _tones(tones: tuple[Tone, ...], t: Array, dt_s: float) -> Array:
     return out
 
 
-def _harmonics(spec: Periodic | Ripple, angle: Array) -> Array:
+def _harmonics(spec: Periodic, angle: Array) -> Array:
     phases = spec.phases_rad or (0.0,) * len(spec.amplitudes)
     if len(phases) != len(spec.amplitudes):
         raise ModelError(f"{len(spec.amplitudes)} harmonics, but {len(phases)} phases")

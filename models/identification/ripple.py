@@ -22,6 +22,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from scipy.linalg import block_diag
 
 from models.errors import ModelError
@@ -41,6 +42,8 @@ _STEADY = 1e-3
 """Relative change of speed that still counts as steady."""
 _FEWEST = 4
 """Samples per unknown that a fit must have."""
+_FASTEST = 0.2
+"""Frequency of a wave times the sampling time: lines between samples take sinc^2 off, 12 % here."""
 _LARGEST_MATRIX = 50_000_000
 """Numbers in the matrix of a fit: 400 MB."""
 
@@ -140,8 +143,9 @@ def learn_ripple(
     Raises
     ------
     ModelError
-        If a pass was not homed, is too short or never steady, or a harmonic is not observable at
-        the speeds driven; says which, and the remedy.
+        If a pass was not homed, is too short or never steady, a harmonic is not observable at the
+        speeds driven or faster than the sampling shows, or what was learnt cannot be the ripple of
+        an axis; says which, and the remedy.
     """
     _check(passes, basis)
     blocks = [_block(log, basis, plant) for log in passes]
@@ -168,10 +172,7 @@ def learn_ripple(
     spread = residual * np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
     sines, cosines = unknown[: 2 * waves : 2], unknown[1 : 2 * waves : 2]
     sd_mm = np.hypot(spread[: 2 * waves : 2], spread[1 : 2 * waves : 2]) / math.sqrt(2)
-    ripple = AxisRipple(
-        sources=_sources(basis, sines + 1j * cosines, sd_mm),
-        homing_repeatability_mm=homing_repeatability_mm,
-    )
+    ripple = _axis_ripple(_sources(basis, sines + 1j * cosines, sd_mm), homing_repeatability_mm)
     total = _rms_beside(matrix[:, 2 * waves :], aim)
     explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
     return RippleLearning(ripple, seen, residual, explained)
@@ -195,7 +196,8 @@ def update_ripple(
     Raises
     ------
     ModelError
-        If `gain` is outside 0 to 1, or a source of the same name has another pitch or side.
+        If `gain` is outside 0 to 1, a source of the same name has another pitch or side, or the
+        sum cannot be the ripple of an axis.
     """
     if not 0.0 < gain <= 1.0:
         raise ModelError(f"learning gain {gain} must lie above 0 and not above 1")
@@ -214,12 +216,12 @@ def update_ripple(
         c_learnt, sd_learnt = new.get(wave, (0j, 0.0))
         c, sd = keep * c_before + gain * c_learnt, math.hypot(keep * sd_before, gain * sd_learnt)
         merged.setdefault(wave[:3], []).append(_harmonic(wave[3], c, sd))
-    return AxisRipple(
-        sources=tuple(
+    return _axis_ripple(
+        tuple(
             RippleSource(name=name, pitch_mm=pitch_mm, enters=enters, harmonics=tuple(harmonics))
             for (name, pitch_mm, enters), harmonics in merged.items()
         ),
-        homing_repeatability_mm=max(known.homing_repeatability_mm, learnt.homing_repeatability_mm),
+        max(known.homing_repeatability_mm, learnt.homing_repeatability_mm),
     )
 
 
@@ -276,7 +278,25 @@ class _Block:
 
 def _block(log: PassLog, basis: Sequence[WaveBasis], plant: DiscretePlant) -> _Block:
     of_position = log.kind == "position"
+    _check_band(log, basis, plant.dt_s)
     return _positions(log, basis, plant) if of_position else _accelerations(log, basis, plant)
+
+
+def _check_band(log: PassLog, basis: Sequence[WaveBasis], dt_s: float) -> None:
+    """Refuse waves that the command's samples do not show."""
+    fastest = float(np.abs(np.diff(log.command_mm)).max()) / dt_s
+    limit_hz = _FASTEST / dt_s
+    for source, number in _waves(basis):
+        # An accelerometer's waves on the output side are computed at its own samples.
+        sampled = log.kind == "position" or source.enters == "input"
+        f_hz = number * fastest / source.pitch_mm
+        if sampled and f_hz > limit_hz:
+            raise ModelError(
+                f"{log.source}: at {fastest:.4g} mm/s harmonic {number} of {source.name} is a wave "
+                f"of {f_hz:.4g} Hz, above the {limit_hz:.4g} Hz that {1 / dt_s:.4g} samples/s of "
+                f"the command show; drive at most {limit_hz * source.pitch_mm / number:.3g} mm/s, "
+                "or learn fewer harmonics"
+            )
 
 
 def _positions(log: PassLog, basis: Sequence[WaveBasis], plant: DiscretePlant) -> _Block:
@@ -435,6 +455,17 @@ def _unobservable(missing: Sequence[Observability]) -> str:
         "cannot tell them apart: add a pass at another speed (f = h v / pitch), or learn fewer "
         "harmonics"
     )
+
+
+def _axis_ripple(sources: tuple[RippleSource, ...], repeatability_mm: float) -> AxisRipple:
+    try:
+        return AxisRipple(sources=sources, homing_repeatability_mm=repeatability_mm)
+    except ValidationError as error:
+        said = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise ModelError(
+            f"what the passes teach cannot be the ripple of an axis: {said}; is it this axis's "
+            "plant, and the log's unit right?"
+        ) from None
 
 
 def _sources(basis: Sequence[WaveBasis], c_mm: Complex, sd_mm: Array) -> tuple[RippleSource, ...]:

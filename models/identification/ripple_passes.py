@@ -31,7 +31,8 @@ from models.plants import DiscretePlant, discretise
 __all__ = ["learn_machine_ripple", "read_pass"]
 
 _FEWEST_ROWS = 16
-_DT_S = 1e-3
+_DT_S = 0.25e-3
+"""Fine against the ripple's waves, which the lines between samples would flatten."""
 
 
 def read_pass(text: str, source: str, dt_s: float = _DT_S) -> PassLog:

@@ -12,12 +12,10 @@ from models.disturbances import (
     Narrowband,
     Peak,
     Periodic,
-    Ripple,
     Switched,
     Tone,
     Wideband,
     sample,
-    sample_ripple,
 )
 from models.errors import ModelError
 
@@ -69,13 +67,6 @@ def test_wideband_has_its_humps_and_power() -> None:
     assert np.array_equal(d, again)
     with pytest.raises(ModelError, match="generator"):
         sample(spec, 10, TS)
-
-
-def test_ripple_counts_from_homing() -> None:
-    spec = Ripple(pitch_mm=2.0, amplitudes=(0.02, 0.008), phases_rad=(0.5, 0.0))
-    s = np.linspace(0, 8, 100)
-    expected = 0.02 * np.sin(np.pi * s + 0.5) + 0.008 * np.sin(2 * np.pi * s)
-    assert sample_ripple(spec, s) == pytest.approx(expected, abs=1e-12)
 
 
 def test_documents_tell_their_kind() -> None:

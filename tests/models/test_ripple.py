@@ -203,6 +203,22 @@ class TestLearning:
         with pytest.raises(ModelError, match="constant speed"):
             learn_ripple([log], self.basis, plant().discretise(DT))
 
+    @pytest.mark.parametrize("kind", ["position", "acceleration"])
+    def test_refuses_waves_faster_than_the_samples_show(self, kind: str) -> None:
+        command = drive("constant", speed=150.0)
+        t = np.arange(len(command)) * DT
+        log = PassLog(command, t, np.zeros(len(t)), kind, homed=True, source="fast.csv")
+        with pytest.raises(ModelError, match=r"fast.csv: at 150 mm/s harmonic 3.*at most 133 mm/s"):
+            learn_ripple([log], self.basis, plant().discretise(DT))
+
+    def test_what_no_axis_has_is_refused(self) -> None:
+        """Metres taken for millimetres: a ripple steeper than the axis moves."""
+        command = drive("constant", speed=40.0)
+        measured = command + 2.0 * np.sin(np.pi * command)
+        log = PassLog(command, np.arange(len(command)) * DT, measured, homed=True)
+        with pytest.raises(ModelError, match=r"cannot be the ripple.*slope"):
+            learn_ripple([log], self.basis, plant().discretise(DT))
+
     def test_refuses_too_little(self) -> None:
         command = drive("constant")
         log = PassLog(command, np.arange(10) * DT, np.ones(10), homed=True)
