@@ -157,9 +157,16 @@ def _rounded(accels: np.ndarray) -> list[float]:
 
 def _fastest(machine: Machine, flow_mm_s: float, run_mm: float, accel: float) -> float:
     limits = machine.firmware.planner
-    return max(
-        min(flow_mm_s, limits.max_velocity_mm_s, math.sqrt(0.8 * run_mm * accel)), _LOWEST_MM_S
-    )
+    within = math.sqrt(0.8 * run_mm * accel)
+    fastest = min(flow_mm_s, limits.max_velocity_mm_s, within)
+    if fastest < _LOWEST_MM_S:
+        raise ModelError(
+            f"walls can be printed at {fastest:.1f} mm/s at most (hotend {flow_mm_s:.1f}, machine "
+            f"{limits.max_velocity_mm_s:g}, its acceleration {within:.0f}); ringing shows from "
+            f"{_LOWEST_MM_S:g} mm/s on: raise --max-flow, take a finer nozzle, or correct the "
+            "machine's limits"
+        )
+    return fastest
 
 
 def _legible(speed_mm_s: float, modes: Sequence[RingingMode]) -> float:

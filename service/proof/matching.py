@@ -110,7 +110,7 @@ def log_signal(log: AccelerationLog) -> Signal:
         raise ModelError(f"{log.source}: {seconds:.1f} s are too short; record {_SHORTEST_S:g} s")
     dt_s = float(np.median(np.diff(t)))
     if dt_s > 1.0 / 400.0:
-        raise ModelError(f"{log.source}: {1 / dt_s:.0f} samples per second are too few; 400 needed")
+        raise ModelError(f"{log.source}: {1 / dt_s:.6g} samples per second are too few; 400 needed")
     columns = log.accel_mm_s2[:, np.all(np.isfinite(log.accel_mm_s2), axis=0)]
     if columns.shape[1] == 0:
         raise ModelError(f"{log.source}: no column of accelerations is complete")

@@ -183,7 +183,19 @@ class Program:
         self._go((x.min_mm + _MARGIN_MM, y.max_mm - _MARGIN_MM))
 
     def layer(self, z_mm: float) -> None:
-        """Begin a layer whose top is at `z_mm`."""
+        """Begin a layer whose top is at `z_mm`.
+
+        Raises
+        ------
+        ModelError
+            If that is above the travel of Z.
+        """
+        highest_mm = self._machine.travel["z"].max_mm
+        if z_mm > highest_mm:
+            raise ModelError(
+                f"the print reaches z = {z_mm:.2f} mm and the travel of z ends at {highest_mm:g} "
+                "mm: take fewer bands (--bands), or correct the machine's travel"
+            )
         self._retract()
         self._add(";LAYER_CHANGE", f";Z:{z_mm:.3f}")
         self._rise(z_mm)
@@ -247,7 +259,9 @@ class Program:
 
     def _line(self, point: Point, speed_mm_s: float, thickness: float = 1.0) -> None:
         assert self._at is not None
-        feed = math.dist(self._at, point) * self.section_mm2 * thickness / self._filament_mm2
+        section_mm2 = self.section_mm2 * thickness
+        feed = math.dist(self._at, point) * section_mm2 / self._filament_mm2
+        speed_mm_s = min(speed_mm_s, self._settings.max_flow_mm3_s / section_mm2)
         self._add(f"G1 X{point[0]:.3f} Y{point[1]:.3f} E{feed:.5f} F{60 * speed_mm_s:.0f}")
         self._at = point
 

@@ -135,6 +135,36 @@ def test_too_small_a_bed_is_refused_with_the_reason():
         tower_program(machine, "x", SETTINGS, 13)
 
 
+def with_extruder(nozzle_mm: float) -> Machine:
+    document = load_machine("ender3").model_dump(mode="json")
+    document["firmware"]["extruder"]["nozzle_diameter_mm"] = nozzle_mm
+    return Machine.model_validate(document)
+
+
+@pytest.mark.parametrize("nozzle_mm", [0.25, 0.8])
+def test_nothing_is_printed_faster_than_the_hotend_melts(nozzle_mm):
+    machine = with_extruder(nozzle_mm)
+    program, _ = coupon_program(machine, PrintSettings(max_flow_mm3_s=9.0))
+    moves, *_ = moves_of(program.text().encode(), machine)
+    travel = moves.end_mm - moves.start_mm
+    way = np.hypot(travel[:, 0], travel[:, 1])
+    prints = (way > 0.1) & (travel[:, 3] > 0)
+    mm3_per_mm = 0.25 * math.pi * 1.75**2 * travel[prints, 3] / way[prints]
+    assert np.max(mm3_per_mm * moves.speed_mm_s[prints]) <= 9.0 * 1.01
+    with pytest.raises(ModelError, match="take a finer nozzle"):
+        coupon_program(with_extruder(1.2), PrintSettings(max_flow_mm3_s=4.0))
+
+
+def test_a_tower_above_the_travel_is_refused():
+    machine = load_machine("ender3")
+    low = machine.model_copy(
+        update={"travel": {**machine.travel, "z": AxisTravel(min_mm=0, max_mm=40)}}
+    )
+    with pytest.raises(ModelError, match=r"z = 40.2\d mm and the travel of z ends at 40 mm"):
+        tower_program(low, "x", SETTINGS, 12)
+    tower_program(low, "x", SETTINGS, 6)
+
+
 def test_own_lines_at_start_and_end_and_the_shaper_put_back():
     machine = load_machine("ender3")
     shaper = FirmwareShaper(type_x="mzv", freq_x_hz=45, type_y="ei", freq_y_hz=32)
