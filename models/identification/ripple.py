@@ -7,10 +7,6 @@ the map is then the input's own, valid at every speed (reference, finding (iii))
 
 An accelerometer is read where the command moves steadily: there the harmonic h is a line at
 f = h v / p, and dividing by -(2 pi f)^2 integrates twice.
-
-A sensor slower than the ripple still sees every harmonic, folded, unless two of them fold onto one
-another, or one onto a constant. `Observability` says how far a pass is from that (finding (vi)):
-the noise gain of the fit decides, the distance in Hz says which speed to choose instead.
 """
 
 from __future__ import annotations
@@ -26,18 +22,21 @@ from pydantic import ValidationError
 from scipy.linalg import block_diag
 
 from models.errors import ModelError
+from models.identification.ripple_observability import (
+    Observability,
+    folded_distances,
+    observability,
+    refuse_unobservable,
+)
 from models.plants import DiscretePlant
 from models.response_kernels import dense_response
 from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
 
-__all__ = ["Observability", "PassLog", "RippleLearning", "WaveBasis", "folded_distances",
-           "learn_ripple", "update_ripple"]  # fmt: skip
+__all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-LARGEST_NOISE_GAIN = 4.0
-"""Above, a harmonic is not observable: noise would count four times as much as for a wave alone."""
 _STEADY = 1e-3
 """Relative change of speed that still counts as steady."""
 _FEWEST = 4
@@ -79,26 +78,6 @@ class WaveBasis:
     pitch_mm: float
     numbers: tuple[int, ...] = (1, 2, 3)
     enters: RippleSide = "input"
-
-
-@dataclass(frozen=True, slots=True)
-class Observability:
-    """How well the passes show one harmonic.
-
-    Attributes
-    ----------
-    noise_gain : float
-        Standard deviation of the coefficient over that of a wave alone among white noise; 1 is
-        the best, infinite in the singular set.
-    distance_hz : float or None
-        At steady speed: from folding onto a constant, onto itself, or onto another harmonic.
-    """
-
-    source: str
-    number: int
-    noise_gain: float
-    distance_hz: float | None
-    observable: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,10 +141,18 @@ def learn_ripple(
             f"{len(aim)} usable samples for {2 * waves} unknowns, at least {_FEWEST * 2 * waves} "
             "needed: drive longer, or learn fewer harmonics"
         )
-    seen = _observability(matrix, blocks, basis, passes)
-    missing = [one for one in seen if not one.observable]
-    if missing:
-        raise ModelError(_unobservable(missing))
+    seen = observability(
+        matrix,
+        [(source.name, number) for source, number in _waves(basis)],
+        [
+            folded_distances(
+                block.frequencies_hz, 1.0 / float(np.median(np.diff(log.sensor_time_s)))
+            )
+            for block, log in zip(blocks, passes, strict=True)
+            if block.frequencies_hz is not None
+        ],
+    )
+    refuse_unobservable(seen)
     unknown, *_ = np.linalg.lstsq(matrix, aim, rcond=None)
     left = aim - matrix @ unknown
     residual = math.sqrt(float(left @ left) / len(left))
@@ -223,22 +210,6 @@ def update_ripple(
         ),
         max(known.homing_repeatability_mm, learnt.homing_repeatability_mm),
     )
-
-
-def folded_distances(f_hz: Array, sensor_hz: float) -> Array:
-    """Return how far each frequency is from the singular set of a sensor, shape (m,).
-
-    The smallest |f_i|, |2 f_i| or |f_i +- f_k|, modulo `sensor_hz`: at 0 the samples cannot tell
-    the harmonic from a constant, its own mirror image, or another one (paper 001, section III).
-    Keep more than 1 / (length of the record).
-    """
-    f = np.abs(np.asarray(f_hz, np.float64))
-    candidates = [f, 2 * f]
-    for shift in range(1, len(f)):
-        other = np.roll(f, shift)
-        candidates += [f - other, f + other]
-    folded = np.abs(np.array(candidates))
-    return np.asarray(np.min(np.abs(folded - sensor_hz * np.round(folded / sensor_hz)), axis=0))
 
 
 def _check(passes: Sequence[PassLog], basis: Sequence[WaveBasis]) -> None:
@@ -404,57 +375,10 @@ def _signed_response(plant: DiscretePlant, rate: float) -> complex:
     return value if rate >= 0 else value.conjugate()
 
 
-def _observability(
-    matrix: Array, blocks: Sequence[_Block], basis: Sequence[WaveBasis], passes: Sequence[PassLog]
-) -> tuple[Observability, ...]:
-    """Judge all passes together by noise gain; the distance is the largest of a single one."""
-    waves = _waves(basis)
-    scale = np.linalg.norm(matrix, axis=0)
-    scale[scale == 0.0] = 1.0
-    unit = matrix / scale
-    # 1 / sqrt of the inverse's diagonal is each column's part that no other column explains.
-    _, sizes, right = np.linalg.svd(unit, full_matrices=False)
-    kept = np.maximum(sizes, 1e-9 * sizes[0])
-    spread = np.sqrt(np.sum((right / kept[:, None]) ** 2, axis=0))
-    distances = np.full(len(waves), -1.0)
-    for block, log in zip(blocks, passes, strict=True):
-        if block.frequencies_hz is not None:
-            interval = float(np.median(np.diff(log.sensor_time_s)))
-            found = folded_distances(block.frequencies_hz, 1.0 / interval)
-            distances = np.maximum(distances, found)
-    out = []
-    for k, (source, number) in enumerate(waves):
-        gain = float(np.max(spread[2 * k : 2 * k + 2]))
-        out.append(
-            Observability(
-                source.name,
-                number,
-                gain,
-                float(distances[k]) if distances[k] >= 0 else None,
-                gain <= LARGEST_NOISE_GAIN,
-            )
-        )
-    return tuple(out)
-
-
 def _rms_beside(columns: Array, values: Array) -> float:
     """Return the rms of what is left without the waves."""
     left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
     return math.sqrt(float(left @ left) / len(left))
-
-
-def _unobservable(missing: Sequence[Observability]) -> str:
-    named = ", ".join(
-        f"{one.source} {one.number} (noise gain {one.noise_gain:.3g}"
-        + ("" if one.distance_hz is None else f", {one.distance_hz:.3g} Hz from folding")
-        + ")"
-        for one in missing
-    )
-    return (
-        f"not observable at the speeds driven: {named}; limit {LARGEST_NOISE_GAIN:g}. The sensor "
-        "cannot tell them apart: add a pass at another speed (f = h v / pitch), or learn fewer "
-        "harmonics"
-    )
 
 
 def _axis_ripple(sources: tuple[RippleSource, ...], repeatability_mm: float) -> AxisRipple:

@@ -14,10 +14,10 @@ from models.errors import ModelError
 from models.identification.ripple import (
     PassLog,
     WaveBasis,
-    folded_distances,
     learn_ripple,
     update_ripple,
 )
+from models.identification.ripple_observability import folded_distances
 from models.plants import ContinuousPlant, DiscretePlant, Mode, ModesSpec, continuous
 from models.response_kernels import dense_response
 from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource, RippleTable
