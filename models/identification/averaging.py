@@ -16,6 +16,8 @@ __all__ = ["aligned_to", "low_frequency_delay", "mean_response", "mean_spectrum"
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_COHERENT = 0.95
+_DELAYS_S = 20e-3
 _FLAT = 0.2
 """Logarithm of the modulus that a mode must add before its phase counts."""
 
@@ -100,10 +102,27 @@ def mean_spectrum(spectra: Sequence[Spectrum]) -> Spectrum:
 
 
 def aligned_to(response: FrequencyResponse, reference: FrequencyResponse) -> FrequencyResponse:
-    """Return the response with the delay of the reference at low frequency."""
-    shift = low_frequency_delay(response.f_hz, response.response) - low_frequency_delay(
-        reference.f_hz, reference.response
-    )
+    """Return the response with the delay of the reference.
+
+    The delay that makes both most alike over all coherent frequencies: at low frequency alone
+    noise would tell too little.
+    """
+    used = ~(response.coherence < _COHERENT)
+    low, high = reference.f_hz[0], reference.f_hz[-1]
+    used &= (response.f_hz >= low) & (response.f_hz <= high)
+    f = response.f_hz[used]
+    if len(f) < 2:
+        return response
+    alike = response.response[used] * on_grid(reference, f).response.conj()
+    turn = 2j * np.pi * f
+
+    def likeness(delays_s: Array) -> Array:
+        return np.asarray(np.abs(np.exp(np.outer(delays_s, turn)) @ alike), np.float64)
+
+    coarse = low_frequency_delay(f, alike) + np.linspace(-_DELAYS_S, _DELAYS_S, 801)
+    best = coarse[np.argmax(likeness(coarse))]
+    fine = best + np.linspace(-1.0, 1.0, 201) * (coarse[1] - coarse[0])
+    shift = fine[np.argmax(likeness(fine))]
     turned = response.response * np.exp(2j * np.pi * response.f_hz * shift)
     return replace(response, response=turned)
 

@@ -189,3 +189,19 @@ def test_plant_set_of_a_fit_survives_json() -> None:
     made = plant_set_from(found.fit, [found.fit], kind="frequency response")
     again = type(made).model_validate_json(made.model_dump_json())
     assert again == made
+
+
+def test_noise_does_not_shift_repeats_against_each_other() -> None:
+    """Delays told at low frequency alone would take a fifth off the mean at 100 Hz."""
+    low = ModesSpec(
+        modes=(Mode(f_hz=19.0, zeta=0.03, gain=0.8), Mode(f_hz=90.0, zeta=0.1, gain=0.2))
+    )
+    rng = np.random.default_rng(0)
+    repeats = []
+    for delay_s in (0.5e-3, -2.0e-3, 3.1e-3, 0.0):
+        one = response(low, delay_s=delay_s)
+        noise = rng.standard_normal((2, len(F))) * (0.4 / F)
+        repeats.append(replace(one, response=one.response + noise[0] + 1j * noise[1], sd=0.57 / F))
+    mean = mean_response(repeats)
+    seen = np.abs(mean.response / frequency_response(low, F))[F > 80] / 0.97
+    assert np.mean(seen) == pytest.approx(1.0, abs=0.02)
