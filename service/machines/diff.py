@@ -124,6 +124,12 @@ def _short(value: Any) -> str:
         return f"{value:g}"
     if value is None:
         return "none"
-    listed = isinstance(value, list)
-    text = ", ".join(map(_short, value)) or "none" if listed else str(value)
+    if isinstance(value, dict):
+        text = "; ".join(f"{key} {_short(inner)}" for key, inner in value.items())
+    elif isinstance(value, list) and _long(value, []):
+        text = f"{len(value)} entries"
+    elif isinstance(value, list):
+        text = ", ".join(map(_short, value)) or "none"
+    else:
+        text = str(value)
     return text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…"

@@ -107,6 +107,18 @@ def test_plants_without_modes_are_compared_and_do_not_drift(nominal: dict):
     assert drift([revision(1, make_plants()), revision(2, plants)]) == ()
 
 
+def test_documents_are_told_in_words():
+    scales = {"frequency_scale": [0.98, 1.0, 1.02], "damping_scale": [0.8, 1.0, 1.2]}
+    listed = [{"plant": {"kind": "modes", "modes": [{"f_hz": 52.0, "zeta": 0.05}]}, "weight": 1.0}]
+    plants = make_plants().model_dump()
+    old, new = (
+        make_machine(axes={"x": plants | {"members": members}, "y": make_plants()})
+        for members in (scales, listed)
+    )
+    told = "frequency_scale 0.98, 1, 1.02; damping_scale 0.8, 1, 1.2 -> 1 entries"
+    assert f"axes.x.members: {told}" in [change.text for change in diff(old, new)]
+
+
 @pytest.mark.parametrize("name", builtin_machines())
 def test_every_kind_of_plant_can_be_compared(name: str):
     old, new = load_machine(name), load_machine("ender3")
