@@ -295,7 +295,7 @@ def _level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
         (
             f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
             f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
-            "its sensor reads right (the shape of the model does not depend on it)"
+            "its sensor reads right (the shape of the model hardly depends on it)"
         ),
     )
 
