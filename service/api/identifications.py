@@ -116,6 +116,7 @@ async def post_measurements(
     base: Annotated[
         str | None, Query(description="What a machine that does not exist yet starts from.")
     ] = None,
+    title: Annotated[str | None, Query(description="Of the machine.", max_length=200)] = None,
     trial: Annotated[bool, Query(description="Store nothing.")] = False,
     max_order: Annotated[int, Query(ge=1, le=8, description="Most modes to try.")] = 4,
     author: Author = "unknown",
@@ -132,7 +133,9 @@ async def post_measurements(
     files = await _received(request)
     identifications: Identifications = request.app.state.identifications
     with as_problems():
-        found = await identifications.run(_identified, files, start, settings, name, max_order)
+        found = await identifications.run(
+            _identified, files, start, settings, name, title, max_order
+        )
         if trial:
             response.status_code = 200
             return IdentificationView(revision=None, report=found.report)
@@ -215,7 +218,12 @@ def _start(machines: Resolver, name: str, base: str | None) -> tuple[Machine, in
 
 
 def _identified(
-    files: list[tuple[str, bytes]], start: Machine, settings: ReadSettings, name: str, order: int
+    files: list[tuple[str, bytes]],
+    start: Machine,
+    settings: ReadSettings,
+    name: str,
+    title: str | None,
+    order: int,
 ) -> Any:
     from models.identification.conditions import Condition
     from service.identification.run import InputFile, identify_files
@@ -226,7 +234,7 @@ def _identified(
     for label, content in files:
         before, _, condition = label.partition("@")
         inputs.append(InputFile(safe_name(before), content, Condition.parse(condition)))
-    return identify_files(inputs, start, settings, name=name, max_order=order)
+    return identify_files(inputs, start, settings, name=name, title=title, max_order=order)
 
 
 def _stored(

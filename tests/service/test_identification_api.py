@@ -108,9 +108,11 @@ def test_a_trial_stores_nothing(client: TestClient, data: Path) -> None:
 def test_a_new_machine_from_a_base(client: TestClient) -> None:
     where = "/v1/machines/new/measurements"
     assert_problem(post(client, quick_raw("x"), where=where), 404, "base")
-    assert post(client, quick_raw("x"), where=where, base="ender3").status_code == 201
+    made = post(client, quick_raw("x"), where=where, base="ender3", title="Left of the door")
+    assert made.status_code == 201, made.text
     machine = Machine.model_validate(client.get("/v1/machines/new").json())
-    assert machine.name == "new"
+    assert (machine.name, machine.title) == ("new", "Left of the door")
+    assert_problem(post(client, quick_raw("x"), title="a\x1b"), 422, "title")
     bad = "/v1/machines/Not%20Good/measurements"
     assert_problem(post(client, quick_raw("x"), where=bad, base="ender3"), 422)
 

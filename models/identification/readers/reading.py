@@ -111,7 +111,9 @@ def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     if is_drive(table, settings):
         return read_drives(table, axis, settings)
     hint = ""
-    if table.names and len(table.rows) > 1:
+    if "position_mm" in table.names:
+        hint = "; of a pass ripple is learnt: say what repeats (--ripple NAME:PITCH)"
+    elif table.names and len(table.rows) > 1:
         hint = (
             "; if it records a command and what followed, say which columns (time_column, "
             "command_column, measured_column)"

@@ -121,6 +121,8 @@ def test_files_that_are_not_read(tmp_path: Path) -> None:
         read_content(pickle.dumps({"num": [1]}), "model.pkl")
     with pytest.raises(ModelError, match=r"looked for .*The first line is 'hello there'"):
         read_content(b"hello there\n1,2\n", "a.csv")
+    with pytest.raises(ModelError, match="say what repeats"):
+        read_content(b"# homed\ntime_s,position_mm,measured_mm\n0,1,1\n.1,2,2\n", "pass.csv")
     with pytest.raises(ModelError, match="0 frequencies, at least 8"):
         read_content(b"freq_hz,mag,phase_deg\n", "a.csv")
     with pytest.raises(ModelError, match="header but no row"):
