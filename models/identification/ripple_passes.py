@@ -7,6 +7,9 @@ A pass is a table of text with a row per sample of the sensor:
 
 `position_mm` is what the axis was told, in machine coordinates. The comment says that the machine
 was homed before; without it the phase of a ripple means nothing, and learning refuses.
+
+A motor of CoreXY is seen alone where the other stands: motor a (x + y) on moves along the diagonal
+x = y, motor b (x - y) along the other. Both columns are then x + y, or x - y.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from models.errors import ModelError
 from models.identification.readers.tables import as_table
@@ -27,6 +31,7 @@ from models.identification.ripple import (
 )
 from models.machine import Machine
 from models.plants import DiscretePlant, discretise
+from models.ripple import RippleAxis
 
 __all__ = ["learn_machine_ripple", "read_pass"]
 
@@ -79,7 +84,7 @@ def read_pass(text: str, source: str, dt_s: float = _DT_S) -> PassLog:
 
 def learn_machine_ripple(
     machine: Machine,
-    axis: Literal["x", "y"],
+    axis: RippleAxis,
     passes: Sequence[PassLog],
     basis: Sequence[WaveBasis],
     *,
@@ -95,6 +100,7 @@ def learn_machine_ripple(
     ----------
     machine : Machine
     axis : str
+        Input ripple of CoreXY belongs to its motors ``a`` and ``b``, all else to ``x`` and ``y``.
     passes, basis, homing_repeatability_mm
         See `learn_ripple`.
     gain, remaining
@@ -103,15 +109,10 @@ def learn_machine_ripple(
     Raises
     ------
     ModelError
-        See `learn_ripple`; or if the axis's motors are not its own.
+        See `learn_ripple`; or if the ripple cannot enter at `axis`.
     """
-    sides = {source.enters for source in basis}
-    if machine.kinematics == "corexy" and "input" in sides:
-        raise ModelError(
-            f"axis {axis}: two motors move each axis of a corexy machine; their ripple cannot be "
-            "told apart along x or y. Learn it as output ripple, which holds where it was measured"
-        )
-    plant: DiscretePlant = discretise(machine.axes[axis].nominal, _DT_S)
+    _check_axis(machine, axis, basis)
+    plant = _plant(machine, axis)
     learning = learn_ripple(passes, basis, plant, homing_repeatability_mm=homing_repeatability_mm)
     ripple = learning.ripple
     if axis in machine.ripple:
@@ -119,3 +120,35 @@ def learn_machine_ripple(
     changed = machine.model_copy(update={"ripple": {**machine.ripple, axis: ripple}})
     # A copy is not checked; the document is.
     return Machine.model_validate(changed.model_dump(mode="json")), learning
+
+
+def _check_axis(machine: Machine, axis: RippleAxis, basis: Sequence[WaveBasis]) -> None:
+    corexy = machine.kinematics == "corexy"
+    for source in basis:
+        motors = ("a", "b") if corexy and source.enters == "input" else ("x", "y")
+        if axis in motors:
+            continue
+        remedy = (
+            "two motors move each axis; drive along a diagonal, where one of them stands, and "
+            "learn motor a (x + y) or b (x - y)"
+            if corexy and source.enters == "input"
+            else "learn it there"
+        )
+        raise ModelError(
+            f"axis {axis}: {source.enters} ripple ({source.name}) of a {machine.kinematics} "
+            f"machine belongs to {' or '.join(motors)}; {remedy}"
+        )
+
+
+def _plant(machine: Machine, axis: RippleAxis) -> DiscretePlant:
+    """Return what a motor's motion answers: along a diagonal the mean of both axes."""
+    if axis in ("x", "y"):
+        return discretise(machine.axes[axis].nominal, _DT_S)
+    x, y = (discretise(machine.axes[name].nominal, _DT_S) for name in ("x", "y"))
+    return DiscretePlant(
+        np.asarray(block_diag(x.a, y.a)),
+        np.concatenate([x.b, y.b]),
+        0.5 * np.concatenate([x.c, y.c]),
+        0.5 * (x.d + y.d),
+        dt_s=_DT_S,
+    )

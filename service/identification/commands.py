@@ -47,7 +47,8 @@ Report = Annotated[
     Path | None, typer.Option("--report", metavar="DIR", help="Folder for identification.html.")
 ]
 AxisOption = Annotated[
-    Literal["x", "y"] | None, typer.Option(help="Axis, if neither files nor their names say it.")
+    Literal["x", "y", "a", "b"] | None,
+    typer.Option(help="Axis, if neither files nor their names say it. a, b: CoreXY's (--ripple)."),
 ]
 PerHz = Annotated[float | None, typer.Option(help="accel_per_hz of [resonance_tester].")]
 Low = Annotated[float | None, typer.Option(help="min_freq of [resonance_tester], Hz.")]
@@ -123,7 +124,7 @@ def run(
     Without --machine and --output nothing is stored: the figures are printed.
     """
     settings = _settings(
-        axis=axis,
+        axis=None if ripple else axis,
         accel_per_hz_mm_s=accel_per_hz,
         f_start_hz=min_freq,
         f_end_hz=max_freq,

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 from models.errors import ModelError
 from models.identification.ripple import RippleLearning, WaveBasis
 from models.identification.ripple_passes import learn_machine_ripple, read_pass
 from models.machine import Machine
 from models.provenance import SourceFile
-from models.ripple import RippleSide
+from models.ripple import RippleAxis, RippleSide
 from service.identification.run import read_inputs
 
 __all__ = ["LearntRipple", "learn_from_files", "parse_basis"]
@@ -31,7 +30,7 @@ class LearntRipple:
 def learn_from_files(
     files: Sequence[str],
     machine: Machine,
-    axis: Literal["x", "y"] | None,
+    axis: RippleAxis | None,
     parts: Sequence[str],
     *,
     gain: float = 0.5,
@@ -57,7 +56,9 @@ def learn_from_files(
         Where no axis is told, a file or part cannot be read, or `learn_ripple` refuses.
     """
     if axis is None:
-        raise ModelError("--ripple: say by --axis x or --axis y along which axis the passes went")
+        raise ModelError(
+            "--ripple: say by --axis x or y (a or b: a motor of CoreXY) what the passes moved"
+        )
     basis = [parse_basis(text) for text in parts]
     inputs = read_inputs(files)
     passes = [read_pass(_text(f.content, f.name), f.name) for f in inputs]
@@ -112,7 +113,7 @@ def _text(content: bytes, name: str) -> str:
         raise ModelError(f"{name}: not text (byte {error.start}); a pass is a table") from None
 
 
-def _summary(axis: Literal["x", "y"], machine: Machine, learning: RippleLearning) -> str:
+def _summary(axis: RippleAxis, machine: Machine, learning: RippleLearning) -> str:
     lines = [f"axis {axis}: the waves explain {learning.explained:.1%} of the deviation (rms)"]
     for source in machine.ripple[axis].sources:
         for h in source.harmonics:

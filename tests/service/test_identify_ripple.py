@@ -70,3 +70,10 @@ def test_parts() -> None:
 def test_parts_that_are_not(text: str) -> None:
     with pytest.raises(ModelError, match="--ripple"):
         parse_basis(text)
+
+
+def test_motors_are_axes_of_ripple_alone(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert learn(folder, "--base", str(folder / "base.json"), "--axis", "a") == 2
+    assert "belongs to x or y" in capsys.readouterr().err
+    assert run(["identify", str(folder / "pass.csv"), "--axis", "a"]) == 2
+    assert "axis" in capsys.readouterr().err
