@@ -39,7 +39,13 @@ _METHODS = (
     "it undoes the machine's ripple too"
 )
 
-Input = Annotated[Path, typer.Argument(metavar="IN", help="The sliced file.")]
+Input = Annotated[
+    Path, typer.Argument(metavar="IN", help="The sliced file: .gcode, .bgcode or .gcode.3mf.")
+]
+PlateOption = Annotated[
+    int | None,
+    typer.Option("--plate", metavar="N", min=1, help="Which plate of a .gcode.3mf with several."),
+]
 MachineOption = Annotated[
     str,
     typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
@@ -127,6 +133,7 @@ def compensate(
         float | None,
         typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
     ] = None,
+    plate: PlateOption = None,
     report: ReportOption = None,
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
@@ -138,6 +145,7 @@ def compensate(
         "robust": robust,
         "along": along,
         "tolerance_um": tolerance_um,
+        "plate": plate,
     }
     options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
@@ -161,6 +169,7 @@ def plan(
     machine: MachineOption,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="motion.npz")],
     rate: Annotated[float, typer.Option(min=1.0, max=100_000.0, help="Samples per second.")] = 1e3,
+    plate: PlateOption = None,
 ) -> None:
     """Write the motion the machine will make. Columns t, x, y, z, e."""
     _check_input(source)
@@ -173,7 +182,7 @@ def plan(
     from service.pipeline.road import plan_file
 
     with progress_shown("stillpath") as progress:
-        plan_file(source, target, found.machine, rate_hz=rate, progress=progress)
+        plan_file(source, target, found.machine, rate_hz=rate, plate=plate, progress=progress)
 
 
 @app.command()
@@ -183,6 +192,7 @@ def simulate(
     report: Annotated[
         Path, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
     ],
+    plate: PlateOption = None,
 ) -> None:
     """Report how far the nozzle will be from its path. No G-code is written."""
     _check_input(source)
@@ -193,7 +203,7 @@ def simulate(
     from service.pipeline.road import simulate_file
 
     with progress_shown("stillpath") as progress:
-        result = simulate_file(source, found.machine, progress=progress)
+        result = simulate_file(source, found.machine, plate=plate, progress=progress)
     result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)

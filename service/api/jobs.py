@@ -11,6 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
+from gcode.containers.sniff import Kind, sniff
 from models.errors import ModelError
 from service.api.problems import Problem, responses
 from service.api.schemas import JobView
@@ -30,10 +31,15 @@ _METHOD = Options.model_json_schema()["properties"]["method"]["pattern"]
 _BODY = {
     "requestBody": {
         "required": True,
-        "description": "The G-code: as the body itself, or as the file of a form.",
+        "description": "The G-code, plain, binary (.bgcode) or in a sliced 3MF package: as the "
+        "body itself, or as the file of a form.",
         "content": {
             "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-            "text/x.gcode": {
+            **{
+                kind.value: {"schema": {"type": "string", "format": "binary"}}
+                for kind in (Kind.BGCODE, Kind.THREEMF)
+            },
+            Kind.TEXT.value: {
                 "schema": {"type": "string"},
                 "example": "G28\nG1 X10 Y10 F6000\nG1 X60 Y10 E2\n",
             },
@@ -99,6 +105,9 @@ async def create_job(
             description="How far the written path may be from the computed one.",
         ),
     ] = DEFAULT_TOLERANCE_UM,
+    plate: Annotated[
+        int | None, Query(ge=1, description="Which plate of a 3MF package with several.")
+    ] = None,
     name: Annotated[
         str, Query(max_length=255, description="File name, for a raw body.")
     ] = "upload.gcode",
@@ -113,7 +122,12 @@ async def create_job(
     store: JobStore = request.app.state.store
     pinned = await run_in_threadpool(_pinned, request.app.state.machines, machine)
     options = Options(
-        method=method, basis=basis, robust=robust, along=along, tolerance_um=tolerance_um
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        plate=plate,
     )
     job_id = uuid.uuid4().hex
     incoming = store.incoming_dir / job_id
@@ -147,18 +161,15 @@ def read_job(request: Request, job_id: str) -> JobView:
 @router.get(
     "/{job_id}/result",
     response_class=FileResponse,
-    responses={200: {"content": {"text/x.gcode": {}}}, **responses(404, 409)},
+    responses={200: {"content": {kind.value: {} for kind in Kind}}, **responses(404, 409)},
     summary="Fetch the compensated G-code",
 )
 def read_result(request: Request, job_id: str) -> FileResponse:
-    """Stream the written file."""
+    """Stream the written file: of the kind that was handed in."""
     store: JobStore = request.app.state.store
     job = _done(store, job_id)
-    return FileResponse(
-        _there(store.files(job_id).result(job.result_name)),
-        media_type="text/x.gcode",
-        filename=job.result_name,
-    )
+    path = _there(store.files(job_id).result(job.result_name))
+    return FileResponse(path, media_type=sniff(path).value, filename=job.result_name)
 
 
 @router.get(
@@ -228,8 +239,10 @@ def _enqueue(store: JobStore, job: Job, incoming: Path, pinned: PinnedMachine) -
 
 
 def _result_name(source_name: str) -> str:
+    """Name the result; printers tell a sliced package by both of its suffixes."""
     source = Path(source_name)
-    return f"{source.stem}.stillpath{source.suffix or '.gcode'}"
+    suffix = ".gcode.3mf" if source_name.lower().endswith(".gcode.3mf") else source.suffix
+    return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
 def _view(store: JobStore, job: Job) -> JobView:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import tempfile
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gcode.containers.opening import open_text
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.planner import Planner
 from gcode.interpreter import Interpreter
@@ -23,7 +25,7 @@ from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples
 from service.pipeline.operating import Operation
-from service.pipeline.progress import Progress, ProgressCallback
+from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.result import Result, StageTime
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
@@ -40,6 +42,7 @@ def plan_file(
     machine: Machine,
     *,
     rate_hz: float = 1000.0,
+    plate: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> None:
     """Write the motion that the firmware makes of a file as a table of samples.
@@ -47,13 +50,15 @@ def plan_file(
     Parameters
     ----------
     source : Path
-        Any print file, also one that was compensated.
+        Any print file of any kind, also one that was compensated.
     target_npz : Path
         Arrays ``t`` [s, 0 at the first move], ``x y z`` [mm, machine axes] and ``e`` [mm, the
         firmware's cumulative extruder position], written whole or not at all.
     machine : Machine
     rate_hz : float
         Samples per second.
+    plate : int, optional
+        Which plate of a 3MF package with several.
     progress : callable, optional
 
     Raises
@@ -71,7 +76,7 @@ def plan_file(
         files = {name: path.open("wb") for name, path in columns.items()}
         count = 0
         try:
-            for part in _Motion(source, machine, 1.0 / rate_hz, progress):
+            for part in _Motion(source, plate, machine, 1.0 / rate_hz, progress):
                 samples = part.samples
                 rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
                 for name, row in zip(_COLUMNS, rows, strict=True):
@@ -93,6 +98,7 @@ def simulate_file(
     source: Path,
     machine: Machine,
     *,
+    plate: int | None = None,
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> Result:
@@ -104,7 +110,7 @@ def simulate_file(
     with clock.stage("yardstick"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     measurement = Measurement(machine, DT_S, shaper, compensated=False)
-    motion = _Motion(source, machine, DT_S, progress)
+    motion = _Motion(source, plate, machine, DT_S, progress)
     operation = Operation(machine)
     extruding_s = 0.0
     peak_velocity = 0.0
@@ -195,9 +201,14 @@ class _Motion:
     """Iterate over the sampled motion of a file in bounded memory."""
 
     def __init__(
-        self, source: Path, machine: Machine, dt_s: float, progress: ProgressCallback | None
+        self,
+        source: Path,
+        plate: int | None,
+        machine: Machine,
+        dt_s: float,
+        progress: ProgressCallback | None,
     ) -> None:
-        self._source, self._machine = source, machine
+        self._source, self._plate, self._machine = source, plate, machine
         self._dt_s, self._progress = dt_s, progress
         self._began = time.monotonic()
         self._held: list[tuple[int, Moves]] = []
@@ -209,9 +220,12 @@ class _Motion:
         planner = Planner(self._machine.firmware)
         sampler = Sampler(self._dt_s)
         self.feature_names = reader.feature_names
-        size = max(self._source.stat().st_size, 1)
         moves = 0
-        with self._source.open("rb") as file:
+        unpacking = telling(self._progress, "unpacking", 0.0)
+        with open_text(self._source, plate=self._plate, told=unpacking) as container:
+            file = container.text
+            size = max(file.seek(0, io.SEEK_END), 1)
+            file.seek(0)
             while True:
                 data = file.read(_BLOCK_BYTES)
                 for block in reader.push(data) if data else reader.flush():

@@ -20,7 +20,8 @@ class Options(BaseModel):
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
     with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
     `basis`, `robust` and `along` are settings of `fbf`: `along` is the weight of the error along
-    the path against that across it (None: as suits `robust`).
+    the path against that across it (None: as suits `robust`). `plate` chooses one of several in a
+    3MF package; it is no setting of the compensation.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,4 +36,5 @@ class Options(BaseModel):
     basis: BasisName = "ce-opt"
     robust: RobustMode = "off"
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
+    plate: Annotated[int, Field(ge=1)] | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

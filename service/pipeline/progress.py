@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Cancelled", "Progress", "ProgressCallback"]
+__all__ = ["Cancelled", "Progress", "ProgressCallback", "telling"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,3 +40,19 @@ class Cancelled(Exception):
 
 ProgressCallback = Callable[[Progress], None]
 """Called now and then; may raise `Cancelled`."""
+
+
+def telling(
+    callback: ProgressCallback | None, stage: str, fraction: float
+) -> Callable[[float], None]:
+    """Return a callback for a stage before or behind the work that `fraction` counts.
+
+    What it is given, the share of the stage itself, only shows that there is life.
+    """
+    began = time.monotonic()
+
+    def tell(_: float) -> None:
+        if callback is not None:
+            callback(Progress(stage, fraction, 0.0, time.monotonic() - began, None))
+
+    return tell

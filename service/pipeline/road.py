@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import copy
 import hashlib
+import io
 import time
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
+from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
 from gcode.firmware.klipper.planner import join_phases, plan_moves
 from gcode.firmware.klipper.writer import KlipperWriter
@@ -38,7 +41,7 @@ from service.pipeline.measure import Measurement, MotionSamples, part_of
 from service.pipeline.motion import plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options
-from service.pipeline.progress import Progress, ProgressCallback
+from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
@@ -69,8 +72,9 @@ def compensate_file(
     Parameters
     ----------
     source, target : Path
-        The target is written beside itself and renamed when it is complete; the source is only
-        read. They may be the same file.
+        Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
+        name says so and the source's does not. It is written beside itself and renamed when it is
+        complete; the source is only read. They may be the same file.
     machine : Machine
     options : Options
     cache_dir : Path, optional
@@ -86,12 +90,24 @@ def compensate_file(
     Raises
     ------
     GcodeError
-        The file cannot be read as G-code of this machine, moves nothing, or was processed before.
+        The file cannot be read as G-code of this machine, moves nothing, or was processed before;
+        its container is damaged, or cannot be what the target is called.
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
-    with replacing(target) as temporary:
-        return _Job(source, temporary, machine, options, cache_dir, progress).run()
+    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    with (
+        replacing(target) as temporary,
+        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+    ):
+        with rewriting(container, temporary, name=target, told=packing) as text:
+            job = _Job(container.text, text, machine, options, cache_dir, progress)
+            result = job.run(source.name)
+        sizes = {
+            "original_bytes": source.stat().st_size,
+            "written_bytes": temporary.stat().st_size,
+        }
+        return result.model_copy(update=sizes)
 
 
 class _Job:
@@ -99,8 +115,8 @@ class _Job:
 
     def __init__(
         self,
-        source: Path,
-        target: Path,
+        source: BinaryIO,
+        target: BinaryIO,
         machine: Machine,
         options: Options,
         cache_dir: Path | None,
@@ -132,32 +148,32 @@ class _Job:
             self._writer = KlipperWriter(machine, self._work.encoder.limits, self._stamp())
         self._sum = _Sums()
 
-    def run(self) -> Result:
-        size = self._source.stat().st_size
-        with self._source.open("rb") as source, self._target.open("wb") as target:
-            if self._changes:
-                self._emit(target, self._writer.header())
-            for item in self._items(source):
-                self._point = self._operation.at(item.moves)
-                self._measurement.operate_at(self._point)
-                if isinstance(item, Piece):
-                    self._emit(target, self._piece(item))
-                else:
-                    self._emit(target, self._passage(item))
-                self._operation.passed(item.moves)
-                self._say("compensating", source.tell() / max(size, 1))
-            if self._sum.moves == 0:
-                raise GcodeError("the file contains no moves: is it G-code?")
-            if self._changes:
-                self._emit(target, self._writer.footer(self._sum.newline))
+    def run(self, name: str) -> Result:
+        size = max(self._source.seek(0, io.SEEK_END), 1)
+        self._source.seek(0)
+        if self._changes:
+            self._emit(self._writer.header())
+        for item in self._items():
+            self._point = self._operation.at(item.moves)
+            self._measurement.operate_at(self._point)
+            if isinstance(item, Piece):
+                self._emit(self._piece(item))
+            else:
+                self._emit(self._passage(item))
+            self._operation.passed(item.moves)
+            self._say("compensating", self._source.tell() / size)
+        if self._sum.moves == 0:
+            raise GcodeError("the file contains no moves: is it G-code?")
+        if self._changes:
+            self._emit(self._writer.footer(self._sum.newline))
         self._measurement.finish()
         self._say("done", 1.0)
-        return self._result(size)
+        return self._result(name, size)
 
-    def _items(self, source: object) -> Iterator[Piece | Passage]:
+    def _items(self) -> Iterator[Piece | Passage]:
         while True:
             with self._clock.stage("read"):
-                data = source.read(_BLOCK_BYTES)  # type: ignore[attr-defined]
+                data = self._source.read(_BLOCK_BYTES)
                 blocks = self._reader.push(data) if data else self._reader.flush()
             for block in blocks:
                 if np.any(block.events.kind == EventKind.STAMP):
@@ -333,16 +349,16 @@ class _Job:
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 
     def _stamp(self) -> str:
-        options = self._options.model_dump_json()
+        options = self._options.model_dump_json(exclude={"plate"})
         settings = hashlib.sha256(options.encode()).hexdigest()[:8]
         return (
             f"{__version__} machine={self._machine.name} model={self._machine.revision} "
             f"method={self._options.method} settings={settings}"
         )
 
-    def _emit(self, target: object, text: bytes) -> None:
+    def _emit(self, text: bytes) -> None:
         self._sum.written += len(text)
-        target.write(text)  # type: ignore[attr-defined]
+        self._target.write(text)
 
     def _say(self, stage: str, fraction: float) -> None:
         if self._progress is None:
@@ -352,7 +368,7 @@ class _Job:
         seconds = self._sum.time_s if hasattr(self, "_sum") else 0.0
         self._progress(Progress(stage, fraction, seconds, elapsed, eta))
 
-    def _result(self, size: int) -> Result:
+    def _result(self, name: str, size: int) -> Result:
         total, measured = self._sum, self._measurement
         put_back_s = sum(p.extruding_seconds for p in total.put_back)
         warnings = [*total.warnings, *measured.warnings()]
@@ -368,7 +384,7 @@ class _Job:
             machine_title=self._machine.title,
             machine_revision=self._machine.revision,
             settings=self._options.model_dump(exclude_none=True),
-            source_name=self._source.name,
+            source_name=name,
             channels=measured.channels(),
             best_shaper=shaper.label,
             original_time_s=total.original_s,

@@ -80,6 +80,7 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
         "basis": "ce-opt",
         "robust": "off",
         "along": None,
+        "plate": None,
         "tolerance_um": 2.0,
     }
     result = client.get(job["links"]["result"])

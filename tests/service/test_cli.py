@@ -34,12 +34,13 @@ def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
         target.write_bytes(b"; compensated\n" + source.read_bytes())
         return make_result(layers=2)
 
-    def simulate_file(source, machine, *, cache_dir=None, progress=None):
+    def simulate_file(source, machine, *, plate=None, cache_dir=None, progress=None):
+        seen.plate = plate
         seen.behave()
         return make_result(channels=("before", "shaper"), layers=2)
 
-    def plan_file(source, target_npz, machine, *, rate_hz=1000.0, progress=None):
-        seen.rate_hz = rate_hz
+    def plan_file(source, target_npz, machine, *, rate_hz=1000.0, plate=None, progress=None):
+        seen.rate_hz, seen.plate = rate_hz, plate
         target_npz.write_bytes(b"npz")
 
     module = types.ModuleType("service.pipeline.road")
@@ -92,6 +93,8 @@ def test_options_reach_the_road(road, source, tmp_path):
         ".1",
         "--tolerance-um",
         "2",
+        "--plate",
+        "3",
     ]
     assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
     assert road.machine == "voron-v0"
@@ -100,6 +103,7 @@ def test_options_reach_the_road(road, source, tmp_path):
         "basis": "bspline",
         "robust": "minimax",
         "along": 0.1,
+        "plate": 3,
         "tolerance_um": 2.0,
     }
 
