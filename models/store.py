@@ -61,7 +61,7 @@ def no_such_machine(name: str, own: Sequence[str] = ()) -> ModelError:
     hint = f"did you mean {', '.join(near)}? " if near else ""
     yours = f"your own are {', '.join(own)}; " if own else ""
     return ModelError(
-        f"no machine is called {name!r:.80}; {hint}{yours}Built in are {', '.join(names)}; "
+        f"no machine is called {name!r:.80}; {hint}{yours}built in are {', '.join(names)}; "
         "a file of your own is given by its path, ending in .json"
     )
 

@@ -23,14 +23,15 @@ class _Group(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """See `typer.core.TyperGroup`."""
-        if args[0] not in self.commands and not args[0].startswith("-"):
+        alone = len(args) == 1 or args[1].startswith("-")
+        if alone and args[0] not in self.commands and not args[0].startswith("-"):
             args = ["show", *args]
         return super().resolve_command(ctx, args)
 
 
 app = typer.Typer(
     cls=_Group,
-    help="Machines: the built-in library and your own, each change of which is a revision.",
+    help="Machines, built in and your own. Each change of your own is a revision.",
     rich_markup_mode=None,
 )
 

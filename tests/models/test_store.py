@@ -82,7 +82,7 @@ def test_a_file_of_ones_own(tmp_path: Path, document: dict[str, Any]) -> None:
 def test_unknown_names_and_files(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="did you mean voron-v0"):
         load_machine("voron_v0")
-    with pytest.raises(ModelError, match="Built in are annex-k3"):
+    with pytest.raises(ModelError, match="built in are annex-k3"):
         load_machine("zzz")
     with pytest.raises(ModelError, match="cannot read the machine file"):
         load_machine(tmp_path / "none.json")

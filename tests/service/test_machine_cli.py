@@ -91,6 +91,8 @@ def test_the_old_form_still_works(capsys):
     assert Machine.model_validate_json(document).name == "ender3"
     assert machines("show", "ender3") == 0
     assert capsys.readouterr().out == document
+    assert machines("histroy", "ender3") == 2
+    assert "'history'" in one_line(capsys)
     assert machines("nope") == 2
     assert "nope" in one_line(capsys)
 
