@@ -8,6 +8,7 @@ import sys
 import uvicorn
 
 from service.api import create_app
+from service.exclusive import exclusive
 from service.logs import configure_logging
 from service.settings import Settings
 
@@ -30,7 +31,7 @@ def serve_forever(settings: Settings, host: str, port: int) -> None:
     Raises
     ------
     OSError
-        If the address cannot be bound.
+        If the address cannot be bound, or another service works with the data directory.
     """
     configure_logging()
     app = create_app(settings)
@@ -38,7 +39,10 @@ def serve_forever(settings: Settings, host: str, port: int) -> None:
         app, host=host, port=port, log_level="warning", access_log=False, server_header=False
     )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener:
+    with (
+        exclusive(settings.data_dir),
+        socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
+    ):
         shown = f"[{host}]" if family == socket.AF_INET6 else host
         sys.stdout.write(f"stillpath: http://{shown}:{listener.getsockname()[1]}/\n")
         sys.stdout.flush()

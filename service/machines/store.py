@@ -82,16 +82,15 @@ class MachineStore:
 
     def revision(self, name: str, number: int) -> Revision:
         """Return one revision."""
-        numbers = self._existing(name)
-        if number not in numbers:
-            raise UnknownMachine(
-                f"machine {name!r} has no revision {number}; it has 1 to {numbers[-1]}"
-            )
-        return self._read_revision(name, number)
+        last = self._existing(name)[-1]
+        if not 1 <= number <= last:
+            raise UnknownMachine(f"machine {name!r} has no revision {number}; it has 1 to {last}")
+        return self._listed(name, number)
 
     def history(self, name: str) -> list[Revision]:
         """Return all revisions, oldest first."""
-        return [self._read_revision(name, number) for number in self._existing(name)]
+        last = self._existing(name)[-1]
+        return [self._listed(name, number) for number in range(1, last + 1)]
 
     def approvals(self, name: str) -> dict[int, Approval]:
         """Return the approvals by the number of their revision."""
@@ -350,6 +349,15 @@ class MachineStore:
     def _revision_numbers(self, name: str) -> list[int]:
         # A name only: a path must not reach the file system from outside.
         return _numbers(self._root / name, _REVISION) if _NAME.fullmatch(name) else []
+
+    def _listed(self, name: str, number: int) -> Revision:
+        """Read a revision that must be there: numbers have no gaps."""
+        try:
+            return self._read_revision(name, number)
+        except _Gone:
+            if name not in self:
+                raise
+            raise _damaged(_revision_file(self._root / name, number), "it is missing") from None
 
     def _read_revision(self, name: str, number: int) -> Revision:
         file = _revision_file(self._root / name, number)

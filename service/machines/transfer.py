@@ -71,7 +71,7 @@ def import_file(
     if history is not None and name in (None, history.name):
         store.add_history(history.name, history.revisions)
         return store.current(history.name)
-    name = name or machine.name
+    name = machine.name if name is None else name
     return store.add_revision(
         name,
         machine.model_copy(update={"name": name}),

@@ -196,6 +196,20 @@ def test_damage_names_the_file(store: MachineStore, tmp_path: Path, spoil, words
     assert store.names() == ["mine"]
 
 
+def test_a_revision_that_is_missing_is_named(store: MachineStore, tmp_path: Path):
+    for title in ("one", "two", "three"):
+        machine = make_machine().model_copy(update={"title": title})
+        store.add_revision("mine", machine, author="A", message=title)
+    (found,) = tmp_path.rglob("000002.json")
+    found.unlink()
+    assert store.current("mine").number == 3
+    for needs_it in (lambda: store.history("mine"), lambda: store.revision("mine", 2)):
+        with pytest.raises(ModelError, match=r"000002\.json: damaged: it is missing"):
+            needs_it()
+    with pytest.raises(UnknownMachine, match="it has 1 to 3"):
+        store.revision("mine", 4)
+
+
 def test_documents_of_an_earlier_version_stay_readable(store: MachineStore, tmp_path: Path):
     """A field with a default that the version that wrote the file did not know."""
     made = store.add_revision("mine", make_machine(), author="anna")

@@ -145,3 +145,19 @@ def _peak_kb(pid: int) -> int:
         if line.startswith("VmHWM")
     ]
     return int(line.split()[1])
+
+
+def test_a_second_service_on_the_same_data_is_refused(tmp_path: Path):
+    with server(REAL, tmp_path) as (client, process):
+        second = subprocess.run(
+            [*REAL, str(tmp_path)], capture_output=True, text=True, cwd=ROOT, check=False
+        )
+        assert second.returncode == 1
+        assert "another service works with this data directory" in second.stderr
+        assert second.stderr.count("\n") == 1
+        assert client.get("/readyz").status_code == 200
+        process.kill()
+        process.wait(timeout=30)
+    # The system lets go of what a killed one kept.
+    with server(REAL, tmp_path) as (client, _):
+        assert client.get("/readyz").status_code == 200

@@ -1,0 +1,56 @@
+"""One service for each data directory.
+
+At its start a service deletes broken uploads and takes up the jobs that were running; done beside
+another service, those would be the other one's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["exclusive"]
+
+_TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
+
+
+@contextlib.contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """Keep a folder, made if need be, for the `with` block; the system lets go if we are killed.
+
+    Raises
+    ------
+    OSError
+        EBUSY if somebody else keeps it. File systems without locks keep nothing.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder / "service.lock", os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        try:
+            _lock(handle)
+        except OSError as error:
+            if error.errno in _TAKEN:
+                raise OSError(
+                    errno.EBUSY,
+                    "another service works with this data directory; stop it, or choose another "
+                    "one (--data-dir, STILLPATH_DATA_DIR)",
+                    str(folder),
+                ) from None
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(handle: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
