@@ -75,6 +75,17 @@ class Loop:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        polynomials = (self.plant_num, self.plant_den, self.error_num, self.error_den,
+                       self.rate_num, self.rate_den)  # fmt: skip
+        if not all(math.isfinite(c) for polynomial in polynomials for c in polynomial):
+            raise ModelError(f"loop {self.name!r}: coefficients must be finite numbers")
+        if not any(self.plant_num) or 0.0 in (
+            self.plant_den[0], self.error_den[0], self.rate_den[0]
+        ):  # fmt: skip
+            raise ModelError(
+                f"loop {self.name!r}: the plant is 0, or a denominator begins with 0 (what z^0 "
+                "multiplies must not vanish)"
+            )
         if self.plant_num[0] != 0.0:
             raise ModelError(
                 f"loop {self.name!r}: the plant answers within the sample (num[0] = "
@@ -96,6 +107,11 @@ class Loop:
         A dc gain above 1 is scaled to 1: it would put the integrator of P outside the circle.
         """
         top, bottom = _aligned(num, den)
+        if not (np.all(np.isfinite(top)) and np.all(np.isfinite(bottom)) and bottom.sum()):
+            raise ModelError(
+                f"loop {name!r}: T0 has no finite gain at standstill; its denominator must be that "
+                "of a stable servo"
+            )
         gain = float(top.sum() / bottom.sum())
         notes: tuple[str, ...] = ()
         if gain > 1.0:

@@ -44,6 +44,7 @@ __all__ = [
     "forward_model",
     "instant_check",
     "model_blocks",
+    "target_angles",
 ]
 
 Array = NDArray[np.float64]
@@ -208,7 +209,7 @@ def design_q(
     DesignError
         See `fmsdob`.
     """
-    w = _checked(loop, targets_hz)
+    w = target_angles(loop, targets_hz)
     if not 0.0 < detuning <= 1.0:
         raise DesignError(f"detuning {detuning:g}: take a factor in (0, 1]")
     values, slopes = inverse_and_slope(*forward_model(loop, around), w)
@@ -219,6 +220,28 @@ def design_q(
     angles = [(radius, 2 * math.pi * f_hz * loop.dt_s) for radius, f_hz in zeros]
     taps = interpolating_fir(w, values, slopes if shape == "hermite" else None, angles)
     return QFilter(tuple(taps.tolist()), band, detuning)
+
+
+def target_angles(loop: Loop, targets_hz: Sequence[float]) -> Array:
+    """Return the targets in rad/sample.
+
+    Raises
+    ------
+    DesignError
+        If there is none, one is not between 0 and half the sampling rate, or one is named twice.
+    """
+    top = 0.5 / loop.dt_s
+    targets = np.asarray(targets_hz, float)
+    if targets.ndim != 1 or len(targets) == 0:
+        raise DesignError("name at least one target frequency")
+    for f in targets:
+        if not 0.0 < f < top:
+            raise DesignError(
+                f"target {f:g} Hz does not lie between 0 and half the sampling rate, {top:g} Hz"
+            )
+    if len(np.unique(targets)) < len(targets):
+        raise DesignError("a target frequency is named twice")
+    return np.asarray(2 * np.pi * targets * loop.dt_s, np.float64)
 
 
 def instant_check(loop: Loop, targets_hz: ArrayLike) -> Array:
@@ -256,21 +279,6 @@ def model_blocks(loop: Loop, around: Around = "servo") -> tuple[Block, ...]:
         Block("answer", (("c", -1.0),), loop.servo_num, loop.t0_den),
         Block("model", (("told", 1.0), ("answer", 1.0))),
     )
-
-
-def _checked(loop: Loop, targets_hz: Sequence[float]) -> Array:
-    top = 0.5 / loop.dt_s
-    targets = np.asarray(targets_hz, float)
-    if targets.ndim != 1 or len(targets) == 0:
-        raise DesignError("name at least one target frequency")
-    for f in targets:
-        if not 0.0 < f < top:
-            raise DesignError(
-                f"target {f:g} Hz does not lie between 0 and half the sampling rate, {top:g} Hz"
-            )
-    if len(np.unique(targets)) < len(targets):
-        raise DesignError("a target frequency is named twice")
-    return np.asarray(2 * np.pi * targets * loop.dt_s, np.float64)
 
 
 def _widths(bandwidth_hz: float | Sequence[float] | None, count: int) -> tuple[float, ...]:

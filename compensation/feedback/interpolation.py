@@ -58,8 +58,13 @@ def interpolating_fir(
     Raises
     ------
     DesignError
-        If two frequencies are so close that the taps are not determined.
+        If two frequencies are so close that the taps are not determined, or a fixed zero is no
+        point of the plane but 0.
     """
+    if not all(
+        radius > 0 and np.isfinite(radius) and np.isfinite(angle) for radius, angle in zeros
+    ):
+        raise DesignError("fixed zeros of Q need a radius above 0 and a frequency, both finite")
     angles = [angle for _, angle in zeros]
     real = [bool(np.isclose(np.sin(angle), 0.0, atol=1e-12)) for angle in angles]
     count = (2 if slopes is None else 4) * len(w) + sum(1 if r else 2 for r in real)

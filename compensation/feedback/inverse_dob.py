@@ -7,7 +7,6 @@ its reference [21]). Needs zeros of P well inside the unit circle.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,7 +21,7 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from compensation.feedback.fmsdob import QFilter
+from compensation.feedback.fmsdob import QFilter, target_angles
 from compensation.feedback.interpolation import interpolating_fir
 from models.diagrams import Block
 from models.loops import Loop
@@ -43,6 +42,8 @@ def inverse_dob(
 
     Raises
     ------
+    DesignError
+        If a target is out of range.
     Refusal
         If the inverse has a pole beyond |z| = .97, or the loop is unstable for a member, or
         small gain is violated.
@@ -57,7 +58,7 @@ def inverse_dob(
             f"inverse dob on {nominal.name!r}: the plant has a zero at |z| = {radius:.4f}, so its "
             f"inverse has a pole there (at most {LARGEST_INVERSE_RADIUS:g}); use fmsdob",
         )
-    w = 2 * math.pi * np.asarray(targets_hz, float) * nominal.dt_s
+    w = target_angles(nominal, targets_hz)
     widths = (bandwidth_hz,) * len(w)
     q = QFilter(
         tuple(interpolating_fir(w, np.exp(1j * delay * w)).tolist()),

@@ -136,7 +136,7 @@ def predictor(
             "least 2, alpha in [0, 1), the age not negative"
         )
     w = 2 * np.pi * np.asarray(f_hz, float) * dt_s
-    if len(w) == 0 or np.any(w <= 0) or np.any(w >= np.pi):
+    if len(w) == 0 or not np.all((w > 0) & (w < np.pi)):
         raise DesignError(f"tones {list(f_hz)} Hz: each must lie between 0 and {0.5 / dt_s:g} Hz")
     distance = singular_distance_hz(f_hz, ratio * dt_s)
     if distance * ratio * dt_s < 1e-9:

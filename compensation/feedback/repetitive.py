@@ -69,6 +69,7 @@ _RADIUS = 0.97
 _SERIES_LEFT = 1e-3
 _LARGEST_PERIOD = 1000
 _NOTHING = 1e-9
+_LOWEST_NOTCH = 1e-2
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,9 +333,11 @@ def internal_model(
     if not 0 <= pairs <= 20:
         raise Refusal("singular", f"{pairs} zero pairs at Nyquist; 0 to 20 are possible")
     angles = tuple(2 * math.pi * f * dt_s for f in notches_hz)
-    if any(not 0 < angle <= math.pi for angle in angles):
+    if any(not _LOWEST_NOTCH <= angle <= math.pi for angle in angles):
         raise Refusal(
-            "singular", f"notches {tuple(notches_hz)} Hz must lie below {0.5 / dt_s:g} Hz"
+            "singular",
+            f"notches {tuple(notches_hz)} Hz must lie between {_LOWEST_NOTCH / math.tau / dt_s:g} "
+            f"and {0.5 / dt_s:g} Hz",
         )
     if not 2 <= period <= _LARGEST_PERIOD:
         raise Refusal(

@@ -113,8 +113,10 @@ def design_prefilter(
     Raises
     ------
     DesignError
-        If the inverse does not exist.
+        If the inverse does not exist, or `length` is below 1.
     """
+    if length < 1:
+        raise DesignError(f"low-pass that looks {length} samples ahead; at least 1 is needed")
     # The scale of a reference is the user's: the inverse must reach constants exactly.
     inversion = invert(kind, reference_plant(loop), order, unit_dc=True)
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)

@@ -143,3 +143,17 @@ def test_refusals(tmp_path: Path) -> None:
     path.write_text(json.dumps(document))
     with pytest.raises(ModelError, match="unstable"):
         load_loop(path)
+
+
+@pytest.mark.parametrize(
+    ("num", "den", "words"),
+    [
+        ((0.0, 0.0), (1.0, -0.5), "plant is 0"),
+        ((0.0, float("nan")), (1.0, -0.5), "finite"),
+        ((0.0, 0.5), (0.0, 1.0), "begins with 0"),
+        ((0.0, 0.5), (1.0, -1.0), "no finite gain"),
+    ],
+)
+def test_what_is_no_loop(num: tuple[float, ...], den: tuple[float, ...], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        Loop.from_t0(num, den, 1e-3)

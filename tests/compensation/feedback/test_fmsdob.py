@@ -290,6 +290,19 @@ def test_impossible_targets(targets_hz: list[float], message: str) -> None:
         fmsdob(SLOW.loops(), targets_hz)
 
 
+@pytest.mark.parametrize("target_hz", [float("nan"), float("inf"), -5.0, 0.0, 5000.0])
+def test_targets_outside_the_band(target_hz: float) -> None:
+    for design in (fmsdob, inverse_dob):
+        with pytest.raises(DesignError, match="half the sampling rate"):
+            design(SLOW.loops(), [target_hz])
+
+
+@pytest.mark.parametrize("zero", [(0.0, 100.0), (1.0, float("nan")), (-1.0, 100.0)])
+def test_fixed_zeros_are_points(zero: tuple[float, float]) -> None:
+    with pytest.raises(DesignError, match="fixed zeros"):
+        fmsdob(SLOW.loops(), [1500.0], zeros=[zero])
+
+
 def test_blocked_target() -> None:
     num = np.convolve([0.0, 0.2], [1.0, -2 * np.cos(0.6), 1.0])
     loop = Loop(tuple(num.tolist()), (1.0, -0.3, 0.0, 0.0), 1e-3, (0.0,))

@@ -192,7 +192,13 @@ def test_what_is_returned_is_stable_on_every_member(
 
 @pytest.mark.parametrize(
     ("f_hz", "ratio", "alpha"),
-    [([100.0], 1, 0.9), ([100.0], 3, 1.0), ([6000.0], 3, 0.9), ([], 3, 0)],
+    [
+        ([100.0], 1, 0.9),
+        ([100.0], 3, 1.0),
+        ([6000.0], 3, 0.9),
+        ([float("nan")], 3, 0.9),
+        ([], 3, 0),
+    ],
 )
 def test_impossible_predictors(f_hz: list[float], ratio: int, alpha: float) -> None:
     with pytest.raises(DesignError):

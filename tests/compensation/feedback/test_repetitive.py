@@ -280,6 +280,7 @@ def test_a_refusal_names_what_fits() -> None:
         ({"alpha": 1.0}, "alpha"),
         ({"nyquist_pairs": 30}, "pairs"),
         ({"notches_hz": (9000.0,)}, "8000"),
+        ({"notches_hz": (1e-6,)}, "25"),
     ],
 )
 def test_names_what_is_out_of_range(change: dict[str, object], words: str) -> None:
