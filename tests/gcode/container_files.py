@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import struct
 import zipfile
 import zlib
@@ -22,7 +23,7 @@ METADATA = (
     (2, 1, b"layer_height=0.2\nstart_gcode=G28\\nG1 X1\n"),
 )
 THUMBNAIL = bytes(range(256)) * 3
-_WORDS = b"ACEFGHIJPRSWXYZ"
+_BEFORE_WORD = re.compile(rb"(?<=[^ ])(?=[ACEFGHIJPRSWXYZ])")
 
 
 def block(
@@ -90,15 +91,10 @@ def blocks(file: bytes) -> Iterator[tuple[int, int, bytes, bytes]]:
 
 def normal(text: bytes) -> bytes:
     """What MeatPack leaves of a text: no empty lines, a space before each word of a G line."""
-    lines = []
-    for line in text.split(b"\n"):
-        made = b""
-        for k in range(len(line)):
-            c = line[k : k + 1]
-            if k and line[:1] == b"G" and c in _WORDS and line[k - 1 : k] != b" ":
-                made += b" "
-            made += c
-        lines.append(made)
+    lines = [
+        _BEFORE_WORD.sub(b" ", line) if line.startswith(b"G") else line
+        for line in text.split(b"\n")
+    ]
     ends = text.endswith(b"\n")
     return b"\n".join(line for line in lines if line) + (b"\n" if ends and any(lines) else b"")
 
