@@ -113,7 +113,10 @@ class ScheduledCompensator:
         kept = {*left, *self._points}
         self._made = {p: c for p, c in self._made.items() if p in kept}
         self._knowing &= set(self._points)
-        made = [self._compensator(one) for one in self._points]
+        made = [self._compensator(self._points[0])]
+        if made[0].lead_s or made[0].tail_s:
+            made = [self._compensator(one) for one in self._points]
+        # Others need no standing time anywhere; the nodes that a print never touches are not made.
         self.lead_s, self.tail_s = max(c.lead_s for c in made), max(c.tail_s for c in made)
 
     def compensate(

@@ -80,6 +80,7 @@ class MachineStream:
     def _answer(self, u_mm: Array, path_mm: Array) -> Array:
         if len(self._streams) == 1:
             return self._streams[0].push(u_mm)
-        answers = [stream.push(u_mm) - u_mm for stream in self._streams]
-        blended = np.einsum("in,ikn->kn", self._grid.weights(path_mm), np.stack(answers))
-        return np.asarray(u_mm + blended)
+        blended = u_mm.copy()
+        for share, stream in zip(self._grid.weights(path_mm), self._streams, strict=True):
+            blended += share * (stream.push(u_mm) - u_mm)
+        return blended

@@ -10,9 +10,9 @@ from compensation.base import Compensator, DesignError
 from compensation.fbf import LADDER, PreviewFbf
 from compensation.preview_axis import BAND_MARGIN, functions_within
 from compensation.registry import compensator
-from compensation.scheduled import ScheduledCompensator
+from compensation.scheduled import BLEND_STEP, STEP, ScheduledCompensator
 from models.machine import CommandLimits, Machine
-from models.operating import machine_at
+from models.operating import OperatingGrid, machine_at
 from models.plants import Mode, ModesSpec, plant_set
 from models.schedule import (
     AxisSchedule,
@@ -192,6 +192,20 @@ def test_blend_beyond_the_limits_is_refused() -> None:
     narrow = across({79.0: 25.0, 81.0: 50.0}, command=CommandLimits(accel_mm_s2=6500.0))
     with pytest.raises(DesignError, match=r"axis y: blended over the position.*mm/s2"):
         run(compensator("fbf", narrow, DT_S), pieces(1), [OperatingPoint()])
+
+
+def test_nodes_that_a_print_does_not_touch_are_not_designed() -> None:
+    machine = across({0.0: 35.0, 110.0: 30.0, 220.0: 26.0})
+    asked = []
+
+    def make(then: Machine) -> Compensator:
+        asked.append(then)
+        return PreviewFbf(then, DT_S)
+
+    one = ScheduledCompensator(machine, make, DT_S)
+    assert len(asked) == 1
+    run(one, pieces(2), [OperatingPoint()] * 2)
+    assert 2 <= len(asked) < 0.7 * OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP).nodes
 
 
 def test_designs_fail_where_they_are_made() -> None:
