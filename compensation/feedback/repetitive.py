@@ -106,9 +106,7 @@ class InternalModel:
             pair = np.array([0.5, -math.cos(notch), 0.5]) / (1 - math.cos(notch))
             taps = np.convolve(taps, np.convolve(pair, pair))
         if self.mean_free:
-            mean = self._mean()
-            half = max(len(mean), len(taps)) // 2
-            taps = _centred(taps, half) - _centred(mean, half)
+            taps = np.convolve(taps, self._without_mean())
         return np.asarray(taps)
 
     @property
@@ -124,7 +122,7 @@ class InternalModel:
             value = value * ((np.cos(w) - math.cos(notch)) / (1 - math.cos(notch))) ** 2
         if self.mean_free:
             even = np.cos(w / 2) if self.period % 2 == 0 else 1.0
-            value = value - diric(w, self.period) * even
+            value = value * (1 - diric(w, self.period) * even)
         return np.asarray(value)
 
     def response(self, angle: ArrayLike) -> Complex:
@@ -142,11 +140,12 @@ class InternalModel:
         den[self.period - self.lead :] -= (1 - share) * self.taps
         return (1 - share) * self.taps, den
 
-    def _mean(self) -> Array:
-        """Return the mean over a period; an even one has half samples at its ends."""
-        taps = np.full(2 * (self.period // 2) + 1, 1.0 / self.period)
+    def _without_mean(self) -> Array:
+        """Return 1 less the mean over a period; an even one has half samples at its ends."""
+        taps = np.full(2 * (self.period // 2) + 1, -1.0 / self.period)
         if self.period % 2 == 0:
             taps[[0, -1]] *= 0.5
+        taps[self.period // 2] += 1.0
         return taps
 
 
@@ -444,8 +443,3 @@ def _designed(
         settings=asked | {"period": model.period},
         notes=(*inverse.notes, *notes),
     )
-
-
-def _centred(taps: Array, half: int) -> Array:
-    """Pad symmetric taps to 2 half + 1 of them."""
-    return np.pad(taps, half - len(taps) // 2)

@@ -240,6 +240,16 @@ class TestIntegralAction:
         assert np.abs(np.mean(after["y"][-2000:])) < 1e-3
         assert np.abs(np.mean(after["c"][-2000:])) < 1e-3
 
+    def test_multirate(self) -> None:
+        """The mean is low-passed, too: what is left at half the fast rate would fold to dc."""
+        fast = PidLoop(
+            plant_num=(0.0, 7.5e-6, 7.5e-6), plant_den=(1.0, -2.0, 1.0), delay_samples=2,
+            dt_s=5e-5, kp=9.0, ki=90.0, kv=1440.0, velocity_corner_hz=1000.0,
+        ).loop("fast")  # fmt: skip
+        made = design_multirate((self.PI, self.PI.varied(1.05)), fast, 20_000 / 45)
+        assert made.settings["factor"] == 2
+        assert max(made.spectral_radii) < 1
+
     @pytest.mark.parametrize("period", [6, 7])
     def test_the_mean_alone_is_taken_out(self, period: int) -> None:
         model, whole = (InternalModel(period, 0.9, 1, (), out) for out in (True, False))
