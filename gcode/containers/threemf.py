@@ -26,7 +26,7 @@ from gcode.errors import GcodeError
 
 __all__ = ["ThreeMf"]
 
-_PLATE = re.compile(r"Metadata/plate_(\d{1,4})\.gcode")
+_PLATE = re.compile(r"Metadata/plate_([1-9]\d{0,3})\.gcode")
 _COPY_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
 _BROKEN = (
@@ -79,12 +79,13 @@ class ThreeMf:
 
     def write(self, text: BinaryIO, target: BinaryIO, told: Callable[[float], None]) -> None:
         """Write a package around a text; its other members and plates are kept as they are."""
-        digest = _md5(text)
+        digest, size = _md5(text)
         with _reading(self._source) as archive, zipfile.ZipFile(target, "w") as made:
             made.comment = archive.comment
             for info in archive.infolist():
-                with made.open(_like(info), "w") as member:
-                    if info.filename == self._name:
+                ours = info.filename == self._name
+                with made.open(_like(info, size if ours else info.file_size), "w") as member:
+                    if ours:
                         while data := text.read(_COPY_BYTES):
                             member.write(data)
                             told(text.tell())
@@ -163,22 +164,24 @@ def _chosen(names: list[str], plate: int | None) -> str:
     return plates[plate]
 
 
-def _md5(text: BinaryIO) -> str:
+def _md5(text: BinaryIO) -> tuple[str, int]:
+    """Return digest and size of a text, and go back to its beginning."""
     digest = hashlib.md5(usedforsecurity=False)
     while data := text.read(_COPY_BYTES):
         digest.update(data)
+    size = text.tell()
     text.seek(0)
-    return digest.hexdigest()
+    return digest.hexdigest(), size
 
 
-def _like(info: zipfile.ZipInfo) -> zipfile.ZipInfo:
-    """Describe a member to be written as the original was, but for sizes and checksum."""
+def _like(info: zipfile.ZipInfo, size: int) -> zipfile.ZipInfo:
+    """Describe a member of about `size` bytes to be written as the original was."""
     made = zipfile.ZipInfo(info.filename, info.date_time)
     made.compress_type = info.compress_type
     made.external_attr = info.external_attr
     made.create_system = info.create_system
     made.comment = info.comment
-    made.file_size = info.file_size  # tells whether large sizes are needed
+    made.file_size = size  # tells whether the fields of large files are needed
     return made
 
 
