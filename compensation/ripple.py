@@ -209,7 +209,6 @@ class RippleCompensator:
     def operate_at(self, point: OperatingPoint) -> None:
         """See `compensation.base.Compensator.operate_at`."""
         self._inner.operate_at(point)
-        self.lead_s, self.tail_s = self._inner.lead_s, self._inner.tail_s
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]

@@ -14,7 +14,6 @@ from models.identification.ripple import PassLog, WaveBasis, learn_ripple, updat
 from models.machine import CommandLimits, Machine
 from models.plants import Mode, ModesSpec, PlantSetSpec, continuous
 from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource, RippleTable
-from models.schedule import AxisSchedule, MassSchedule, OperatingPoint
 from models.store import load_machine
 from simulation.response import response
 
@@ -222,14 +221,3 @@ class TestAxes:
             RippleCompensator(PassThrough(), rippled(printer(), x=loose), DT)
         close = axis_ripple(homing_repeatability_mm=0.03)
         RippleCompensator(PassThrough(), rippled(printer(), x=close), DT)
-
-
-def test_standing_times_follow_the_operating_point() -> None:
-    machine = rippled(load_machine("generic-bedslinger"), x=axis_ripple())
-    mass = AxisSchedule(mass=MassSchedule(moving_mass_kg=0.2))
-    machine = machine.model_copy(update={"schedules": {"y": mass}})
-    for method in ("zpetc", "shaper:mzv"):
-        plain, both = (compensator(name, machine, 1e-3) for name in (method, f"{method}+ripple"))
-        for one in (plain, both):
-            one.operate_at(OperatingPoint(mass_kg=0.6))
-        assert (both.lead_s, both.tail_s) == (plain.lead_s, plain.tail_s)
