@@ -15,7 +15,7 @@ from compensation.feedback.fmsdob import fmsdob
 from compensation.feedback.inverse_dob import inverse_dob
 from compensation.feedback.mmp import mmp
 from compensation.feedback.multirate import design_multirate
-from compensation.feedback.repetitive import design_quasi, design_wide_band, exact_frequency
+from compensation.feedback.repetitive import design_quasi, design_wide_band, shared_period
 from models.disturbances import SensorSpec
 from models.loops import Loop, LoopSpec, builtin_loops, load_loop
 from service.controllers.figures import (
@@ -249,8 +249,7 @@ def _check_size(spec: LoopSpec, loops: tuple[Loop, ...], options: ControllerOpti
     if isinstance(options, WideOptions):
         states += round(1.0 / (loops[0].dt_s * options.fundamental_hz))
     elif isinstance(options, QuasiOptions | MultirateOptions):
-        ratio = exact_frequency(1 / loops[0].dt_s) / exact_frequency(options.fundamental_hz)
-        states += ratio.numerator
+        states += shared_period(1 / loops[0].dt_s, options.fundamental_hz).denominator
     elif isinstance(options, MmpOptions):
         states += 2 * len(options.targets_hz) * _every(spec)
     largest = int((_LARGEST_WORK / len(loops)) ** (1 / 3))

@@ -20,7 +20,7 @@ __all__ = ["LoadedController", "load_controller", "read_controller"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Polynomial = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=5000)]
 _OPTIONS: TypeAdapter[ControllerOptions] = TypeAdapter(ControllerOptions)
-_MOST_STATES = 800
+_MOST_STATES = 1200
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class _Document(BaseModel):
     loop: LoopSpec
     options: ControllerOptions
     every: Annotated[int, Field(ge=1, le=64)]
-    difference_equations: Annotated[tuple[_Equation, ...], Field(min_length=1, max_length=256)]
+    difference_equations: Annotated[tuple[_Equation, ...], Field(min_length=1, max_length=4096)]
 
 
 def _checked_radius(found: _Document, blocks: tuple[Block, ...], source: str) -> float:
