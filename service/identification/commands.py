@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import ModelError
-from service.machines.commands import By, Message, open_machines, who
+from service.machines.commands import By, Message, data_dir, open_machines, who
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -162,6 +162,7 @@ def run(
         return
 
     from service.console import progress_shown
+    from service.identification.archive import Archive
     from service.identification.page import write_identification
     from service.identification.run import identify_files, read_inputs
     from service.identification.tables import print_identification
@@ -178,6 +179,9 @@ def run(
         )
     sources = found.report.sources
     made = _stored(machines, machine, found.machine, sources, who(by), message, expected)
+    if made is not None:
+        # Where the service looks for them.
+        Archive(data_dir() / "identifications").keep(found.report)
     if report is not None:
         write_identification(found.report, report)
     _write(output, found.machine)

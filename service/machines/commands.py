@@ -14,8 +14,9 @@ from models.errors import ModelError
 if TYPE_CHECKING:
     from service.machines.resolve import Resolver
     from service.machines.revision import Revision
+    from service.machines.settings import MachineSettings
 
-__all__ = ["app", "open_machines", "who"]
+__all__ = ["app", "data_dir", "open_machines", "who"]
 
 
 class _Group(TyperGroup):
@@ -45,23 +46,22 @@ Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
 
 def open_machines() -> Resolver:
     """Return the machines of this user, by the environment's settings."""
-    from pydantic import ValidationError
-
-    from models.store import explain
-    from service.machines.resolve import Resolver, user_data_dir
-    from service.machines.settings import MachineSettings
+    from service.machines.resolve import Resolver
     from service.machines.store import MachineStore
 
-    try:
-        settings = MachineSettings.from_environment()
-    except ValidationError as error:
-        raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
-    store = MachineStore((settings.data_dir or user_data_dir()) / "machines")
+    settings = _settings()
     return Resolver(
-        store,
+        MachineStore(data_dir() / "machines"),
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
+
+
+def data_dir() -> Path:
+    """Return the folder of this user's machines and identifications."""
+    from service.machines.resolve import user_data_dir
+
+    return _settings().data_dir or user_data_dir()
 
 
 @app.callback(invoke_without_command=True)
@@ -314,6 +314,18 @@ def who(by: str | None) -> str:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):  # a container's user may have no name
         return "unknown"
+
+
+def _settings() -> MachineSettings:
+    from pydantic import ValidationError
+
+    from models.store import explain
+    from service.machines.settings import MachineSettings
+
+    try:
+        return MachineSettings.from_environment()
+    except ValidationError as error:
+        raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
 
 
 def _day(text: str) -> Any:
