@@ -14,15 +14,15 @@ import heatshrink2
 
 from gcode.containers.meatpack import pack
 
-__all__ = ["METADATA", "THUMBNAIL", "binary", "block", "blocks", "members", "normal", "package"]
+__all__ = ["binary", "block", "blocks", "members", "normal", "package"]
 
-METADATA = (
+_METADATA = (
     (0, 0, b"Producer=PrusaSlicer 2.9.4\nProduced on=2026-01-02 at 03:04:05 UTC\n"),
     (3, 0, b"printer_model=MK4\n"),
     (4, 1, b"estimated printing time (normal mode)=1m 8s\n"),
     (2, 1, b"layer_height=0.2\nstart_gcode=G28\\nG1 X1\n"),
 )
-THUMBNAIL = bytes(range(256)) * 3
+_THUMBNAIL = bytes(range(256)) * 3
 _BEFORE_WORD = re.compile(rb"(?<=[^ ])(?=[ACEFGHIJPRSWXYZ])")
 
 
@@ -54,9 +54,9 @@ def binary(
 ) -> bytes:
     """A file with metadata, a thumbnail, and a block for each text."""
     parts = [struct.pack("<4sIH", b"GCDE", version, checked if checksum is None else checksum)]
-    parts += [block(k, d, compression=c, checked=checked) for k, c, d in METADATA[:2]]
-    parts.append(block(5, THUMBNAIL, parameters=struct.pack("<3H", 0, 16, 9), checked=checked))
-    parts += [block(k, d, compression=c, checked=checked) for k, c, d in METADATA[2:]]
+    parts += [block(k, d, compression=c, checked=checked) for k, c, d in _METADATA[:2]]
+    parts.append(block(5, _THUMBNAIL, parameters=struct.pack("<3H", 0, 16, 9), checked=checked))
+    parts += [block(k, d, compression=c, checked=checked) for k, c, d in _METADATA[2:]]
     for piece in [text] if isinstance(text, bytes) else text:
         parts.append(
             block(
@@ -112,7 +112,7 @@ def package(
             archive.writestr(f"Metadata/plate_{number}.gcode", text)
             name = f"Metadata/plate_{number}.gcode.md5"
             archive.writestr(name, digest.upper() if upper else digest + "\n")
-            archive.writestr(f"Metadata/plate_{number}.png", THUMBNAIL)
+            archive.writestr(f"Metadata/plate_{number}.png", _THUMBNAIL)
         for name, data in (more or {}).items():
             archive.writestr(name, data)
         archive.comment = b"sliced"
