@@ -43,7 +43,8 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
         _lead(out[:, begin - 1 : begin + length], u_mm, y_d_mm, begin - 1, 1)
         _lead(out[:, end - length + 1 : end + 1][:, ::-1], u_mm, y_d_mm, end, -1)
     for a, b in spans:
-        out[:, a:b] = y_d_mm[:, b - 1 : b]
+        # The plan may end and begin its motions between the samples at the edges of a rest.
+        out[:, a:b] = y_d_mm[:, (a + b) // 2, None]
     return out
 
 

@@ -155,6 +155,16 @@ def test_terms_of_ts_follow_the_slowest_zero() -> None:
         compensator("ts", near, 1e-3)
 
 
+def test_rests_stand_where_the_plan_rests_and_not_where_its_motions_end() -> None:
+    y_d = np.zeros((2, 200))
+    y_d[:, 100:] = 1.0
+    # The motion ended a little after the sample before the rest, and went on before its last one.
+    y_d[:, 99], y_d[:, 149] = 0.9999, 1.0002
+    y_d[:, 150:] = 1.0 + 0.01 * np.arange(50)
+    out = stand_still(y_d, y_d, np.array([[100, 150]]), 20)
+    np.testing.assert_array_equal(out[:, 99:150], 1.0)
+
+
 def test_stand_still_joins_smoothly() -> None:
     t = np.arange(600)
     y_d = np.stack([np.clip(t - 100, 0, 200) * 0.1 + np.clip(t - 400, 0, 100) * 0.1] * 2)

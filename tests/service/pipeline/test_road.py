@@ -130,6 +130,16 @@ def test_other_methods(tmp_path: Path, cache: Path, options: dict[str, str]) -> 
     check_file(data, written, load_machine("ender3"))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["zpetc", "npz-ignore", "shaper:mzv"])
+def test_other_methods_stand_on_the_plan_in_rests(tmp_path: Path, cache: Path, method: str) -> None:
+    # Motions end and begin between samples: with the command beside the plan's own rest, the
+    # filament of a whole move would fall on a hundredth of a micrometre.
+    result, written = compensate(EXAMPLE.read_bytes(), tmp_path, cache, method=method)
+    assert result.put_back == []
+    check_file(EXAMPLE.read_bytes(), written, load_machine("ender3"))
+
+
 @pytest.mark.slow  # tunes the shaper of one more machine
 def test_a_machine_beyond_the_method_gets_the_reason_and_no_file(
     tmp_path: Path, cache: Path
