@@ -192,10 +192,14 @@ def estimate_driven(
     logs = _several(driven)
     report = progress or _silent
     records = []
-    for i, log in enumerate(logs):
-        records.append(_transformed(log.command, log.measured, _rate_hz(log), taper=0.0))
-        report("estimate", (i + 1) / (len(logs) + 1))
     transient = not all(_rests(log.command) for log in logs)
+    for i, log in enumerate(logs):
+        # Gravity and offsets of sensors are no response.
+        command, measured = (
+            v - np.mean(v if transient else _ends(v)) for v in (log.command, log.measured)
+        )
+        records.append(_transformed(command, measured, _rate_hz(log), taper=0.0))
+        report("estimate", (i + 1) / (len(logs) + 1))
     reach = bins_needed(len(records), transient=transient) // 2
     half = half_band_hz or max(
         *(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS
@@ -378,9 +382,12 @@ def _several(driven: DrivenLog | Sequence[DrivenLog]) -> tuple[DrivenLog, ...]:
 
 def _rests(values: Array) -> bool:
     """Whether a record ends where it began, and hardly moves there."""
+    return bool(np.std(_ends(values)) <= _REST * np.std(values))
+
+
+def _ends(values: Array) -> Array:
     edge = max(len(values) // 50, 1)
-    ends = np.concatenate([values[:edge], values[-edge:]])
-    return bool(np.std(ends) <= _REST * np.std(values))
+    return np.concatenate([values[:edge], values[-edge:]])
 
 
 def _rate_hz(log: DrivenLog) -> float:

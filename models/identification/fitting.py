@@ -57,6 +57,8 @@ _POLES_BAND = (0.5, 1.6)
 _ZEROS_BAND = (0.5, 10.0)
 """Zeros so far above that there are as good as none."""
 _ZETA = (3e-3, 3.0)
+_GAIN = (1e-9, 1e9)
+"""Of any two units."""
 _TINY = 1e-9
 _FAR_ZERO = 3.0
 """A real zero above this multiple of the band is hardly anything but a delay."""
@@ -349,7 +351,7 @@ def _candidate(
     raw = _Candidate(structure, np.concatenate([[0.0, delay_s * 2 * np.pi * data.unit_hz], theta]))
     shape = data.weight * raw.model(data.f_hz)
     gain = float(np.vdot(shape, data.weight * data.response).real / np.vdot(shape, shape).real)
-    raw.vector[0] = np.log(max(gain, 1e-3))
+    raw.vector[0] = np.log(max(gain, _GAIN[0]))
     return raw
 
 
@@ -378,7 +380,8 @@ def _polished(
     if not real_zero:
         low[0], high[0] = -_TINY, _TINY
     turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 1.5 * _EARLIER_S)
-    low, high = np.append([-7.0, -turns], low), np.append([7.0, turns], high)
+    low = np.append([np.log(_GAIN[0]), -turns], low)
+    high = np.append([np.log(_GAIN[1]), turns], high)
 
     def residual(vector: Array) -> Array:
         error = data.weight * (replace(start, vector=vector).model(f) - data.response)

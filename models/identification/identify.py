@@ -60,6 +60,9 @@ _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _MOSTLY = 0.8
 _POOR, _POOR_DB = 0.15, 1.1
+_AHEAD_S = 1e-3
+_WARNING = "warning: "
+"""How readers mark notes that the user must look at."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,8 +173,9 @@ class _AxisWork:
                 "says more"
             )
         notes += _by_file((r.source, n) for r in found.measured for n in r.notes)
-        warnings = (*_fit_warnings(found.fit), *found.warnings) if found.fit else found.warnings
-        return replace(found, notes=tuple(dict.fromkeys(notes)), warnings=warnings)
+        told, warned = _parted(dict.fromkeys(notes))
+        fit_warnings = _fit_warnings(found.fit) if found.fit else ()
+        return replace(found, notes=told, warnings=(*fit_warnings, *found.warnings, *warned))
 
     def _from_model(self) -> AxisIdentification:
         if len(self._used) > 1:
@@ -207,10 +211,18 @@ class _AxisWork:
             for condition in special([c for _, c in responses])
         }
         others = tuple(r for r, c in responses if c not in common)
-        warnings = list(found.warnings)
+        notes: list[str] = []
         if self._kind == "raw log":
-            warnings += _level_warnings(chosen, nominal) + self._mounting_warnings(chosen)
-        found = replace(found, measured=(*found.measured, *others), warnings=tuple(warnings))
+            warnings = _level_warnings(chosen, nominal)
+            notes = self._mounting_notes(chosen)
+        else:
+            warnings = _scale_warnings(chosen, nominal)
+        found = replace(
+            found,
+            measured=(*found.measured, *others),
+            warnings=(*found.warnings, *warnings),
+            notes=tuple(notes),
+        )
         return scheduled(found, nominal, fits, self._kind)
 
     def _from_spectra(self) -> AxisIdentification:
@@ -256,14 +268,18 @@ class _AxisWork:
         if isinstance(measurement, AccelerationLog):
             test = excitation_for(measurement, self._settings)
             sensor = self._settings.sensor_axis
-            response = estimate_response(
-                measurement,
-                test,
-                sensor_direction=None if sensor is None else _SENSOR_AXES[sensor],
-                # Tests of different strength are different operating points.
-                label=label or f"{test.accel_per_hz_mm_s:g} mm/s",
-                progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
-            )
+            try:
+                response = estimate_response(
+                    measurement,
+                    test,
+                    sensor_direction=None if sensor is None else _SENSOR_AXES[sensor],
+                    # Tests of different strength are different operating points.
+                    label=label or f"{test.accel_per_hz_mm_s:g} mm/s",
+                    progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
+                )
+            except ModelError as error:
+                # What the reader noticed may be the reason.
+                raise ModelError("; ".join([str(error), *measurement.notes])) from None
             notes = excitation_notes(measurement, self._settings)
             response = replace(response, notes=(*response.notes, *notes))
         elif isinstance(measurement, DrivenLog):
@@ -274,21 +290,22 @@ class _AxisWork:
         self._steps.stepped(what)
         return response
 
-    def _mounting_warnings(self, responses: Sequence[FrequencyResponse]) -> list[str]:
-        """Say where the sensor's axes seem exchanged: or another axis was measured."""
+    def _mounting_notes(self, responses: Sequence[FrequencyResponse]) -> list[str]:
+        """Say how the sensor sits, where its axes are not the machine's: many are mounted so."""
         if self._settings.sensor_axis is not None:
             return []
-        warnings = []
+        notes = []
         for response in responses:
             along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
             most = max(along, key=along.__getitem__, default=self._axis)
             if most != self._axis and along[most] > _MOSTLY:
                 text = (
-                    f"the sensor's {most} moved in the test of axis {self._axis}; unless it is "
-                    f"mounted so (sensor_axis {most} says that), another axis was measured"
+                    f"the sensor's {most} moved in the test of axis {self._axis}, so it was taken "
+                    "to be mounted so; if it is not, another axis was measured (sensor_axis "
+                    f"{self._axis} refuses such a log)"
                 )
-                warnings.append((response.source, text))
-        return _by_file(warnings)
+                notes.append((response.source, text))
+        return _by_file(notes)
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
@@ -318,6 +335,14 @@ def _by_file(told: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
 
 
+def _parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Part notes from those that a reader calls a warning."""
+    told = tuple(told)
+    warned = tuple(text for text in told if _WARNING in text)
+    notes = tuple(text for text in told if text not in warned)
+    return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
+
+
 def _fit_warnings(fit: Fit) -> tuple[str, ...]:
     """Tell of a model that should not be relied on."""
     if fit.magnitude_only:
@@ -344,6 +369,23 @@ def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[st
             "measure at the part that the axis moves"
         )
     return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]
+
+
+def _scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
+    """Tell of a command and a measurement that are hardly those of one axis in one unit."""
+    names, warnings = ", ".join(dict.fromkeys(r.source for r in responses)), []
+    if abs(fit.gain - 1.0) > _LEVEL_TOLERANCE:
+        warnings.append(
+            f"{names}: at low frequencies the measurement is {fit.gain:.3g} times the command, and "
+            "was divided by that: an axis that keeps its steps ends where it is told; check that "
+            "both have the same unit, and which columns they are"
+        )
+    if fit.delay_s < -_AHEAD_S:
+        warnings.append(
+            f"{names}: the measurement is {-fit.delay_s * 1e3:.2g} ms ahead of the command: check "
+            "that the two are not exchanged, and their clocks"
+        )
+    return warnings
 
 
 def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:

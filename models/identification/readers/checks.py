@@ -12,6 +12,7 @@ __all__ = ["check_alive", "check_long", "check_rising", "check_steady"]
 
 Array = NDArray[np.float64]
 
+_RATES_HZ = (10.0, 1e6)
 _GAP_SAMPLES = 2.5
 """Two periods are one lost sample, which is let pass; half a period allows for jitter."""
 
@@ -38,10 +39,15 @@ def check_rising(values: Array, table: Table, name: str) -> None:
 
 
 def check_steady(time_s: Array, table: Table) -> None:
-    """Raise ModelError at the first gap of more than two samples."""
+    """Raise ModelError for a time that is not in s, and at the first gap of over two samples."""
     check_rising(time_s, table, "time")
     steps = np.diff(time_s)
     period = float(np.median(steps))
+    if not _RATES_HZ[0] <= 1.0 / period <= _RATES_HZ[1]:
+        raise ModelError(
+            f"{table.source}: the samples are {period:.4g} s apart by its time, which is not "
+            f"between {1 / _RATES_HZ[1]:g} and {1 / _RATES_HZ[0]:g} s: time must be in seconds"
+        )
     gaps = np.flatnonzero(steps > _GAP_SAMPLES * period)
     if len(gaps):
         i = int(gaps[0])

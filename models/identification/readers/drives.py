@@ -61,6 +61,11 @@ def _log(table: Table, chosen: np.ndarray, values: np.ndarray, axis: str | None)
                 f"{table.source}: the {name} column is constant ({column[0]:g})"
                 f"{f' for axis {axis}' if axis else ''}; choose another column, or record again"
             )
+    if np.array_equal(command, measured):
+        raise ModelError(
+            f"{table.source}: command and measurement are the same numbers"
+            f"{f' for axis {axis}' if axis else ''}: choose the column of what followed"
+        )
     return DrivenLog(time_s, command, measured, axis, table.source, table.notes)
 
 

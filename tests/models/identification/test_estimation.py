@@ -220,6 +220,20 @@ def test_recorded_drives_give_the_response_of_python_control(estimate, logs: int
     assert found.source.startswith("log0.csv")
 
 
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_gravity_in_a_recorded_drive_changes_nothing(at_rest: bool) -> None:
+    log, plant = driven_log(20_000, 3)
+    if at_rest:
+        command = np.where(np.arange(20_000) % 19_000 < 1000, 0.0, log.command)
+        log = replace(
+            log, command=command, measured=control.forced_response(plant, inputs=command).outputs
+        )
+    plain = estimate_driven(log)
+    heavy = estimate_driven(replace(log, measured=log.measured + 9806.65))
+    strong = plain.f_hz < 80.0
+    np.testing.assert_allclose(heavy.response[strong], plain.response[strong], rtol=1e-3)
+
+
 def test_welch_is_scipys() -> None:
     log, _ = driven_log(20_000, 5)
     found = estimate_welch(log, segment_s=2.0)

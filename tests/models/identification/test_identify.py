@@ -177,12 +177,54 @@ def test_axes_of_the_sensor_that_seem_exchanged() -> None:
     files = [quick_raw(axis, sensor=swapped) for axis in "xy"]
     for axis, found in identify(read(*files), SETTINGS).items():
         other = {"x": "y", "y": "x"}[axis]
-        (warning,) = found.warnings
-        assert f"the sensor's {other} moved in the test of axis {axis}" in warning
+        assert found.warnings == ()
+        text = f"the sensor's {other} moved in the test of axis {axis}"
+        assert sum(text in note for note in found.notes) == 1
     said = SETTINGS.model_copy(update={"sensor_axis": "y"})
-    assert one(files[0], settings=said).warnings == ()
+    assert not any("sensor's" in note for note in one(files[0], settings=said).notes)
     with pytest.raises(ModelError, match="another axis was measured"):
         one(files[0], settings=SETTINGS.model_copy(update={"sensor_axis": "x"}))
+
+
+@pytest.mark.parametrize("gain", [3.7, 1 / 9806.65, 0.8, -1000.0])
+def test_a_response_that_is_not_1_at_low_frequency(gain: float) -> None:
+    plant = one_mode(40.0, 0.05)
+    scaled = response(plant)
+    scaled = replace(scaled, response=gain * scaled.response)
+    found = identify([at(scaled)])["x"]
+    assert any(f"is {abs(gain):.3g} times the command" in w for w in found.warnings)
+    np.testing.assert_allclose(
+        frequency_response(found.plants.nominal, F_HZ), frequency_response(plant, F_HZ), rtol=5e-3
+    )
+    assert identify([at(response(plant))])["x"].warnings == ()
+
+
+def test_command_and_measurement_exchanged() -> None:
+    plant = PairsSpec(poles=(PolePair(f_hz=40.0, zeta=0.3), PolePair(f_hz=90.0, zeta=0.3)))
+    forward = response(plant)
+    swapped = replace(forward, response=1.0 / forward.response)
+    assert any("ahead of the command" in w for w in identify([at(swapped)])["x"].warnings)
+    assert not any("ahead" in w for w in identify([at(forward)])["x"].warnings)
+
+
+def test_a_dc_gain_that_was_scaled_is_a_warning() -> None:
+    def model(gain: float) -> InputFile:
+        return InputFile("m_x.json", f'{{"num": [{gain}], "den": [1e-5, 1e-4, 1.0]}}'.encode())
+
+    (warning,) = one(model(1.1)).warnings
+    assert warning.startswith("m_x.json: DC gain 1.1 scaled to 1; more than 2% off")
+    near = one(model(1.01))
+    assert near.warnings == ()
+    assert near.notes == ("m_x.json: DC gain 1.01 scaled to 1",)
+
+
+def test_a_log_of_m956_without_a_test() -> None:
+    """RepRapFirmware has no such test, so nobody should look for its frequencies."""
+    ringing = 0.3 * np.exp(-np.arange(3000) / 300) * np.sin(np.arange(3000) * 0.2)
+    rows = "".join(f"{i},{v:.3f}\n" for i, v in enumerate(ringing))
+    file = InputFile("x.csv", f"Sample,X\n{rows}Rate 1600, overflows 0\n".encode())
+    with pytest.raises(ModelError, match=r"too short .*RepRapFirmware has no resonance test"):
+        one(file)
 
 
 def test_one_axis_measured_twice() -> None:

@@ -238,6 +238,12 @@ def test_drive_faults() -> None:
     flat = "".join(f"{k / 500},1,{k % 5}\n" for k in range(90))
     with pytest.raises(ModelError, match="command column is constant"):
         read("time_s,cmd_acc,meas_acc\n" + flat)
+    same = {"time_column": "t", "command_column": "u", "measured_column": "u"}
+    with pytest.raises(ModelError, match="are the same numbers"):
+        read("t,u,y\n" + rows, **same)
+    in_ms = "".join(f"{2 * k},{k % 7},{k % 5}\n" for k in range(90))
+    with pytest.raises(ModelError, match=r"2 s apart .*time must be in seconds"):
+        read("time_s,cmd_acc,meas_acc\n" + in_ms)
 
 
 @pytest.mark.shared
