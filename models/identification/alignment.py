@@ -29,6 +29,7 @@ _APART_S = 2.0  # beyond the side lobes of one peak
 _LEAST_FRACTION = 0.95  # of the sweep, before a cut log is refused
 _LATEST_START_S = 0.6  # half a second, and what else is late: sensor, plant, time stamps
 _LEAD_S = 0.5
+_CROSS = 0.2  # of the power along the axis
 _LEAST_COSINE = 0.7  # 45 degrees: nearer to this axis than to another
 
 
@@ -104,6 +105,7 @@ def align(
     f_reached_hz, notes = _check_ends(log, excitation, profile, grid_s, start_s)
 
     kept = (grid_s >= start_s - _LEAD_S) & (grid_s <= start_s + profile.duration_s)
+    coupling = _coupling(log, accel[kept], direction, rate_hz, excitation)
     return AlignedLog(
         rate_hz,
         command[kept],
@@ -112,7 +114,7 @@ def align(
         f_reached_hz,
         direction,
         correlation,
-        notes,
+        (*notes, coupling) if coupling else notes,
     )
 
 
@@ -281,6 +283,24 @@ def _check_ends(
             f"test, or give max_freq = {np.floor(f_reached_hz):g} to use what is there"
         )
     return f_reached_hz, (f"the log ends at {f_reached_hz:.1f} Hz of the sweep",)
+
+
+def _coupling(
+    log: AccelerationLog, accel: Array, direction: Array, rate_hz: float, excitation: Excitation
+) -> str:
+    """Return a warning if the sensor moved across the axis too, at frequencies of the test."""
+    f_hz = rfftfreq(len(accel), 1.0 / rate_hz)
+    swept = (f_hz >= excitation.f_start_hz) & (f_hz <= excitation.f_end_hz)
+    spectra = rfft(accel, axis=0)[swept]
+    along = float(np.sum(np.abs(spectra @ direction) ** 2))
+    share = float(np.sum(np.abs(spectra) ** 2)) / along - 1.0
+    if share <= _CROSS:
+        return ""
+    return (
+        f"warning: across axis {log.axis} the sensor moved with {share:.0%} of the power along it: "
+        "the axes are coupled (CoreXY belts of unequal tension?), the frame rocks, or the sensor "
+        "is loose; the model describes the motion along the axis alone"
+    )
 
 
 def _not_found(

@@ -81,6 +81,8 @@ def _settings(
     sensor_axis: Annotated[str | None, Query(description="x, y or z")] = None,
     sensor_turned: bool = False,
     repair_rounding: bool = False,
+    dc_gain: Annotated[float | None, Query(gt=0, description="That a model may have.")] = None,
+    sampling_s: Annotated[float | None, Query(gt=0, description="Of a discrete model.")] = None,
 ) -> ReadSettings:
     given = {
         "axis": axis,
@@ -93,6 +95,8 @@ def _settings(
         "sensor_axis": sensor_axis,
         "sensor_turned": sensor_turned,
         "repair_rounding": repair_rounding,
+        "dc_gain": dc_gain,
+        "sampling_s": sampling_s,
     }
     try:
         return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})

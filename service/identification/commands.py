@@ -71,6 +71,12 @@ Columns = Annotated[
 Repair = Annotated[
     bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
 ]
+DcGain = Annotated[
+    float | None, typer.Option(help="DC gain that a model may have: steps per mm are off by it.")
+]
+Sampling = Annotated[
+    float | None, typer.Option(help="Sampling time, s, of a discrete model that does not say.")
+]
 Ripple = Annotated[
     list[str] | None,
     typer.Option(
@@ -111,6 +117,8 @@ def run(
     sensor_turned: Turned = False,
     columns: Columns = None,
     repair_rounding: Repair = False,
+    dc_gain: DcGain = None,
+    sampling_s: Sampling = None,
     max_order: Annotated[int, typer.Option(min=1, max=8, help="Most modes to try.")] = 4,
     ripple: Ripple = None,
     gain: Gain = 0.5,
@@ -134,6 +142,8 @@ def run(
         sensor_axis=sensor_axis,
         sensor_turned=sensor_turned,
         repair_rounding=repair_rounding,
+        dc_gain=dc_gain,
+        sampling_s=sampling_s,
         **_columns(columns),
     )
     _check_targets(output, report)

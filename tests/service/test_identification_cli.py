@@ -206,6 +206,16 @@ def test_a_printed_model(store: MachineStore, folder: Path, capsys) -> None:
     assert "-4.54 to -4.53995" in " ".join(capsys.readouterr().out.split())
 
 
+def test_what_a_model_does_not_say(store: MachineStore, folder: Path, capsys) -> None:
+    (folder / "m_x.json").write_text('{"num": [0.013], "den": [1.0, -1.9, 0.91], "dt": true}')
+    file = folder / "m_x.json"
+    assert identify(file, quick=False) == 2
+    assert "give sampling_s" in one_line(capsys)
+    assert identify(file, "--sampling-s", "0.001", quick=False) == 2
+    assert "give it as dc_gain" in one_line(capsys)
+    assert identify(file, "--sampling-s", "0.001", "--dc-gain", "1.3", quick=False) == 0
+
+
 # What cannot be used
 
 

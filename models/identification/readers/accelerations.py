@@ -7,7 +7,12 @@ import re
 import numpy as np
 
 from models.errors import ModelError
-from models.identification.readers.checks import check_alive, check_long, check_steady
+from models.identification.readers.checks import (
+    check_alive,
+    check_long,
+    check_range,
+    check_steady,
+)
 from models.identification.readers.settings import ReadSettings
 from models.identification.readers.tables import Table
 from models.identification.types import AccelerationLog
@@ -55,7 +60,7 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
     check_steady(values[:, 0], table)
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
     columns = dict(zip("xyz", accel.T, strict=True))
-    notes = check_alive(columns, table, axis, settings.sensor_axis)
+    notes = (*check_alive(columns, table, axis, settings.sensor_axis), *check_range(columns))
     return AccelerationLog(values[:, 0], accel, axis, table.source, (*table.notes, *notes))
 
 
@@ -81,7 +86,8 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
     accel = np.full((len(values), 3), np.nan)
     for i, name in enumerate(table.names[1:], start=1):
         accel[:, "xyz".index(name)] = values[:, i] * _UNITS[settings.acceleration_unit or "g"]
-    notes = check_alive(dict(zip("xyz", accel.T, strict=True)), table, axis, settings.sensor_axis)
+    columns = dict(zip("xyz", accel.T, strict=True))
+    notes = (*check_alive(columns, table, axis, settings.sensor_axis), *check_range(columns))
     return AccelerationLog(values[:, 0] / rate_hz, accel, axis, table.source, (_NO_TEST, *notes))
 
 

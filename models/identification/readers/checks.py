@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 from models.errors import ModelError
 from models.identification.readers.tables import Table
 
-__all__ = ["check_alive", "check_long", "check_rising", "check_steady"]
+__all__ = ["check_alive", "check_long", "check_range", "check_rising", "check_steady"]
 
 Array = NDArray[np.float64]
 
 _RATES_HZ = (10.0, 1e6)
+_NEXT, _FINE, _OFTEN = 0.02, 3, 20
+"""Share of the range that is looked at beside an extreme, the steps of the sensor that it must
+hold, and the samples that an extreme may have."""
 _GAP_SAMPLES = 2.5
 """Two periods are one lost sample, which is let pass; half a period allows for jitter."""
 
@@ -98,6 +101,28 @@ def check_alive(
                 f"{axis} was tested; check the sensor, or give sensor_axis if it is mounted turned"
             )
     return (f"the sensor's {_listed(dead)} is constant",) if dead else ()
+
+
+def check_range(columns: dict[str, Array]) -> tuple[str, ...]:
+    """Return a warning if a sensor's readings stop at a value that they reach often.
+
+    An extreme is rare: where more samples lie on it than in the next part of the range, the
+    sensor's own range ended there.
+    """
+    for name, values in columns.items():
+        for side in (1.0, -1.0):
+            up = side * values
+            top = float(up.max())
+            below = up[(up < top) & (up > top - _NEXT * float(np.ptp(up)))]
+            often = int(np.count_nonzero(up == top))
+            if often > max(_OFTEN, 2 * len(below)) and len(np.unique(below)) >= _FINE:
+                text = (
+                    f"warning: the sensor's {name} stops at {side * top:.6g} mm/s^2, {often} "
+                    "samples lie there: its range ended, and damping comes out too large; test "
+                    "with a lower accel_per_hz, or set a larger range"
+                )
+                return (text,)
+    return ()
 
 
 def _along(axis: str | None, sensor_axis: str | None) -> tuple[str, ...]:

@@ -29,7 +29,9 @@ from tests.models.identification.recordings import (
     QUICK,
     QUICK_SETTINGS,
     one_mode,
+    quick_log,
     quick_raw,
+    raw_file,
     spectrum_file,
 )
 
@@ -225,6 +227,27 @@ def test_a_log_of_m956_without_a_test() -> None:
     file = InputFile("x.csv", f"Sample,X\n{rows}Rate 1600, overflows 0\n".encode())
     with pytest.raises(ModelError, match=r"too short .*RepRapFirmware has no resonance test"):
         one(file)
+
+
+def clipped_at(limit_mm_s2: float) -> InputFile:
+    log = quick_log("x")
+    return raw_file(replace(log, accel_mm_s2=np.clip(log.accel_mm_s2, -limit_mm_s2, limit_mm_s2)))
+
+
+def test_a_sensor_whose_range_ended() -> None:
+    most = float(np.abs(quick_log("x").accel_mm_s2[:, 0]).max())
+    found = one(clipped_at(0.7 * most))
+    assert sum("the sensor's x stops at" in w for w in found.warnings) == 1
+    assert one(clipped_at(2 * most)).warnings == ()
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0.6, True), (0.2, False)])
+def test_motion_across_the_tested_axis(share: float, warned: bool) -> None:
+    log, other = quick_log("x"), quick_log("x", one_mode(25.0, 0.06))
+    accel = log.accel_mm_s2.copy()
+    accel[:, 1] += share * (other.accel_mm_s2[:, 0] - accel[:, 0])
+    found = one(raw_file(replace(log, accel_mm_s2=accel)))
+    assert any("across axis x the sensor moved" in w for w in found.warnings) == warned
 
 
 def test_one_axis_measured_twice() -> None:
