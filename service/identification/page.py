@@ -195,7 +195,7 @@ def interval_text(value: float, deviation: float | None, digits: int) -> str:
     if deviation is None or deviation == 0.0:
         return f"{value:.{digits}f}"
     half = 1.96 * deviation
-    digits = min(max(digits, 1 - math.floor(math.log10(half))), digits + 2)
+    digits = min(max(digits, -math.floor(math.log10(half))), digits + 2)
     return f"{value:.{digits}f} ± {half:.{digits}f}"
 
 
