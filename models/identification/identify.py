@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 from models.errors import ModelError
 from models.identification.alignment import check_pair
 from models.identification.averaging import mean_response, mean_spectrum
@@ -61,6 +63,7 @@ _LEVELS = (0.3, 3.0)
 _MOSTLY = 0.8
 _POOR, _POOR_DB = 0.15, 1.1
 _AHEAD_S = 1e-3
+_LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
 _WARNING = "warning: "
 """How readers mark notes that the user must look at."""
 
@@ -380,12 +383,33 @@ def _scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[st
             "was divided by that: an axis that keeps its steps ends where it is told; check that "
             "both have the same unit, and which columns they are"
         )
+    warnings += _by_file((r.source, text) for r in responses if (text := _slope_text(r)))
     if fit.delay_s < -_AHEAD_S:
         warnings.append(
             f"{names}: the measurement is {-fit.delay_s * 1e3:.2g} ms ahead of the command: check "
             "that the two are not exchanged, and their clocks"
         )
     return warnings
+
+
+def _slope_text(response: FrequencyResponse) -> str:
+    """Tell of a response that rises or falls like a power of f over its lowest octave."""
+    f_hz = response.f_hz
+    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
+    if np.count_nonzero(known) < _LEAST_POINTS:
+        return ""
+    lowest = known & (f_hz <= 2.0 * f_hz[known].min())
+    if np.count_nonzero(lowest) < _LEAST_POINTS:
+        return ""
+    slope = np.polyfit(np.log(f_hz[lowest]), np.log(np.abs(response.response[lowest])), 1)[0]
+    power = round(float(slope))
+    if power == 0 or abs(slope - power) > _SLOPE_TOLERANCE:
+        return ""
+    return (
+        f"towards low frequencies the response goes like f^{power:d} instead of being level: "
+        "command and measurement must be the same quantity (both position, or both acceleration); "
+        f"multiply the response by (2 pi j f)^{-power:d}"
+    )
 
 
 def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:

@@ -201,6 +201,15 @@ def test_a_response_that_is_not_1_at_low_frequency(gain: float) -> None:
     assert identify([at(response(plant))])["x"].warnings == ()
 
 
+@pytest.mark.parametrize("power", [-2, -1, 1, 2])
+def test_command_and_measurement_of_different_kinds(power: int) -> None:
+    plain = response(one_mode(60.0, 0.05))
+    derived = replace(plain, response=plain.response * (2j * np.pi * F_HZ) ** power)
+    warnings = identify([at(derived)])["x"].warnings
+    assert any(f"goes like f^{power} " in w and f"(2 pi j f)^{-power}" in w for w in warnings)
+    assert identify([at(plain)])["x"].warnings == ()
+
+
 def test_command_and_measurement_exchanged() -> None:
     plant = PairsSpec(poles=(PolePair(f_hz=40.0, zeta=0.3), PolePair(f_hz=90.0, zeta=0.3)))
     forward = response(plant)
