@@ -62,6 +62,8 @@ _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _MOSTLY = 0.8
 _POOR, _POOR_DB = 0.15, 1.1
+_USELESS, _USELESS_DB = 0.5, 6.0
+"""Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
 _WARNING = "warning: "
@@ -177,7 +179,8 @@ class _AxisWork:
             )
         notes += _by_file((r.source, n) for r in found.measured for n in r.notes)
         told, warned = _parted(dict.fromkeys(notes))
-        fit_warnings = _fit_warnings(found.fit) if found.fit else ()
+        names = list(dict.fromkeys(m.source for m in used))
+        fit_warnings = _fit_warnings(found.fit, names) if found.fit else ()
         return replace(found, notes=told, warnings=(*fit_warnings, *found.warnings, *warned))
 
     def _from_model(self) -> AxisIdentification:
@@ -346,18 +349,25 @@ def _parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
 
 
-def _fit_warnings(fit: Fit) -> tuple[str, ...]:
-    """Tell of a model that should not be relied on."""
+def _fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
+    """Tell of a model that should not be relied on; refuse one that is none."""
     if fit.magnitude_only:
-        poor, missed = fit.residual > _POOR_DB, f"{fit.residual:.1f} dB"
+        limits, missed = (_POOR_DB, _USELESS_DB), f"{fit.residual:.1f} dB"
     else:
-        poor, missed = fit.residual > _POOR, f"{fit.residual:.0%}"
-    text = (
-        f"the model misses {missed} of what was measured: look at the curves before it is used. "
+        limits, missed = (_POOR, _USELESS), f"{fit.residual:.0%}"
+    remedy = (
         "Allow more modes (max_order), leave out files of another state of the machine, or "
         "measure again"
     )
-    return (text,) if poor else ()
+    if fit.residual > limits[1]:
+        raise ModelError(
+            f"{', '.join(sources)}: no stable model of {fit.order} modes explains this: it misses "
+            f"{missed}. Check that file, axis and test belong together. {remedy}"
+        )
+    if fit.residual > limits[0]:
+        text = f"the model misses {missed} of what was measured: look at the curves before it is"
+        return (f"{text} used. {remedy}",)
+    return ()
 
 
 def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

@@ -482,3 +482,14 @@ def test_same_files_same_plants() -> None:
     files = [quick_raw("x"), quick_raw("y")]
     first, again = (identify(read(*files), SETTINGS) for _ in range(2))
     assert [a.plants for a in first.values()] == [a.plants for a in again.values()]
+
+
+def test_what_no_model_explains_is_refused() -> None:
+    f = np.arange(5.0, 130.0, 0.5)
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=len(f)) + 1j * rng.normal(size=len(f))
+    response = FrequencyResponse(
+        f, noise, np.full(len(f), np.nan), np.full(len(f), np.nan), axis="x", source="noise.csv"
+    )
+    with pytest.raises(ModelError, match=r"noise.csv: no stable model .* explains this"):
+        identify([Measured(response)])
