@@ -9,11 +9,11 @@ from pathlib import Path
 
 from service.controllers.design import Designed
 from service.controllers.figures import ControllerReport, Envelope
-from service.design.charts import Chart, Line, Mark, draw
-from service.reports.pages import asset, rendered, write_texts
+from service.reports.charts import Chart, Line, Mark, draw
+from service.reports.pages import rendered, style_of, write_texts
 
 __all__ = [
-    "STYLES",
+    "STYLE",
     "Figure",
     "charted",
     "decibels",
@@ -22,11 +22,7 @@ __all__ = [
     "write_controller",
 ]
 
-STYLES = (
-    ("service.reports", "report.css"),
-    ("service.design", "design.css"),
-    ("service.controllers", "controller.css"),
-)
+STYLE = ("service.controllers", "controller.css")
 _WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 300.0), (480.0, 270.0)
 _LOWEST_DB, _HIGHEST_DB = -60.0, 40.0
 
@@ -68,7 +64,7 @@ def render_controller(report: ControllerReport) -> str:
     return rendered(
         "service.controllers",
         "controller.html.j2",
-        "".join(asset(package, name) for package, name in STYLES),
+        style_of(STYLE),
         {"short": short, "db": decibels, "setting": _setting},
         d=report,
         sensitivity=_sensitivity(report),

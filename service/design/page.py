@@ -12,14 +12,14 @@ from pathlib import Path
 
 from compensation.basis import ZERO
 from compensation.preview import MAX_CONDITION, MAX_SPECTRAL_RADIUS
-from service.design.charts import Chart, Line, Mark, draw
 from service.design.figures import (
     Curve,
     DesignReport,
     RobustMetric,
 )
 from service.design.summary import Summary, modes_text, zero_text
-from service.reports.pages import asset, rendered, write_texts
+from service.reports.charts import Chart, Line, Mark, draw
+from service.reports.pages import rendered, style_of, write_texts
 
 __all__ = ["render_design", "write_design"]
 
@@ -64,7 +64,7 @@ def render_design(report: DesignReport) -> str:
     return rendered(
         _PACKAGE,
         "design.html.j2",
-        asset("service.reports", "report.css") + asset(_PACKAGE, "design.css"),
+        style_of(),
         {
             "um": _um,
             "number": _number,

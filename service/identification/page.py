@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from models.provenance import MeasuredMode
-from service.design.charts import Chart, Line, Mark, draw
 from service.identification.figures import AxisFigures, IdentificationReport
-from service.reports.pages import asset, rendered, write_texts
+from service.reports.charts import Chart, Line, Mark, draw
+from service.reports.pages import rendered, style_of, write_texts
 
 __all__ = [
     "change_text",
@@ -22,11 +22,6 @@ __all__ = [
 ]
 
 _PACKAGE = "service.identification"
-_STYLES = (
-    ("service.reports", "report.css"),
-    ("service.design", "design.css"),
-    (_PACKAGE, "identification.css"),
-)
 _WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 320.0), (480.0, 250.0)
 _MEASURED = ("before thin", "before thin d1", "before thin d2", "before thin d3", "before thin d5")
 _LARGEST_LABEL, _MOST_NAMES = 18, 6
@@ -58,7 +53,7 @@ def render_identification(report: IdentificationReport) -> str:
     return rendered(
         _PACKAGE,
         "identification.html.j2",
-        "".join(asset(package, name) for package, name in _STYLES),
+        style_of((_PACKAGE, "identification.css")),
         {"number": _number, "fit": fit_text, "interval": interval_text, "change": change_text},
         d=report,
         axes=[_Axis(axis, _figures(axis)) for axis in report.axes],

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.design.charts import Chart, Line, Mark, draw
 from service.proof.figures import AxisReadback, Curve, ReadbackReport
-from service.reports.pages import asset, rendered, write_texts
+from service.reports.charts import Chart, Line, Mark, draw
+from service.reports.pages import rendered, style_of, write_texts
 
 __all__ = ["render_readback", "write_readback"]
 
@@ -37,7 +37,7 @@ def render_readback(report: ReadbackReport) -> str:
     return rendered(
         "service.proof",
         "readback.html.j2",
-        asset("service.reports", "report.css") + asset("service.design", "design.css"),
+        style_of(),
         {},
         d=report,
         axes=[(axis, _figures(axis)) for axis in report.axes],

@@ -16,7 +16,7 @@ from jinja2 import Environment, StrictUndefined
 
 from service.pipeline.files import replacing
 
-__all__ = ["asset", "content_hash", "rendered", "write_texts"]
+__all__ = ["asset", "content_hash", "rendered", "style_of", "write_texts"]
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> None:
@@ -31,6 +31,17 @@ def write_texts(directory: Path, texts: Mapping[str, str]) -> None:
     for name, text in texts.items():
         with replacing(directory / name) as path:
             path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def style_of(*own: tuple[str, str]) -> str:
+    """Return the style of a page that is drawn without script, and what it adds of its own.
+
+    Parameters
+    ----------
+    own : tuples of (package, file)
+    """
+    shared = ((__package__, "report.css"), (__package__, "static.css"))
+    return "".join(asset(package, name) for package, name in (*shared, *own))
 
 
 def rendered(

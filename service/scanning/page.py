@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from service.controllers.page import STYLES, Figure, charted, short
-from service.design.charts import Chart, Line
+from service.controllers.page import STYLE, Figure, charted, short
 from service.pipeline.files import replacing
-from service.reports.pages import asset, rendered, write_texts
+from service.reports.charts import Chart, Line
+from service.reports.pages import rendered, style_of, write_texts
 from service.scanning.figures import ScanReport, TrackFigures
 from service.scanning.scan import Scan
 
@@ -75,7 +75,7 @@ def render_scan(report: ScanReport) -> str:
     return rendered(
         "service.scanning",
         "scan.html.j2",
-        "".join(asset(package, name) for package, name in (*STYLES, _STYLE)),
+        style_of(STYLE, _STYLE),
         {"short": short},
         d=report,
         first=report.variants[0],

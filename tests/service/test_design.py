@@ -27,12 +27,12 @@ from service.api import create_app
 from service.api import designs as routes
 from service.cli import run
 from service.design import design as module
-from service.design.charts import Chart, Line, Mark, draw
 from service.design.design import design_report
 from service.design.figures import DesignReport
 from service.design.page import render_design, write_design
 from service.design.summary import Summary
 from service.pipeline.yardstick import BestShaper
+from service.reports.charts import Chart, Line, Mark, draw
 from service.settings import Settings
 from tests.service.runners import pretend
 

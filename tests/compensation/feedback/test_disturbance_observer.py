@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import control
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,8 +24,6 @@ from compensation.feedback.zero_phase import design_prefilter, fir_within, refer
 from models.diagrams import Diagram, polynomial_response
 from models.loops import Loop, load_loop
 from simulation.closed_loop import Imperfections, simulate
-
-control = pytest.importorskip("control")
 
 LOOPS = load_loop("direct-drive-table").loops()
 TABLE = LOOPS[0]
