@@ -105,9 +105,10 @@ def measure(source: Path, machine: Machine, tolerance_um: float, cache: Path) ->
     with tempfile.TemporaryDirectory(prefix="stillpath-emission-") as folder:
         target = Path(folder) / "out.gcode"
         options = Options(tolerance_um=tolerance_um)
-        job = Watched(source, target, machine, options, cache, None)
-        job.prepare()
-        result = job.run()
+        with source.open("rb") as text, target.open("wb") as written:
+            job = Watched(text, written, machine, options, cache, None)
+            job.prepare()
+            result = job.run(source.name)
         total_mm = read_motion(source, machine).end_mm[-1, 3]
         filament_mm = abs(read_motion(target, machine).end_mm[-1, 3] - total_mm)
     hours = result.compensated_s / 3600.0
