@@ -14,6 +14,7 @@ COPY gcode gcode
 COPY simulation simulation
 COPY compensation compensation
 COPY service service
+COPY integrations/slicers integrations/slicers
 RUN python -m pip wheel --no-deps --wheel-dir /dist . \
     && /opt/stillpath/bin/pip install --no-deps /dist/stillpath-*.whl
 COPY examples/ps_ender3_pauses_hept24f.gcode /src/warm.gcode

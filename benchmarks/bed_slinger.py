@@ -118,7 +118,7 @@ def main() -> None:
 
 def write_block(path: Path, kg: float, machine: Machine) -> int:
     """Write a print of this mass; return its number of layers."""
-    diameter_mm = machine.firmware.extruder.filament_diameter_mm
+    diameter_mm = machine.firmware.hotend.filament_diameter_mm
     filament_mm2 = 0.25 * math.pi * diameter_mm**2
     section_mm2 = _WIDTH_MM * _HEIGHT_MM
     wanted_mm = kg / (1e-6 * DENSITY_G_CM3) / filament_mm2
@@ -203,7 +203,7 @@ class Judge:
 
     def __init__(self, machine: Machine, mass: MassSchedule, print_kg: float) -> None:
         self._machine, self._moving_kg, self._print_kg = machine, mass.moving_mass_kg, print_kg
-        area_mm2 = 0.25 * math.pi * machine.firmware.extruder.filament_diameter_mm**2
+        area_mm2 = 0.25 * math.pi * machine.firmware.hotend.filament_diameter_mm**2
         self._kg_per_mm = 1e-6 * DENSITY_G_CM3 * area_mm2
         self._quarters = [Tally() for _ in range(4)]
 

@@ -20,6 +20,7 @@ from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
 
 from gcode.pieces import Piece
 from gcode.sampler import sample_phases
+from gcode.slicers.facts import SlicerFacts
 from gcode.types import Phases
 from models.machine import Machine
 from models.store import load_machine
@@ -27,6 +28,7 @@ from service.pipeline import road
 from service.pipeline.compensating import CompensatedPiece
 from service.pipeline.files import default_cache_dir
 from service.pipeline.options import Options
+from service.pipeline.result import Result
 
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
@@ -50,6 +52,10 @@ class Spread:
         if gap_um.max() > self.max:
             self.max, self.line = float(gap_um.max()), line
 
+    def within(self, limit_um: float) -> float:
+        """Share of the samples that lie within a limit."""
+        return float(self.counts[: round(limit_um / _BIN_UM)].sum() / max(self.counts.sum(), 1))
+
     def quantile(self, share: float) -> float:
         """Distance that the share of all samples does not exceed."""
         total = np.cumsum(self.counts)
@@ -62,6 +68,8 @@ class Watched(road._Job):
     def prepare(self) -> None:
         """Set the sums to nothing."""
         self.xy, self.xy_extruding, self.filament = Spread(), Spread(), Spread()
+        self.along, self.across = Spread(), Spread()
+        """What of the extruding motion's distance lies along the command and across it."""
         self.late_s = self.off_grid_s = self.end_mm = 0.0
 
     def _verify(
@@ -87,7 +95,14 @@ class Watched(road._Job):
             line = int(piece.moves.line[group.first])
             sample = np.minimum((t_s / timeline.dt_s).astype(np.int64), len(grid_s) - 1)
             self.xy.add(apart, line)
-            self.xy_extruding.add(apart[made.extruding[sample]], line)
+            prints = made.extruding[sample]
+            self.xy_extruding.add(apart[prints], line)
+            if n > 1:
+                way = np.gradient(wanted[:2], axis=1)
+                way /= np.maximum(np.hypot(*way), 1e-12)
+                off = 1e3 * (actual[:2] - wanted[:2])
+                self.along.add(np.abs(np.sum(off * way, axis=0))[prints], line)
+                self.across.add(np.abs(off[0] * way[1] - off[1] * way[0])[prints], line)
             # Before the first sample of a stretch the command's E still belongs to the rest.
             own = t_s >= timeline.dt_s * np.ceil(timeline.start_s[k] / timeline.dt_s - 1e-6)
             self.filament.add(1e3 * np.abs(actual[3] - wanted[2])[own], line)
@@ -100,15 +115,22 @@ class Watched(road._Job):
         self.end_mm = max(self.end_mm, gap_mm)
 
 
+def watched(
+    source: Path, target: Path, machine: Machine, tolerance_um: float, cache: Path
+) -> tuple[Watched, Result]:
+    """Compensate a file on the watched road."""
+    options = Options(tolerance_um=tolerance_um)
+    with source.open("rb") as text, target.open("wb") as written:
+        job = Watched(text, written, machine, options, cache, None)
+        job.prepare()
+        return job, job.run(source.name, SlicerFacts())
+
+
 def measure(source: Path, machine: Machine, tolerance_um: float, cache: Path) -> str:
     """Return a table row for one case."""
     with tempfile.TemporaryDirectory(prefix="stillpath-emission-") as folder:
         target = Path(folder) / "out.gcode"
-        options = Options(tolerance_um=tolerance_um)
-        with source.open("rb") as text, target.open("wb") as written:
-            job = Watched(text, written, machine, options, cache, None)
-            job.prepare()
-            result = job.run(source.name)
+        job, result = watched(source, target, machine, tolerance_um, cache)
         total_mm = read_motion(source, machine).end_mm[-1, 3]
         filament_mm = abs(read_motion(target, machine).end_mm[-1, 3] - total_mm)
     hours = result.compensated_s / 3600.0

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.shapers import shape, shaper_pulses
-from gcode.firmware.klipper.planner import STOPPING, Planner, join_phases
+from gcode.firmware.planning import STOPPING, join_phases
+from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.sampler import sample_phases
 from gcode.types import Moves, Phases
@@ -56,6 +57,8 @@ _BLOCK = 200_000
 _READ_BYTES = 1 << 20
 _SAME_MM, _SAME_E_MM = 1e-4, 5e-3
 _LOST = 3
+_JUMP_MM = 0.05
+"""Places that are whole motor steps are not jumps."""
 _SHAPER_REACH_S = 0.15
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
 
@@ -131,9 +134,8 @@ class Motion:
     def jumps(self) -> Ints:
         """Rows of `phases` before which the position changes without a motion (homing)."""
         before = self.end_mm[self.phases.move_index[:-1], :2]
-        return (
-            np.flatnonzero(np.max(np.abs(self.phases.start_mm[1:, :2] - before), axis=1) > 1e-6) + 1
-        )
+        away = np.max(np.abs(self.phases.start_mm[1:, :2] - before), axis=1)
+        return np.flatnonzero(away > _JUMP_MM) + 1
 
     def row_end_s(self) -> Array:
         """When each row of `phases` ends."""
@@ -149,7 +151,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     forced : sequence of int
         Rising numbers of moves behind which the machine stops although the file does not say so.
     """
-    reader, planner = Interpreter(machine), Planner(machine.firmware)
+    reader, planner = Interpreter(machine), kit(machine).planner()
     parts: list[Phases] = []
     ends: list[Array] = []
     lines: list[Ints] = []
@@ -322,6 +324,8 @@ class Aligned(Timed):
 class Judge:
     """Add up the errors of the continuous plants over the sections of a motion.
 
+    A firmware that plans in steps moves its motors by whole steps, whoever made the command.
+
     The nominal plant answers at 10 kHz, the members at 2.5 kHz to save time (in four cases the
     members' ratio to the shaper moved by at most .001). Contour error: distance to the path within
     80 ms, every 2 ms (members 8 ms) of extruding motion. Tracking error: every sample that
@@ -344,6 +348,8 @@ class Judge:
         self._nominal = [plant_set(axis, DT_S).nominal for axis in axes]
         sets = [plant_set(axis, _MEMBER_EVERY * DT_S).members for axis in axes]
         self._pairs = list(zip(*sets, strict=False)) if members else []
+        self._step_mm = max(kit(machine).step_mm[:2])
+        self._corexy = machine.kinematics == "corexy"
         self.contour, self.tracking, self.bend = Tally(), Tally(), Tally()
         self.members = [Tally() for _ in self._pairs]
         self.worst_s = 0.0
@@ -357,7 +363,7 @@ class Judge:
             k1 = min(n, k0 + _BLOCK)
             a, b = max(0, k0 - window), min(n, k1 + window)
             path, extruding = motion.path(a, b)
-            u = motion.command(k0, k1)
+            u = self._stepped(motion.command(k0, k1))
             coarse = np.hstack([tail, u[:, ::10]])
             bend = np.diff(coarse, 2)
             self.bend.add(np.hypot(bend[0], bend[1]))
@@ -378,6 +384,16 @@ class Judge:
                 y = stream.push(u)
                 index = at + (k0 - a) // every
                 tally.add(distance_to_path(path, y[:, at], index, every * DT_S, WINDOW_S))
+
+    def _stepped(self, u: Array) -> Array:
+        """Command as the motors stand: on whole steps, where the firmware plans in steps."""
+        if self._step_mm == 0.0:
+            return u
+        if not self._corexy:
+            return np.asarray(self._step_mm * np.round(u / self._step_mm))
+        motors = np.stack([u[0] + u[1], u[0] - u[1]])
+        a, b = self._step_mm * np.round(motors / self._step_mm)
+        return 0.5 * np.stack([a + b, a - b])
 
     @property
     def members_rms_mm(self) -> float:

@@ -28,12 +28,11 @@ from compensation.preview_axis import (
     AxisTask,
     PreviewAxis,
     Rung,
-    changes,
     designs,
     functions_within,
 )
 from compensation.sliding import balanced_weights, slide
-from compensation.window_problem import Bounds
+from compensation.window_problem import Bounds, Extremes
 from models.machine import Machine
 from models.plants import DiscretePlant, PlantSet, plant_set
 from models.schedule import OperatingPoint
@@ -190,10 +189,11 @@ class PreviewFbf:
             weight[a:b] = WEIGHT_REST
         ends = np.array([[-1, 1], [n, n + self._axes[0].window]], dtype=np.int64)
         stops = _merged(np.concatenate([ends[:1], rests, ends[1:]]))
-        bend = np.diff(y_d_mm, 2) / self._dt_s**2
+        asked = [Extremes.of(path, path[0], path[0]) for path in y_d_mm]
         rms_limit = np.inf
-        if bend.shape[1]:
-            rms_limit = RMS_RATIO * float(np.sqrt(np.max(np.mean(bend**2, axis=1))))
+        if n > 2:
+            largest = max(one.mean_square for one in asked)
+            rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
         accel_limit = self.accel_limit_mm_s2(y_d_mm)
         tasks = [
             AxisTask(path, weight, stops, self._bounds(i, path, accel_limit), rms_limit)
@@ -212,7 +212,7 @@ class PreviewFbf:
     def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
         """Acceleration that the command of a path (2, n) may ask for."""
         ceiling = self._limits.accel_mm_s2
-        path_accel = float(np.max(np.abs(np.diff(y_d_mm, 2)), initial=0.0)) / self._dt_s**2
+        path_accel = max(Extremes.of(p, p[0], p[0]).accel for p in y_d_mm) / self._dt_s**2
         return min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
 
     def _bounds(self, i: int, path: Array, accel_limit: float) -> Bounds:
@@ -242,23 +242,24 @@ class PreviewFbf:
                 rung, careful, rounds = rung + 1, frozenset(), 0
                 continue
             command = found.position_mm
-            bend, step = changes(command)
-            rms = float(np.sqrt(np.mean(bend**2))) / dt**2
+            reached = Extremes.of(command, command[0], command[0], stops=True)
+            rms = np.sqrt(reached.mean_square) / dt**2
             if not careful:
                 asked = (
-                    f"{np.max(np.abs(bend), initial=0.0) / dt**2:.0f} mm/s2, "
-                    f"{np.max(np.abs(step), initial=0.0) / dt:.0f} mm/s and "
-                    f"{command.min():.3f} to {command.max():.3f} mm"
+                    f"{reached.accel / dt**2:.0f} mm/s2, {reached.speed / dt:.0f} mm/s and "
+                    f"{reached.low_mm:.3f} to {reached.high_mm:.3f} mm"
                 )
             if rms <= task.rms_limit_mm_s2 or rung >= GENTLE_RUNG:
-                if all(bounds.kept(bend, step, command)):
+                if all(bounds.kept(reached)):
                     # The next piece starts here, or higher where there was room to spare.
                     roomy = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
                     if len(command) > axis.update:
                         axis.next_rung = max(0, rung - 1) if roomy else rung
                     return found, rung, careful
                 concerned = axis.windows_outside(bounds, command)
-                few = len(careful | concerned) <= max(2, _BOUNDED_SHARE * len(bend) / axis.update)
+                few = len(careful | concerned) <= max(
+                    2, _BOUNDED_SHARE * len(command) / axis.update
+                )
                 if rounds < _BOUNDED_ROUNDS and not concerned <= careful and (few or rung == last):
                     careful |= concerned
                     rounds += 1

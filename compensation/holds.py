@@ -25,8 +25,8 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
     u_mm, y_d_mm : ndarray, shape (2, n)
         Filter output and plan; the plan stands still in the rests.
     rests : ndarray of int64, shape (k, 2)
-        Sample ranges [a, b); the sample before `a` belongs to the rest too, so that the last
-        motion ends there.
+        Sample ranges [a, b); the sample before `a` belongs to the rest too: the plan stands there
+        already. Behind it a rest shorter than a sample may be over.
     blend : int
         Samples of a transition; at most half the distance to the next rest.
     """
@@ -43,16 +43,15 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
         _lead(out[:, begin - 1 : begin + length], u_mm, y_d_mm, begin - 1, 1)
         _lead(out[:, end - length + 1 : end + 1][:, ::-1], u_mm, y_d_mm, end, -1)
     for a, b in spans:
-        # The plan may end and begin its motions between the samples at the edges of a rest.
-        out[:, a:b] = y_d_mm[:, (a + b) // 2, None]
+        out[:, a:b] = y_d_mm[:, a, None]
     return out
 
 
 def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Merge spans that touch."""
+    """Merge spans that overlap; between two that only touch, the plan may have moved."""
     joined: list[tuple[int, int]] = []
     for a, b in sorted(spans):
-        if joined and a <= joined[-1][1]:
+        if joined and a < joined[-1][1]:
             joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
         else:
             joined.append((a, b))

@@ -59,8 +59,9 @@ class LiftedWindow:
         Free response, the command going on in a straight line.
     advance : ndarray, shape (nz - 2, nz - 2)
         States after `update` samples without a command.
-    drive : ndarray, shape (nz - 2, update)
-        States after `update` samples, from those samples of the command.
+    reach : ndarray, shape (nz - 2, window)
+        States behind the window, from its samples of the command; the last m columns are the same
+        for m samples.
     """
 
     plants: tuple[DiscretePlant, ...]
@@ -71,7 +72,7 @@ class LiftedWindow:
     target: Array
     from_state: Array
     advance: Array
-    drive: Array
+    reach: Array
 
     @property
     def window(self) -> int:
@@ -82,6 +83,11 @@ class LiftedWindow:
     def states(self) -> int:
         """Size nz of z."""
         return int(self.from_state.shape[2])
+
+    @property
+    def drive(self) -> Array:
+        """States after `update` samples from those of the command, shape (nz - 2, update)."""
+        return self.reach[:, self.window - self.update :]
 
     def lifted_set(self) -> LiftedSet:
         """Return what a basis needs to know: Gram matrix and mean of the integrated plants."""
@@ -151,14 +157,14 @@ def lifted_window(
             ]
         ),
         advance=block_diag(*(np.linalg.matrix_power(p.a, update) for p in plants)),
-        drive=np.concatenate([_drive(p, update) for p in plants]),
+        reach=np.concatenate([_reach(p, window) for p in plants]),
     )
 
 
-def _drive(plant: DiscretePlant, update: int) -> Array:
-    columns = np.empty((plant.order, update))
+def _reach(plant: DiscretePlant, samples: int) -> Array:
+    columns = np.empty((plant.order, samples))
     column = plant.b
-    for k in range(update - 1, -1, -1):
+    for k in range(samples - 1, -1, -1):
         columns[:, k] = column
         column = plant.a @ column
     return columns

@@ -16,7 +16,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
 
 from compensation.base import DesignError
 from models.plants import PlantSet
@@ -81,6 +80,8 @@ def worst_case_weights(responses: ArrayLike, spectrum: ArrayLike) -> Array:
         # The gradient of the dual is the members' errors themselves (Danskin).
         errors = member_errors(g, spectrum, share) / scale
         return -float(share @ errors), -errors
+
+    from scipy.optimize import minimize  # slow to import, seldom needed
 
     found = minimize(  # type: ignore[call-overload]
         loss,

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import toeplitz
 
 from compensation._lifted_kernels import run_adjoint, run_forward
@@ -164,6 +163,8 @@ class ToeplitzOperator(LiftedOperator):
 
     @cached_property
     def _size(self) -> int:
+        from scipy.fft import next_fast_len  # slow to import, seldom needed
+
         return int(next_fast_len(2 * len(self.markov) - 1, real=True))
 
     @cached_property
@@ -173,7 +174,7 @@ class ToeplitzOperator(LiftedOperator):
         around[: len(self.markov)] = self.markov
         if len(self.ahead):
             around[-len(self.ahead) :] = self.ahead[::-1]
-        return np.asarray(rfft(around), np.complex128)
+        return np.asarray(np.fft.rfft(around), np.complex128)
 
     def _forward(self, u: Array) -> Array:
         return self._multiply(u, self._spectrum)
@@ -187,8 +188,8 @@ class ToeplitzOperator(LiftedOperator):
         for first in range(0, k, _COLUMNS):
             part = slice(first, first + _COLUMNS)
             # Columns as rows: transforms run along contiguous memory.
-            there = rfft(x.T[part], self._size, axis=1)
-            out[:, part] = irfft(there * spectrum, self._size, axis=1)[:, :m].T
+            there = np.fft.rfft(x.T[part], self._size, axis=1)
+            out[:, part] = np.fft.irfft(there * spectrum, self._size, axis=1)[:, :m].T
         return out
 
 

@@ -59,6 +59,8 @@ class PreviewDesign:
         F, shape (nz, nz), and what z becomes by S y_d, shape (nz, update): H = state_drive S.
     basis : ndarray, shape (window, n)
         Psi scaled so that its filtered columns are orthonormal over the (weighted) members.
+    summed : ndarray, shape (window, n)
+        Its double running sum: the commands of the functions.
     filtered : ndarray, shape (components, window, n)
     effort : ndarray, shape (n, n)
         Gram matrix of `basis`: the squared command acceleration of a coefficient vector.
@@ -96,7 +98,8 @@ class PreviewDesign:
         self.filtered = q.reshape(-1, window, n)
 
         solve = np.linalg.solve(np.eye(n) + price * self.effort, q.T).reshape(n, -1, window)
-        summed = np.cumsum(np.cumsum(self.basis, axis=0), axis=0)[:update]
+        self.summed = np.cumsum(np.cumsum(self.basis, axis=0), axis=0)
+        summed = self.summed[:update]
         step = np.arange(1.0, update + 1.0)
         self.target_gain = np.einsum("un,nkw->kuw", summed, solve)
         self.path_gain = summed @ np.einsum("nkw,k->nw", solve, lifted.target)

@@ -29,7 +29,6 @@ __all__ = [
     "Designs",
     "PreviewAxis",
     "Rung",
-    "changes",
     "designs",
     "functions_within",
 ]
@@ -209,6 +208,7 @@ class PreviewAxis:
         self.window, self.update = designs.lifted.window, designs.lifted.update
         self._plants = designs.lifted.plants
         self.members = len(self._plants)
+        self._rest_at_one = np.concatenate([p.rest_state() for p in self._plants])
         self.rung = self.next_rung = 0
         self.last_rung = len(designs.ladder) - 1
         self.reset(0.0)
@@ -243,7 +243,7 @@ class PreviewAxis:
 
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
         """Windows whose command leaves the bounds, and those before them."""
-        bend, step = changes(command)
+        bend, step = _changes(command)
         slack = 1.0 + 1e-9
         outside = command < bounds.low_mm - TRAVEL_SLACK_MM
         outside |= command > bounds.high_mm + TRAVEL_SLACK_MM
@@ -334,7 +334,7 @@ class PreviewAxis:
         self._origin = origin
 
     def _resting(self, position: float) -> Array:
-        return np.concatenate([p.rest_state(position) for p in self._plants])
+        return self._rest_at_one * position
 
     def _advanced(self, states: Array, command: Array) -> Array:
         parts, row = [], 0
@@ -345,7 +345,7 @@ class PreviewAxis:
         return np.concatenate(parts)
 
 
-def changes(command: Array) -> tuple[Array, Array]:
+def _changes(command: Array) -> tuple[Array, Array]:
     """Second and first differences at every sample; the command starts and ends standing."""
     standing = np.concatenate([command[:1], command, command[-1:]])
     return np.diff(standing, 2), np.diff(standing)[:-1]
@@ -357,6 +357,7 @@ def _windows(samples: Array, window: int, update: int) -> Array:
 
 
 def _snapped(position: Array, bounds: Bounds) -> Array:
-    for end in (bounds.low_mm, bounds.high_mm):
-        position = np.where(np.abs(position - end) <= TRAVEL_SLACK_MM, end, position)
+    for end, nearest in ((bounds.low_mm, position.min()), (bounds.high_mm, position.max())):
+        if abs(nearest - end) <= TRAVEL_SLACK_MM:
+            position = np.where(np.abs(position - end) <= TRAVEL_SLACK_MM, end, position)
     return position

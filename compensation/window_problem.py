@@ -13,18 +13,23 @@ programme (DAQP, a dual active-set method).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.linalg.blas import dsyrk
+from scipy.linalg.lapack import dgesv, dpotrf, dtrtrs
 
+from compensation._window_kernels import extremes, segment_states, tied_command, tied_response
 from compensation.base import DesignError
 from compensation.preview import PreviewDesign
 
-__all__ = ["EFFORT_PRICE", "TRAVEL_SLACK_MM", "Bounds", "solve_window"]
+__all__ = ["EFFORT_PRICE", "TRAVEL_SLACK_MM", "Bounds", "Extremes", "solve_window"]
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 EFFORT_PRICE = 0.5
 """Price of squared increments (mm/sample^2)^2 against squared error mm^2 at rests."""
@@ -57,17 +62,30 @@ class Bounds:
         """Return the bounds for positions relative to an origin."""
         return replace(self, low_mm=self.low_mm - origin_mm, high_mm=self.high_mm - origin_mm)
 
-    def kept(self, increments: Array, steps: Array, position_mm: Array) -> list[bool]:
+    def kept(self, reached: Extremes) -> tuple[bool, bool, bool]:
         """Whether acceleration, speed and travel are kept."""
         slack = 1.0 + 1e-9
-        return [
-            bool(np.max(np.abs(increments), initial=0.0) <= slack * self.accel),
-            bool(np.max(np.abs(steps), initial=0.0) <= slack * self.speed),
-            bool(
-                np.min(position_mm) >= self.low_mm - TRAVEL_SLACK_MM
-                and np.max(position_mm) <= self.high_mm + TRAVEL_SLACK_MM
-            ),
-        ]
+        return (
+            reached.accel <= slack * self.accel,
+            reached.speed <= slack * self.speed,
+            reached.low_mm >= self.low_mm - TRAVEL_SLACK_MM
+            and reached.high_mm <= self.high_mm + TRAVEL_SLACK_MM,
+        )
+
+
+class Extremes(NamedTuple):
+    """What a command asks for, in mm and samples: see `Bounds`; and its mean squared increment."""
+
+    accel: float
+    speed: float
+    low_mm: float
+    high_mm: float
+    mean_square: float
+
+    @classmethod
+    def of(cls, command: Array, last: float, previous: float, *, stops: bool = False) -> Extremes:
+        """Look at a command that follows two others, and whether it stops behind its end."""
+        return cls(*extremes(command, last, previous, stops))
 
 
 def solve_window(
@@ -105,31 +123,36 @@ def solve_window(
     last, previous = float(z[-2]), float(z[-1])
     window = len(path_mm)
     spans = [(max(int(a), 0), min(int(b), window)) for a, b in rests]
-    tied, offset = _tie_down(design.basis, last - previous, spans)
-    normal, right = _normal_equations(design, z, targets_mm, weight, spans, tied, offset)
-    fixed = last + np.arange(1.0, window + 1.0) * (last - previous) + _twice_summed(offset)
+    edges = [0, *(edge for span in spans for edge in span), window]
+    moving = np.array(edges, dtype=np.int64).reshape(-1, 2)
+    normal, right, ends = _normal_equations(design, z, targets_mm, weight, moving)
     pins = [a - 1 for a, _ in spans if a > 0]
+    rows = ends[len(spans) - len(pins) :]
+    values = path_mm[pins] - tied_command(np.zeros(window), moving, last, previous)[pins]
 
     # In the coordinates w = L' c, normal = L L', the cost is |w - free|^2: well conditioned even
     # where a rest leaves few samples. LAPACK itself: the wrappers' checks would take as long.
-    factor, flaw = dpotrf(normal, lower=1)
+    factor, flaw = dpotrf(normal, lower=1, overwrite_a=1)
     if flaw:
         raise DesignError(f"the window problem at a rest is singular (LAPACK dpotrf: {flaw})")
-    free = dtrtrs(factor, right, lower=1)[0]
-    # Rows of the double running sum of `tied`, which as a whole would take longer than the rest.
-    reach = np.maximum(np.array(pins, float)[:, None] + 1.0 - np.arange(window), 0.0)
-    rows, values = reach @ tied, path_mm[pins] - fixed[pins]
+    found = free = dtrtrs(factor, right, lower=1)[0]
     pinned = np.ascontiguousarray(dtrtrs(factor, rows.T, lower=1)[0].T)
+    if pins:
+        # The nearest w for which the command stands on the path in the rests.
+        *_, pull, flaw = dgesv(pinned @ pinned.T, pinned @ free - values)
+        if flaw:
+            raise DesignError(f"rests contradict each other in a window (LAPACK dgesv: {flaw})")
+        found = free - pull @ pinned
 
-    try:
-        found = free - pinned.T @ np.linalg.solve(pinned @ pinned.T, pinned @ free - values)
-    except np.linalg.LinAlgError as error:
-        raise DesignError(f"rests contradict each other in a window: {error}") from error
-    command = fixed + _twice_summed(tied @ dtrtrs(factor, found, lower=1, trans=1)[0])
+    def command_of(found: Array) -> Array:
+        increments = design.basis @ dtrtrs(factor, found, lower=1, trans=1)[0]
+        return tied_command(increments, moving, last, previous)
+
+    command = command_of(found)
     broken = _broken(bounds, z, command)
     while any(broken):
         # Only the kinds of bounds that are broken: most windows know one.
-        rows, low, high = _constraints(bounds, z, tied, offset, fixed, broken)
+        rows, low, high = _constraints(bounds, z, design.basis, moving, broken)
         found, _, flag, _ = daqp.solve(
             np.eye(len(free)),
             -free,
@@ -140,7 +163,7 @@ def solve_window(
         )
         if flag <= 0:
             break  # no command keeps them; the caller sees that and takes a gentler design
-        command = fixed + _twice_summed(tied @ dtrtrs(factor, found, lower=1, trans=1)[0])
+        command = command_of(found)
         also = [a and not b for a, b in zip(_broken(bounds, z, command), broken, strict=True)]
         if not any(also):
             break
@@ -153,64 +176,73 @@ def solve_window(
 
 
 def _normal_equations(
-    design: PreviewDesign,
-    z: Array,
-    targets_mm: Array,
-    weight: Array,
-    spans: list[tuple[int, int]],
-    tied: Array,
-    offset: Array,
-) -> tuple[Array, Array]:
-    """Weighted least squares with a price on increments, as a quadratic form."""
+    design: PreviewDesign, z: Array, targets_mm: Array, weight: Array, moving: Ints
+) -> tuple[Array, Array, Array]:
+    """Weighted least squares with a price on increments, as a quadratic form.
+
+    Returns
+    -------
+    normal : ndarray, shape (n, n)
+        Its lower half.
+    right : ndarray, shape (n,)
+    ends : ndarray, shape (rests, n)
+        Where the functions' commands stand in each rest.
+    """
     lifted = design.lifted
-    squared = (weight * weight)[:, None]
-    price = max(EFFORT_PRICE, design.price) if spans else design.price
+    resting = len(moving) > 1
+    price = max(EFFORT_PRICE, design.price) if resting else design.price
     # Outside the rests the increments are the untied ones, so their effort is known. The price of
-    # the untied functions keeps the matrix definite when a rest leaves few samples.
-    normal = (2.0 if spans else 1.0) * price * design.effort
-    for a, b in spans:
-        normal = normal - price * (design.basis[a:b].T @ design.basis[a:b])
-        normal += price * np.outer(tied[a], tied[a])
-    right = -price * (offset @ tied)
-    moved = offset.any()
+    # the untied functions keeps the matrix definite when a rest leaves few samples. BLAS wants
+    # columns one behind the other: here the transpose of a symmetric matrix.
+    normal = ((2.0 if resting else 1.0) * price * design.effort).T
+    right = np.zeros(design.n)
+    begun = np.empty((len(moving), lifted.states, design.n))
+    stopped = np.empty_like(begun)
+    segment_states(design.summed, lifted.reach, moving, begun, stopped)
+    speed, first = float(z[-2] - z[-1]), int(moving[0, 1])
+    if resting:
+        steps = stopped[:-1, -2] - stopped[:-1, -1]
+        normal = dsyrk(price, steps.T, 1.0, normal, lower=1, overwrite_c=1)
+        right -= price * speed * steps[0]
+    for (_, a), (b, _) in pairwise(moving.tolist()):
+        normal = dsyrk(-price, design.basis[a:b].T, 1.0, normal, lower=1, overwrite_c=1)
     for target, free, integrated, filtered in zip(
         targets_mm, lifted.from_state, lifted.integrated, design.filtered, strict=True
     ):
         error = target - free @ z
-        if moved:
-            error -= integrated @ offset
-        response = filtered
-        if spans:
-            response = filtered.copy()
-            for a, b in spans:
-                # The plant is causal: what is tied at a shows from a on.
-                response[a:] += integrated[a:, a:b] @ (tied[a:b] - design.basis[a:b])
-        weighted = response * squared
-        normal = normal + weighted.T @ response
-        right = right + error @ weighted
-    return normal, right
+        if resting:
+            # The increment that stops the motion from before.
+            error += speed * integrated[:, first]
+        response = tied_response(filtered, free, moving, begun, stopped, weight, error, right)
+        normal = dsyrk(1.0, response.T, 1.0, normal, lower=1, overwrite_c=1)
+    return normal, right, np.cumsum(stopped[:-1, -2], axis=0)
 
 
 def _broken(bounds: Bounds, z: Array, command: Array) -> list[bool]:
-    whole = np.concatenate([[z[-1], z[-2]], command])
-    return [not kept for kept in bounds.kept(np.diff(whole, 2), np.diff(whole[1:]), command)]
+    return [not kept for kept in bounds.kept(Extremes.of(command, z[-2], z[-1]))]
 
 
 def _constraints(
-    bounds: Bounds,
-    z: Array,
-    tied: Array,
-    offset: Array,
-    fixed: Array,
-    which: list[bool],
+    bounds: Bounds, z: Array, basis: Array, moving: Ints, which: list[bool]
 ) -> tuple[Array, Array, Array]:
     """Rows, lower and upper ends of the bounds on the coefficients."""
-    step = float(z[-2] - z[-1])
+    last, step = float(z[-2]), float(z[-2] - z[-1])
     accel, speed = (1.0 - _MARGIN) * bounds.accel, (1.0 - _MARGIN) * bounds.speed
+    tied, offset = basis.copy(), np.zeros(len(basis))
+    for (s, a), (b, _) in pairwise(moving.tolist()):
+        tied[a:b] = 0.0
+        tied[a] = -basis[s:a].sum(axis=0)
+        offset[a] = -step if s == 0 else 0.0
+    line = np.arange(1.0, len(basis) + 1.0) * step
     kinds = [
         (offset, -accel, accel, accel),
         (step + np.cumsum(offset), -speed, speed, speed),
-        (fixed, bounds.low_mm, bounds.high_mm, _TRAVEL_SCALE_MM),
+        (
+            last + line + np.cumsum(np.cumsum(offset)),
+            bounds.low_mm,
+            bounds.high_mm,
+            _TRAVEL_SCALE_MM,
+        ),
     ]
     rows, lows, highs = [], [], []
     for times, ((at, low, high, scale), wanted) in enumerate(zip(kinds, which, strict=True)):
@@ -223,23 +255,3 @@ def _constraints(
             lows.append((low - at[free]) / scale)
             highs.append((high - at[free]) / scale)
     return np.concatenate(rows), np.concatenate(lows), np.concatenate(highs)
-
-
-def _tie_down(basis: Array, speed: float, spans: list[tuple[int, int]]) -> tuple[Array, Array]:
-    """Basis and fixed increments that obey the rests."""
-    offset = np.zeros(len(basis))
-    if not spans:
-        return basis, offset
-    tied = basis.copy()
-    moving = 0
-    for a, b in spans:
-        tied[a] = -basis[moving:a].sum(axis=0)
-        tied[a + 1 : b] = 0.0
-        if moving == 0:
-            offset[a] = -speed
-        moving = b
-    return tied, offset
-
-
-def _twice_summed(increments: Array) -> Array:
-    return np.cumsum(np.cumsum(increments, axis=0), axis=0)

@@ -96,10 +96,11 @@ def fit_stretch(
         j = k
         while j <= last:
             span = j * dt_s - origin_s
+            rate = 1.0 / span
             dx, dy = position[0, j] - origin[0], position[1, j] - origin[1]
             if j > k:
                 # The speed may not step too far, neither into the segment nor into the stop.
-                if abs(dx / span - speed[0]) > step or abs(dy / span - speed[1]) > step:
+                if abs(dx * rate - speed[0]) > step or abs(dy * rate - speed[1]) > step:
                     break
                 if j == last and max(abs(dx), abs(dy)) > step * span:
                     break
@@ -115,8 +116,8 @@ def fit_stretch(
             fits = True
             for i in range(4):
                 slack = 0.0 if j == last else tolerance[i]
-                new_low[i] = max(low[i], (value[i] - slack) / span)
-                new_high[i] = min(high[i], (value[i] + slack) / span)
+                new_low[i] = max(low[i], (value[i] - slack) * rate)
+                new_high[i] = min(high[i], (value[i] + slack) * rate)
                 if new_low[i] > new_high[i] + 1e-9:
                     fits = False
             if not fits:
@@ -124,8 +125,8 @@ def fit_stretch(
             low[:] = new_low
             high[:] = new_high
             for i in range(2):
-                wide_low[i] = max(wide_low[i], (value[i] - tolerance[i] - loose) / span)
-                wide_high[i] = min(wide_high[i], (value[i] + tolerance[i] + loose) / span)
+                wide_low[i] = max(wide_low[i], (value[i] - tolerance[i] - loose) * rate)
+                wide_high[i] = min(wide_high[i], (value[i] + tolerance[i] + loose) * rate)
             j += 1
         end = max(j - 1, k)
         samples = end - k + 1

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
-from gcode.lexer import split_line
+from gcode.lexer import split_classic
 
 __all__ = ["Hatches", "ScanSamples", "Timing", "read_hatches", "sample_hatches"]
 
@@ -182,7 +182,7 @@ class _Reader:
 
     def take(self, number: int, line: str) -> None:
         plain = _COMMENT.sub(" ", line).split(";", 1)[0].upper()
-        command = split_line(plain)
+        command = split_classic(plain)
         words = command.words
         codes = [letter + digits for letter, digits in _CODES.findall(plain)]
         odd = [letter for letter in words if len(letter) > 1]

@@ -1,53 +1,46 @@
-"""From bytes to moves and events, as Klipper reads them.
+"""From bytes to moves and events, as the firmware of a dialect reads them.
 
 `Interpreter` takes a file in pieces of any size. The kernel (`_lex_kernels.run`) carries out the
 plain lines; lines it hands back are carried out here and it goes on behind them. Every byte of
-the file belongs to exactly one line, and every line is either one event or one or more moves.
-
-Rules: klippy/gcode.py, klippy/extras/gcode_move.py, gcode_arcs.py, firmware_retraction.py,
-exclude_object.py, klippy/toolhead.py, 2026-08.
+the file belongs to exactly one line, and every line is one event, or one or more moves, or moves
+and behind them the event that stops the machine.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode import _lex_kernels as lex
+from gcode import _slots as at
+from gcode._command_kernels import execute
+from gcode._lex_kernels import PADDING, run
+from gcode.dialect import Action, Dialect
 from gcode.errors import GcodeError
-from gcode.firmware.klipper.dialect import KERNEL_WORDS, classify, word_table
-from gcode.lexer import extended_parameters, split_line
-from gcode.markers import MarkKind, read_mark
+from gcode.firmware.dialects import dialect_of
+from gcode.firmware.registry import kit
+from gcode.lexer import Command, split_line
+from gcode.meta import META_WORDS, held_back, meta_command
+from gcode.slicers.marks import MarkKind, read_mark
+from gcode.state import MachineState
 from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from models.machine import Machine
 
 __all__ = ["Interpreter", "interpret_bytes"]
 
-_ROWS = 32_768
+T = TypeVar("T", bound=np.generic)
+
 _BOM = b"\xef\xbb\xbf"
-_DEFAULT_SPEED_MM_S = 25.0
-_MARK_SLOTS = 4096
+_PAD = b"\n" * PADDING
+_CHUNK = 1 << 20
+_LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
-
-# Words whose numbers a command needs; Klipper does not look at the others.
-_NEEDED = {
-    "G0": "XYZEF",
-    "G1": "XYZEF",
-    "G2": "XYZEFRIJK",
-    "G3": "XYZEFRIJK",
-    "G4": "P",
-    "G92": "XYZE",
-    "M204": "SPT",
-    "M220": "S",
-    "M221": "S",
-}
-
-
-_WORK_SPACE = frozenset({"_mf", "_mi", "_ei", "_ef", "_g_table", "_m_table"})
+_FEWEST_ROWS, _MOST_ROWS = 1024, 32_768
+_SHORT_LINE = 16  # bytes; rows are made for lines of this length
+_SPARE_ROWS = 8  # as many as one command of Python's may write
 
 
 class Interpreter:
@@ -59,6 +52,8 @@ class Interpreter:
         Its firmware facts and travel.
     strict_bounds : bool
         Refuse moves that leave the travel of an axis whose position is known.
+    dialect : Dialect, optional
+        How the file is read; None: as the machine's firmware does.
 
     Attributes
     ----------
@@ -69,65 +64,67 @@ class Interpreter:
 
     Notes
     -----
-    Moves that a line other than G0 to G3 makes (G10, G11, RESTORE_GCODE_STATE MOVE=1,
+    Moves that a line other than G0 to G3 and G5 makes (G10, G11, G61, RESTORE_GCODE_STATE MOVE=1,
     SET_GCODE_OFFSET MOVE=1) have no known axis: such a line does more than move, and must stay.
     """
 
-    def __init__(self, machine: Machine, *, strict_bounds: bool = True) -> None:
+    def __init__(
+        self, machine: Machine, *, strict_bounds: bool = True, dialect: Dialect | None = None
+    ) -> None:
         self.machine = machine
-        self.firmware = firmware = machine.firmware
-        self._features = _Names()
-        self._objects = _Names()
-        self.feature_names = self._features.names
-        self.object_names = self._objects.names
-        self.layer_z_mm: list[float] = []
+        dialect = dialect or dialect_of(machine.firmware)
+        limits = kit(machine).initial_limits()
+        self.state = MachineState(machine, dialect, limits, strict=strict_bounds)
+        self.state.carry_out = self._command
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []
-        self._saved: dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        self._retraction = firmware.retraction
-        self._retracted = False
         self._carry: list[bytes] = []
+        self._carried = 0
         self._offset = 0
         self._first_move = 0
         self._layer_style: str | None = None
-
-        self._f = f = np.zeros(lex.F_SIZE)
-        self._i = i = np.zeros(lex.I_SIZE, np.int64)
-        self._w = np.zeros(26)
-        self._buffer = np.zeros(0, np.uint8)
         self._text = b""
-        self._allocate(_ROWS)
-        self._mod_rows, self._mod_index = _new_table(lex.MODAL_SIZE, 256)
-        self._lim_rows, self._lim_index = _new_table(4, 256)
-        self._mark_keys = np.zeros(_MARK_SLOTS, np.int64)
-        self._mark_values = np.zeros(_MARK_SLOTS, np.int64)
-        self._marks = 0
-        self._g_table = word_table("G", firmware)
-        self._m_table = word_table("M", firmware)
 
-        planner = firmware.planner
-        f[lex.F_SPEED] = _DEFAULT_SPEED_MM_S
-        f[lex.F_SPEED_FACTOR] = 1.0 / 60.0
-        f[lex.F_EXTRUDE_FACTOR] = 1.0
-        f[lex.F_ARC_MM] = firmware.arc_resolution_mm
-        f[lex.F_LIMITS : lex.F_LIMITS + 4] = (
-            planner.max_velocity_mm_s,
-            planner.max_accel_mm_s2,
-            planner.square_corner_velocity_mm_s,
-            planner.minimum_cruise_ratio,
-        )
-        for k, axis in enumerate("xyz"):
-            f[lex.F_LOW + k] = machine.travel[axis].min_mm  # type: ignore[index]
-            f[lex.F_HIGH + k] = machine.travel[axis].max_mm  # type: ignore[index]
-        i[lex.I_LINE] = 1
-        i[lex.I_ABS_XYZ] = i[lex.I_ABS_E] = 1
-        i[lex.I_STRICT] = int(strict_bounds)
-        i[lex.I_ORIGIN_KNOWN] = 0b111
-        i[lex.I_LAYER] = i[lex.I_FEATURE] = i[lex.I_OBJECT] = -1
-        if firmware.homed_at_start:
-            self._home(0b111, firmware.home_mm or (0.0, 0.0, 0.0))
-        self._note_modal()
-        self._note_limits()
+    @property
+    def dialect(self) -> Dialect:
+        """Rules and words in force; RepRapFirmware's modes change them."""
+        return self.state.dialect
+
+    @property
+    def feature_names(self) -> list[str]:
+        """Names behind the `feature` column."""
+        return self.state.features.names
+
+    @property
+    def object_names(self) -> list[str]:
+        """Names behind the `object_id` column."""
+        return self.state.objects.names
+
+    @property
+    def layer_z_mm(self) -> list[float]:
+        """Height of each layer as the slicer's marks say; NaN where they do not."""
+        return [float(z) for z in self.state.tables.layer_z[: int(self.state.i[at.I_LAYER]) + 1]]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the firmware passes over, or what nobody can know before it prints."""
+        return [f"line {line}: {text}" for text, line in self.state.warnings.items()]
+
+    @property
+    def position_mm(self) -> NDArray[np.float64]:
+        """Where the firmware believes the tool is: x y z e, shape (4,)."""
+        return self.state.f[at.F_LAST : at.F_LAST + 4].copy()
+
+    @property
+    def extruder_mm(self) -> float:
+        """What the firmware takes for E: counted from the last G92, in the file's own measure."""
+        f = self.state.f
+        return float((f[at.F_LAST + 3] - f[at.F_BASE + 3]) / f[at.F_EXTRUDE_FACTOR])
+
+    @property
+    def known(self) -> int:
+        """Bit 0..2 set: x, y, z are known."""
+        return int(self.state.i[at.I_KNOWN])
 
     def push(self, data: bytes) -> list[ProgramBlock]:
         """Take the next bytes of the file; return what its whole lines say.
@@ -137,129 +134,115 @@ class Interpreter:
         GcodeError
             For a line that the firmware would reject or that leaves the travel.
         """
-        cut = data.rfind(b"\n") + 1
-        if cut == 0:
-            if data:
-                self._carry.append(data)
-            return []
-        text = b"".join((*self._carry, data[:cut]))
-        self._carry = [data[cut:]] if cut < len(data) else []
-        return self._read(text)
+        blocks: list[ProgramBlock] = []
+        for first in range(0, len(data), _CHUNK):
+            blocks += self._push(data[first : first + _CHUNK] if len(data) > _CHUNK else data)
+        return blocks
 
     def flush(self) -> list[ProgramBlock]:
         """Take what is left as the last line; it may lack its newline."""
-        text = b"".join(self._carry)
-        self._carry = []
-        return self._read(text) if text else []
-
-    @property
-    def position_mm(self) -> NDArray[np.float64]:
-        """Where the firmware believes the tool is: x y z e, shape (4,)."""
-        return self._f[lex.F_LAST : lex.F_LAST + 4].copy()
-
-    @property
-    def known(self) -> int:
-        """Bit 0..2 set: x, y, z are known."""
-        return int(self._i[lex.I_KNOWN])
-
-    # Reading
-
-    def _read(self, text: bytes) -> list[ProgramBlock]:
-        i = self._i
-        self._text = text
-        self._buffer = np.frombuffer(text, np.uint8)
-        i[lex.I_POS] = 0
-        i[lex.I_OFFSET] = self._offset
-        blocks: list[ProgramBlock] = []
-        begun = 0
-        while True:
-            status = lex.run(
-                self._buffer,
-                len(text),
-                self._f,
-                i,
-                self._w,
-                self._mf,
-                self._mi,
-                self._ei,
-                self._ef,
-                self._lim_rows,
-                self._lim_index,
-                self._mod_rows,
-                self._mod_index,
-                self._mark_keys,
-                self._mark_values,
-                self._g_table,
-                self._m_table,
-            )
-            if status == lex.HANDBACK:
-                status = self._carry_out()
-                if status == lex.OK:
-                    i[lex.I_POS] = i[lex.I_END]
-                    i[lex.I_LINE] += 1
-                    continue
-            if status == lex.GROW:
-                self._grow_tables()
-            elif status == lex.FULL and i[lex.I_MOVES] == 0 and i[lex.I_EVENTS] == 0:
-                self._allocate(int(i[lex.I_NEED]) + 1)
-            elif status in (lex.FULL, lex.DONE):
-                end = int(i[lex.I_POS])
-                blocks.append(self._block(begun, end))
-                begun = end
-                if status == lex.DONE:
-                    break
-            else:
-                raise self._error(status)
-        self._offset += len(text)
-        self._text = b""
-        return blocks
+        text = b"".join((*self._carry, _PAD))
+        self._carry, self._carried = [], 0
+        return self._read(text) if len(text) > PADDING else []
 
     def snapshot(self) -> Interpreter:
         """Return an interpreter that goes on from here, whatever this one reads next."""
         other = copy.copy(self)
-        # Work space is empty between calls and may be shared; all that is state is copied.
-        for name, value in vars(self).items():
-            if name in _WORK_SPACE:
-                continue
-            if isinstance(value, np.ndarray | list | dict):
-                setattr(other, name, value.copy())
-            elif isinstance(value, _Names):
-                setattr(other, name, copy.deepcopy(value))
-        other.feature_names = other._features.names
-        other.object_names = other._objects.names
+        other.state = self.state.snapshot()
+        other.state.carry_out = other._command
+        for name in ("_modal", "_limits", "_carry"):
+            setattr(other, name, getattr(self, name).copy())
         return other
 
+    # Reading
+
+    def _push(self, data: bytes) -> list[ProgramBlock]:
+        first = data.find(b"\n") if self._carried else -1
+        if self._carried + (len(data) if first < 0 else first) > _LONGEST_LINE + _CHUNK:
+            raise GcodeError(
+                f"the line has more than {_LONGEST_LINE} bytes; is this G-code?",
+                line=int(self.state.i[at.I_LINE]),
+            )
+        cut = data.rfind(b"\n") + 1
+        if cut == 0:
+            self._carry.append(data)
+            self._carried += len(data)
+            return []
+        text = b"".join((*self._carry, data[:cut], _PAD))
+        self._carry = [data[cut:]] if cut < len(data) else []
+        self._carried = len(data) - cut
+        return self._read(text)
+
+    def _read(self, text: bytes) -> list[ProgramBlock]:
+        """Read whole lines; behind them is the padding."""
+        state, i = self.state, self.state.i
+        stop = len(text) - PADDING
+        self._text = text
+        state.buffer = np.frombuffer(text, np.uint8)
+        i[at.I_POS] = 0
+        i[at.I_OFFSET] = self._offset
+        blocks: list[ProgramBlock] = []
+        begun = 0
+        self._allocate(stop)
+        while True:
+            status = run(state.buffer, stop, state.f, i, state.w, state.rows, state.tables)
+            if status == at.HANDBACK:
+                status = self._carry_out()
+            if status >= at.ERROR_INCHES:
+                status = self._failed(status)
+            if status == at.OK:
+                i[at.I_POS] = i[at.I_END]
+                i[at.I_LINE] += 1
+            elif status == at.GROW:
+                state.grow_tables()
+            elif status == at.FULL and i[at.I_MOVES] == 0 and i[at.I_EVENTS] == 0:
+                self._allocate(stop - begun, int(i[at.I_NEED]))
+            else:
+                end = int(i[at.I_POS])
+                blocks.append(self._block(begun, end))
+                begun = end
+                if status == at.DONE:
+                    break
+                self._allocate(stop - begun)
+        self._offset += stop
+        self._text = b""
+        return blocks
+
+    def _allocate(self, size: int, need: int = 0) -> None:
+        rows = max(min(size // _SHORT_LINE, _MOST_ROWS), _FEWEST_ROWS, need) + _SPARE_ROWS
+        self.state.allocate(rows)
+
     def _block(self, begun: int, end: int) -> ProgramBlock:
-        """Copy the rows out and empty them."""
-        i = self._i
-        n, m = int(i[lex.I_MOVES]), int(i[lex.I_EVENTS])
-        mf, mi, ei = self._mf[:n], self._mi[:n], self._ei[:m]
-        while len(self.layer_z_mm) <= i[lex.I_LAYER]:
-            self.layer_z_mm.append(math.nan)
+        """Hand the rows over."""
+        state, i = self.state, self.state.i
+        state.settle()
+        n, m = int(i[at.I_MOVES]), int(i[at.I_EVENTS])
         self._note_tables()
+        rows = state.rows
         moves = Moves(
-            start_mm=mf[:, 0:4].copy(),
-            end_mm=mf[:, 4:8].copy(),
-            speed_mm_s=mf[:, 8].copy(),
-            limits_id=mi[:, lex.M_LIMITS].astype(np.int32),
-            modal_id=mi[:, lex.M_MODAL].astype(np.int32),
-            known=mi[:, lex.M_KNOWN].astype(np.uint8),
-            line=mi[:, lex.M_LINE].copy(),
-            byte_start=mi[:, lex.M_START].copy(),
-            byte_end=mi[:, lex.M_STOP].copy(),
-            layer=mi[:, lex.M_LAYER].astype(np.int32),
-            feature=mi[:, lex.M_FEATURE].astype(np.int32),
-            object_id=mi[:, lex.M_OBJECT].astype(np.int32),
+            start_mm=_part(rows.start, n),
+            end_mm=_part(rows.end, n),
+            speed_mm_s=_part(rows.speed, n),
+            limits_id=_part(rows.small[at.M_LIMITS], n),
+            modal_id=_part(rows.small[at.M_MODAL], n),
+            known=_part(rows.tiny[at.M_KNOWN], n),
+            line=_part(rows.whole[at.M_LINE], n),
+            byte_start=_part(rows.whole[at.M_START], n),
+            byte_end=_part(rows.whole[at.M_STOP], n),
+            layer=_part(rows.small[at.M_LAYER], n),
+            feature=_part(rows.small[at.M_FEATURE], n),
+            object_id=_part(rows.small[at.M_OBJECT], n),
+            tool=_part(rows.small[at.M_TOOL], n),
         )
         events = Events(
-            kind=ei[:, lex.E_KIND].astype(np.int8),
-            move_index=ei[:, lex.E_MOVE].copy(),
-            modal_id=ei[:, lex.E_MODAL].astype(np.int32),
-            limits_id=ei[:, lex.E_LIMITS].astype(np.int32),
-            dwell_s=self._ef[:m].copy(),
-            line=ei[:, lex.E_LINE].copy(),
-            byte_start=ei[:, lex.E_START].copy(),
-            byte_end=ei[:, lex.E_STOP].copy(),
+            kind=_part(rows.tiny[at.E_KIND].view(np.int8), m),
+            move_index=_part(rows.whole[at.E_MOVE], m),
+            modal_id=_part(rows.small[at.E_MODAL], m),
+            limits_id=_part(rows.small[at.E_LIMITS], m),
+            dwell_s=_part(rows.dwell, m),
+            line=_part(rows.whole[at.E_LINE], m),
+            byte_start=_part(rows.whole[at.E_START], m),
+            byte_end=_part(rows.whole[at.E_STOP], m),
         )
         block = ProgramBlock(
             first_move=self._first_move,
@@ -271,368 +254,225 @@ class Interpreter:
             text=self._text[begun:end],
         )
         self._first_move += n
-        i[lex.I_MOVES] = i[lex.I_EVENTS] = 0
-        if len(self._mf) > _ROWS:
-            self._allocate(_ROWS)
         return block
+
+    def _note_tables(self) -> None:
+        """Bring the public tables up to the kernel's."""
+        i, tables = self.state.i, self.state.tables
+        for row in tables.modal[len(self._modal) : int(i[at.I_N_MODAL])].tolist():
+            absolute_xyz, absolute_e, speed, extrude, x, y, z = row
+            self._modal.append(
+                ModalState(bool(absolute_xyz), bool(absolute_e), speed, extrude, (x, y, z))
+            )
+        for row in tables.limits[len(self._limits) : int(i[at.I_N_LIMITS])].tolist():
+            self._limits.append(self.state.limits_type.from_row(row))
 
     # Lines that the kernel hands back
 
     def _carry_out(self) -> int:
         """Carry out the line in hand; return a kernel status."""
-        i = self._i
-        raw = self._text[int(i[lex.I_POS]) : int(i[lex.I_END])]
-        if i[lex.I_LINE] == 1 and raw.startswith(_BOM):
-            raw = raw[len(_BOM) :]
+        state, i = self.state, self.state.i
+        if max(int(i[at.I_MOVES]), int(i[at.I_EVENTS])) + _SPARE_ROWS > state.rows.room:
+            i[at.I_NEED] = _SPARE_ROWS
+            return at.FULL
+        raw = self._raw()
         text = raw.decode("utf-8", "replace")
+        if text.startswith(";"):
+            state.span = int(i[at.I_POS]), int(i[at.I_END]) - text.endswith("\n")
+            return self._comment(Command("", {}, text))
         if len(text) > _LONGEST_COMMAND and len(text.split(";", 1)[0]) > _LONGEST_COMMAND:
-            raise self._problem(
-                f"the command has more than {_LONGEST_COMMAND} characters; is this G-code?", text
+            raise GcodeError(
+                f"the command has more than {_LONGEST_COMMAND} characters; is this G-code?",
+                line=int(i[at.I_LINE]),
+                text=text,
             )
-        name = split_line(text).name
+        start = int(i[at.I_POS]) + _skipped(raw)
+        end = int(i[at.I_END])
+        state.span = (start, end - 1 if self._text[end - 1 : end] == b"\n" else end)
+        commands = self._split(text)
+        if len(commands) > 1:
+            return self._several(commands)
+        (command,) = commands
+        if not command.name and not (command.words and self.dialect.modal_words):
+            return self._comment(command)
+        return self._command(command)
+
+    def _split(self, text: str) -> list[Command]:
+        try:
+            return split_line(text, self.dialect)
+        except GcodeError as error:
+            raise GcodeError(
+                error.message, line=int(self.state.i[at.I_LINE]), text=error.text
+            ) from None
+
+    def _raw(self) -> bytes:
+        i = self.state.i
+        raw = self._text[int(i[at.I_POS]) : int(i[at.I_END])]
+        if i[at.I_LINE] == 1 and raw.startswith(_BOM):
+            raw = raw[len(_BOM) :]
+        return raw
+
+    def _command(self, command: Command) -> int:
+        state, dialect = self.state, self.dialect
+        if dialect.expressions:
+            held = held_back(state, command)
+            if held is not None:
+                return held
+        if command.dropped:
+            state.warn(f"the firmware drops the line: {command.dropped}")
+            return state.event(EventKind.HARMLESS)
+        if dialect.expressions and command.name in META_WORDS:
+            return meta_command(state, command)
+        name = command.name
         if not name:
-            return self._comment(raw, text)
-        if name in KERNEL_WORDS and (self.firmware.arcs or name not in ("G2", "G3")):
-            return self._classic(name, text)
-        handler = _HANDLERS.get(name)
-        if handler is None or (name in ("G10", "G11") and self._retraction is None):
-            kind = classify(name, self.firmware)
-            if kind == EventKind.UNKNOWN:
-                i[lex.I_KNOWN] = 0
-            return self._event(kind)
-        return handler(self, name, text)
+            motion = int(state.i[at.I_MOTION])
+            if motion < 0:
+                state.warn("coordinates without a command are passed over")
+                return state.event(EventKind.HARMLESS)
+            name = f"G{motion}"
+        word = dialect.word(name)
+        if command.uncertain:
+            return self._uncertain(word)
+        if isinstance(word, Action):
+            return self._classic(word, name, command)
+        if isinstance(word, EventKind):
+            state.remember(command, at.MEMO_EVENT, int(word))
+            return state.event(word)
+        return word(state, command)
 
-    def _classic(self, name: str, text: str) -> int:
+    def _uncertain(self, word: object) -> int:
+        """Pass a line by whose values only the firmware can work out."""
+        state = self.state
+        if word == EventKind.HARMLESS:
+            return state.event(EventKind.HARMLESS)
+        state.warn("the line holds an expression; from here on the position is not known")
+        state.forget(origin=not isinstance(word, Action) or word >= Action.INCHES)
+        return state.event(EventKind.UNKNOWN)
+
+    def _classic(self, action: Action, name: str, command: Command) -> int:
         """Do with Python's number reader what the kernel does with its own."""
-        mask = 0
-        words = split_line(text).words
-        for word in words:
-            if word[1:] in ("NAN", "INF", "INFINITY") and word[0] in _NEEDED.get(name, ""):
+        state = self.state
+        if Action.MOVE <= action <= Action.ARC_CCW:
+            odd = self.dialect.odd_move
+            if action == Action.MOVE and odd is not None:
+                handled = odd(state, command)
+                if handled >= 0:
+                    return handled
+            state.i[at.I_MOTION] = action - 19 if action > Action.MOVE else 1
+        needed = self.dialect.needed.get(name, "")
+        for word in command.words:
+            if word[1:] in ("NAN", "INF", "INFINITY") and word[0] in needed:
                 # Klipper would skip such a word; whoever wrote it meant a coordinate.
-                raise GcodeError(
-                    f"{word[0]} is {word[1:]}, not a number; write a decimal number",
-                    line=int(self._i[lex.I_LINE]),
-                    text=text,
+                raise state.problem(
+                    f"{word[0]} is {word[1:]}, not a number; write a decimal number", command
                 )
-        for letter in _NEEDED.get(name, ""):
-            if letter in words:
-                value = self._number(words[letter], letter, text)
-                self._w[ord(letter) - 65] = value
-                mask |= 1 << (ord(letter) - 65)
-        return self._execute(KERNEL_WORDS[name], mask)
+        mask = 0
+        for letter, value in state.numbers(command, needed).items():
+            if letter == "E" and ":" in command.words["E"]:
+                # Filament of all extruders that feed this move.
+                value = sum(state.number(v, "E", command) for v in command.words["E"].split(":"))
+            state.w[ord(letter) - 65] = value
+            mask |= 1 << (ord(letter) - 65)
+        return execute(int(action), state.w, mask, state.f, state.i, state.rows, state.tables)
 
-    def _execute(self, action: int, mask: int) -> int:
-        return lex.execute(
-            action,
-            self._w,
-            mask,
-            self._f,
-            self._i,
-            self._mf,
-            self._mi,
-            self._ei,
-            self._ef,
-            self._lim_rows,
-            self._lim_index,
-            self._mod_rows,
-            self._mod_index,
-        )
+    def _several(self, commands: list[Command]) -> int:
+        """Carry out the commands of one line; it stays whole, so its moves are not ours."""
+        state, i = self.state, self.state.i
+        before = state.f.copy(), i.copy()
+        events, moves = int(i[at.I_EVENTS]), int(i[at.I_MOVES])
+        worst = EventKind.HARMLESS
+        for command in commands:
+            i[at.I_EVENTS] = events
+            status = self._command(command)
+            if status >= at.ERROR_INCHES:
+                status = self._failed(status)
+            if status != at.OK:
+                state.f[:], need = before[0], int(i[at.I_NEED])
+                i[:] = before[1]
+                i[at.I_NEED] = need
+                return status
+            if i[at.I_EVENTS] > events:
+                worst = max(worst, EventKind(int(state.rows.tiny[at.E_KIND, events])))
+        i[at.I_EVENTS] = events
+        i[at.I_FILLED_EVENTS] = min(int(i[at.I_FILLED_EVENTS]), events)
+        state.settle()
+        if i[at.I_MOVES] > moves:
+            state.rows.tiny[at.M_KNOWN, moves : int(i[at.I_MOVES])] &= KEPT
+        if i[at.I_MOVES] == moves or worst >= EventKind.STOP:
+            known = int(i[at.I_KNOWN])
+            state.event(worst)
+            state.settle()
+            i[at.I_KNOWN] = known
+        return at.OK
 
-    def _comment(self, raw: bytes, text: str) -> int:
+    def _comment(self, command: Command) -> int:
         """Take note of a slicer's mark, and remember it for the kernel."""
-        i = self._i
-        at = text.find(";")
-        mark = read_mark(text[at:]) if at >= 0 else None
-        value = 0
-        if mark is not None and mark.kind == MarkKind.STAMP:
-            return self._event(EventKind.STAMP)
-        if mark is not None and mark.kind in (MarkKind.OFF, MarkKind.ON):
-            i[lex.I_KEPT] = KEPT if mark.kind == MarkKind.OFF else 0
-            return self._event(EventKind.HARMLESS)
-        if mark is not None and mark.kind == MarkKind.LAYER:
-            style = text[at : at + 7]
+        state, i, text = self.state, self.state.i, command.text
+        found = text.find(";")
+        mark = read_mark(text[found:]) if found >= 0 else None
+        kind = None if mark is None else mark.kind
+        if mark is None or kind is None:
+            state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
+        elif kind == MarkKind.STAMP:
+            return state.event(EventKind.STAMP)
+        elif kind in (MarkKind.OFF, MarkKind.ON):
+            state.settle()
+            i[at.I_KEPT] = KEPT if kind == MarkKind.OFF else 0
+        elif kind == MarkKind.LAYER:
+            style = text[found : found + 7]
             self._layer_style = self._layer_style or style
             if style == self._layer_style and not self._same_height(mark.text):
-                i[lex.I_LAYER] += 1
+                state.settle()
+                i[at.I_LAYER] += 1
                 self._note_height(mark.text)
-                value = lex.MARK_LAYER * lex.MARK_STRIDE
-            if mark.text:
-                return self._event(EventKind.HARMLESS)
-        elif mark is not None and mark.kind == MarkKind.HEIGHT:
+                if not mark.text:
+                    state.remember(command, at.MEMO_LAYER, 0)
+            elif not mark.text:
+                state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
+        elif kind == MarkKind.Z:
             self._note_height(mark.text)
-            return self._event(EventKind.HARMLESS)
-        elif mark is not None and mark.kind == MarkKind.FEATURE:
-            number = self._features.number(mark.text)
-            i[lex.I_FEATURE] = number
-            value = lex.MARK_FEATURE * lex.MARK_STRIDE + number + 1
-        elif mark is not None and mark.kind == MarkKind.OBJECT:
-            number = self._objects.number(mark.text)
-            i[lex.I_OBJECT] = number
-            value = lex.MARK_OBJECT * lex.MARK_STRIDE + number + 1
-        pos, end = int(i[lex.I_POS]), int(i[lex.I_END])
-        semicolon = raw.find(b";")
-        if semicolon >= 0 and self._marks < _MARK_SLOTS // 2:
-            start = pos + self._text[pos:end].find(b";")
-            stop = end - 1 if self._text[end - 1 : end] == b"\n" else end
-            key = lex.mark_hash(self._buffer, start, stop)
-            slot = lex.mark_slot(self._mark_keys, key)
-            if self._mark_keys[slot] == 0:
-                self._mark_keys[slot] = key
-                self._mark_values[slot] = value
-                self._marks += 1
-        return self._event(EventKind.HARMLESS)
+        elif kind == MarkKind.FEATURE:
+            number = state.features.number(mark.text)
+            state.settle()
+            i[at.I_FEATURE] = number
+            state.remember(command, at.MEMO_FEATURE, number + 1)
+        elif kind == MarkKind.OBJECT:
+            number = state.objects.number(mark.text)
+            state.settle()
+            i[at.I_OBJECT] = number
+            state.remember(command, at.MEMO_OBJECT, number + 1)
+        else:
+            state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
+        return state.event(EventKind.HARMLESS)
 
     def _same_height(self, text: str) -> bool:
         """Tell whether a layer mark that names its height is the next object's of that layer."""
-        try:
-            return bool(text and self.layer_z_mm and self.layer_z_mm[-1] == float(text))
-        except ValueError:
-            return False
+        layer = int(self.state.i[at.I_LAYER])
+        return bool(text and layer >= 0 and self.state.tables.layer_z[layer] == _height(text))
 
     def _note_height(self, text: str) -> None:
-        while len(self.layer_z_mm) <= self._i[lex.I_LAYER]:
-            self.layer_z_mm.append(math.nan)
-        try:
-            if self.layer_z_mm and text:
-                self.layer_z_mm[-1] = float(text)
-        except ValueError:
-            pass
+        layer = int(self.state.i[at.I_LAYER])
+        if layer >= 0 and text:
+            self.state.tables.layer_z[layer] = _height(text)
 
-    def _velocity_limit(self, name: str, text: str) -> int:
-        given = self._extended(name, text)
-        f = self._f
-        for k, key in enumerate(
-            ("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO")
-        ):
-            if key not in given:
-                continue
-            value = self._number(given[key], key, text)
-            low = "above 0" if k < 2 else "at least 0" if k == 2 else "at least 0 and below 1"
-            if (
-                value < 0
-                or (k < 2 and value == 0)
-                or (k == 3 and value >= 1)
-                or value > lex.MAX_VALUE
-            ):
-                raise self._problem(f"{key}={given[key]} must be {low}", text)
-            f[lex.F_LIMITS + k] = value
-        self._note_limits()
-        return self._event(EventKind.LIMITS)
-
-    def _retract(self, name: str, _text: str) -> int:
-        """G10 and G11: an E move of its own speed that the absolute E does not see."""
-        facts = self._retraction
-        assert facts is not None
-        if (name == "G10") == self._retracted:
-            return self._event(EventKind.MODE)
-        if name == "G10":
-            length, speed = -facts.retract_length_mm, facts.retract_speed_mm_s
-        else:
-            length = facts.retract_length_mm + facts.unretract_extra_length_mm
-            speed = facts.unretract_speed_mm_s
-        f = self._f
-        length = round(length, 5)
-        speed_before = f[lex.F_SPEED]
-        e_before = f[lex.F_LAST + 3]
-        f[lex.F_SPEED] = max(1, int(speed * 60)) * f[lex.F_SPEED_FACTOR]
-        f[lex.F_LAST + 3] += length * f[lex.F_EXTRUDE_FACTOR]
-        status = self._travel(0)
-        f[lex.F_SPEED] = speed_before
-        f[lex.F_BASE + 3] += f[lex.F_LAST + 3] - e_before
-        self._retracted = name == "G10"
-        return self._event(EventKind.MODE) if status == lex.DONE else status
-
-    def _set_retraction(self, name: str, text: str) -> int:
-        facts = self._retraction
-        if facts is None:
-            return self._event(classify(name, self.firmware))
-        given = self._extended(name, text)
-        changed = {}
-        for key in ("RETRACT_LENGTH", "UNRETRACT_EXTRA_LENGTH"):
-            if key in given:
-                changed[f"{key.lower()}_mm"] = self._at_least(given[key], key, 0.0, text)
-        for key in ("RETRACT_SPEED", "UNRETRACT_SPEED"):
-            if key in given:
-                changed[f"{key.lower()}_mm_s"] = self._at_least(given[key], key, 1.0, text)
-        self._retraction = facts.model_copy(update=changed)
-        self._retracted = False
-        return self._event(EventKind.MODE)
-
-    def _gcode_offset(self, name: str, text: str) -> int:
-        given = self._extended(name, text)
-        f = self._f
-        delta = np.zeros(4)
-        for k, axis in enumerate("XYZE"):
-            if axis in given:
-                offset = self._number(given[axis], axis, text)
-            elif f"{axis}_ADJUST" in given:
-                offset = self._number(given[f"{axis}_ADJUST"], f"{axis}_ADJUST", text)
-                offset += f[lex.F_HOMING + k]
-            else:
-                continue
-            delta[k] = offset - f[lex.F_HOMING + k]
-            f[lex.F_BASE + k] += delta[k]
-            f[lex.F_HOMING + k] = offset
-        self._note_modal()
-        if not self._flag(given, text):
-            return self._event(EventKind.MODE)
-        f[lex.F_LAST : lex.F_LAST + 4] += delta
-        return self._travel_at(given, 0, text)
-
-    def _save_state(self, name: str, text: str) -> int:
-        key = self._extended(name, text).get("NAME", "default")
-        self._saved[key] = (self._f.copy(), self._i.copy())
-        return self._event(EventKind.MODE)
-
-    def _restore_state(self, name: str, text: str) -> int:
-        given = self._extended(name, text)
-        key = given.get("NAME", "default")
-        if key not in self._saved:
-            raise self._problem(f"no state {key!r} was saved; SAVE_GCODE_STATE it first", text)
-        saved, saved_flags = self._saved[key]
-        f, i = self._f, self._i
-        for slot in (lex.I_ABS_XYZ, lex.I_ABS_E, lex.I_ORIGIN_KNOWN):
-            i[slot] = saved_flags[slot]
-        for first, count in (
-            (lex.F_BASE, 4),
-            (lex.F_HOMING, 4),
-            (lex.F_SPEED, 4),  # speed, its factor, extrude factor, F
-        ):
-            f[first : first + count] = saved[first : first + count]
-        f[lex.F_BASE + 3] += f[lex.F_LAST + 3] - saved[lex.F_LAST + 3]
-        self._note_modal()
-        if not self._flag(given, text):
-            return self._event(EventKind.MODE)
-        f[lex.F_LAST : lex.F_LAST + 3] = saved[lex.F_LAST : lex.F_LAST + 3]
-        return self._travel_at(given, 0, text)
-
-    def _home_command(self, _name: str, text: str) -> int:
-        words = split_line(text).words
-        axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in words) or 0b111
-        self._home(axes, self.firmware.home_mm)
-        return self._event(EventKind.UNKNOWN)
-
-    def _home(self, axes: int, home: tuple[float, float, float] | None) -> None:
-        """Give the axes their G-code origin back and, if the machine says it, their place."""
-        f, i = self._f, self._i
-        f[lex.F_LAST : lex.F_LAST + 4] = f[lex.F_TOOL : lex.F_TOOL + 4]
-        for k in range(3):
-            if axes >> k & 1:
-                f[lex.F_BASE + k] = f[lex.F_HOMING + k]
-                if home is not None:
-                    f[lex.F_LAST + k] = f[lex.F_TOOL + k] = home[k]
-        i[lex.I_ORIGIN_KNOWN] |= axes
-        # Homing an axis may move the others too (safe_z_home).
-        i[lex.I_KNOWN] = 0 if home is None else i[lex.I_KNOWN] | axes
-        self._note_modal()
-
-    def _object(self, name: str, text: str) -> int:
-        i = self._i
-        if name == "EXCLUDE_OBJECT_START":
-            given = self._extended(name, text)
-            i[lex.I_OBJECT] = self._objects.number(given.get("NAME", "").upper())
-        elif name == "EXCLUDE_OBJECT_END":
-            i[lex.I_OBJECT] = -1
-        else:  # M486: S opens an object, S-1 closes it, A names it
-            words = split_line(text).words
-            if "S" in words:
-                number = words["S"]
-                closing = number.startswith("-") or not number
-                i[lex.I_OBJECT] = -1 if closing else self._objects.number(number)
-        return self._event(EventKind.OBJECT)
-
-    # Helpers of the handlers
-
-    def _event(self, kind: EventKind, dwell_s: float = 0.0) -> int:
-        lex.put_event(self._i, self._ei, self._ef, int(kind), dwell_s)
-        return lex.OK
-
-    def _travel(self, named: int) -> int:
-        return lex.travel(self._f, self._i, self._mf, self._mi, named, False)
-
-    def _travel_at(self, given: Mapping[str, str], named: int, text: str) -> int:
-        """MOVE=1: go to F_LAST at MOVE_SPEED."""
-        f = self._f
-        speed_before = f[lex.F_SPEED]
-        if "MOVE_SPEED" in given:
-            speed = self._number(given["MOVE_SPEED"], "MOVE_SPEED", text)
-            if speed <= 0:
-                raise self._problem(f"MOVE_SPEED={given['MOVE_SPEED']} must be above 0", text)
-            f[lex.F_SPEED] = speed
-        status = self._travel(named)
-        f[lex.F_SPEED] = speed_before
-        return self._event(EventKind.MODE) if status == lex.DONE else status
-
-    def _extended(self, name: str, text: str) -> Mapping[str, str]:
-        return extended_parameters(text, name, line=int(self._i[lex.I_LINE]))
-
-    def _flag(self, given: Mapping[str, str], text: str) -> bool:
-        try:
-            return bool(int(given.get("MOVE", "0")))
-        except ValueError:
-            raise self._problem(f"MOVE={given['MOVE']} must be 0 or 1", text) from None
-
-    def _number(self, value: str, key: str, text: str) -> float:
-        try:
-            number = float(value)
-        except ValueError:
-            raise self._problem(f"{key}{value!r} is not a number; correct it", text) from None
-        if not abs(number) <= lex.MAX_VALUE:
-            raise self._problem(f"{key} {value} is out of range; correct it", text)
-        return number
-
-    def _at_least(self, value: str, key: str, low: float, text: str) -> float:
-        number = self._number(value, key, text)
-        if number < low:
-            raise self._problem(f"{key}={value} must be at least {low:g}", text)
-        return number
-
-    def _problem(self, message: str, text: str) -> GcodeError:
-        return GcodeError(message, line=int(self._i[lex.I_LINE]), text=text)
-
-    def _error(self, status: int) -> GcodeError:
-        i, f = self._i, self._f
-        raw = self._text[int(i[lex.I_POS]) : int(i[lex.I_END])]
-        value, limit = float(f[lex.F_ERROR]), float(f[lex.F_ERROR + 1])
-        axis = "XYZE"[int(i[lex.I_ERROR_AXIS])]
-        message = _MESSAGES[status].format(axis=axis, value=value, limit=limit)
-        return self._problem(message, raw.decode("utf-8", "replace"))
-
-    # Tables
-
-    def _allocate(self, rows: int) -> None:
-        rows = max(rows, _ROWS)
-        self._mf = np.empty((rows, 9))
-        self._mi = np.empty((rows, 9), np.int64)
-        self._ei = np.empty((rows, 7), np.int64)
-        self._ef = np.empty(rows)
-
-    def _note_modal(self) -> None:
-        lex.note_modal(self._f, self._i, self._mod_rows, self._mod_index)
-
-    def _note_limits(self) -> None:
-        lex.note_limits(self._f, self._i, self._lim_rows, self._lim_index)
-
-    def _note_tables(self) -> None:
-        """Bring the public tables up to the kernel's."""
-        for row in self._mod_rows[len(self._modal) : int(self._i[lex.I_N_MODAL])].tolist():
-            absolute_xyz, absolute_e, speed, extrude, x, y, z = row
-            self._modal.append(
-                ModalState(bool(absolute_xyz), bool(absolute_e), speed, extrude, (x, y, z))
-            )
-        for row in self._lim_rows[len(self._limits) : int(self._i[lex.I_N_LIMITS])].tolist():
-            self._limits.append(Limits(*row))
-
-    def _grow_tables(self) -> None:
-        i = self._i
-        if i[lex.I_N_MODAL] + 2 > len(self._mod_rows):
-            self._mod_rows, self._mod_index = _grown(self._mod_rows, int(i[lex.I_N_MODAL]))
-        if i[lex.I_N_LIMITS] + 2 > len(self._lim_rows):
-            self._lim_rows, self._lim_index = _grown(self._lim_rows, int(i[lex.I_N_LIMITS]))
+    def _failed(self, status: int) -> int:
+        """Raise what is wrong with the line in hand, unless the firmware passes it over."""
+        state, i, f = self.state, self.state.i, self.state.f
+        if status == at.ERROR_ARC_CENTER and self.dialect.bad_arcs_pass:
+            state.warn(f"{self.dialect.title} passes over an arc without a centre")
+            return state.event(EventKind.MODE)
+        value, limit = float(f[at.F_ERROR]), float(f[at.F_ERROR + 1])
+        axis = "XYZE"[int(i[at.I_ERROR_AXIS])]
+        message = _MESSAGES[status].format(
+            axis=axis, value=value, limit=limit, firmware=self.dialect.title
+        )
+        raise GcodeError(
+            message, line=int(i[at.I_LINE]), text=self._raw().decode("utf-8", "replace")
+        )
 
 
 def interpret_bytes(
-    data: bytes, machine: Machine, *, strict_bounds: bool = True
+    data: bytes, machine: Machine, *, strict_bounds: bool = True, dialect: Dialect | None = None
 ) -> list[ProgramBlock]:
     """Interpret a whole file.
 
@@ -641,61 +481,55 @@ def interpret_bytes(
     GcodeError
         For a line that the firmware would reject or that leaves the travel.
     """
-    interpreter = Interpreter(machine, strict_bounds=strict_bounds)
+    interpreter = Interpreter(machine, strict_bounds=strict_bounds, dialect=dialect)
     return [*interpreter.push(data), *interpreter.flush()]
 
 
-_HANDLERS = {
-    "SET_VELOCITY_LIMIT": Interpreter._velocity_limit,
-    "SET_GCODE_OFFSET": Interpreter._gcode_offset,
-    "SAVE_GCODE_STATE": Interpreter._save_state,
-    "RESTORE_GCODE_STATE": Interpreter._restore_state,
-    "SET_RETRACTION": Interpreter._set_retraction,
-    "EXCLUDE_OBJECT_START": Interpreter._object,
-    "EXCLUDE_OBJECT_END": Interpreter._object,
-    "M486": Interpreter._object,
-    "G10": Interpreter._retract,
-    "G11": Interpreter._retract,
-    "G28": Interpreter._home_command,
-}
-
 _MESSAGES = {
-    lex.ERROR_INCHES: "Klipper has no G20 (inches); slice in millimetres",
-    lex.ERROR_FEED: "the feedrate F{value:g} must be above 0 and below 1e9 mm/min",
-    lex.ERROR_SLOW: "the speed {value:g} mm/s is below {limit:g} mm/s; raise F or M220",
-    lex.ERROR_TRAVEL: "{axis} {value:.3f} mm lies outside the machine's travel, which ends at "
+    at.ERROR_INCHES: "{firmware} has no G20 (inches); slice in millimetres",
+    at.ERROR_FEED: "the feedrate F{value:g} must be above 0 and below 1e9 mm/min",
+    at.ERROR_SLOW: "the speed {value:g} mm/s is below {limit:g} mm/s; raise F or M220",
+    at.ERROR_TRAVEL: "{axis} {value:.3f} mm lies outside the machine's travel, which ends at "
     "{limit:.3f} mm; move the model or correct the machine's travel",
-    lex.ERROR_RANGE: "{axis} {value:g} is beyond {limit:g} mm; correct it",
-    lex.ERROR_ARC_RADIUS: "Klipper's arcs do not take R; slice with I and J",
-    lex.ERROR_ARC_RELATIVE: "Klipper has no arcs in relative mode; use G90 before them",
-    lex.ERROR_ARC_CENTER: "the arc names no centre; give I and J (G18: I K, G19: J K)",
-    lex.ERROR_ARC_LONG: "the arc has {value:.0f} pieces, more than {limit:.0f}; correct its centre",
-    lex.ERROR_POSITIVE: "the value {value:g} is out of range; it must be above 0 (P of G4: not "
+    at.ERROR_RANGE: "{axis} {value:g} is beyond {limit:g} mm; correct it",
+    at.ERROR_ARC_RADIUS: "Klipper's arcs do not take R; slice with I and J",
+    at.ERROR_ARC_RELATIVE: "Klipper has no arcs in relative mode; use G90 before them",
+    at.ERROR_ARC_CENTER: "the arc names no centre; give I and J (G18: I K, G19: J K)",
+    at.ERROR_ARC_LONG: "the arc has {value:.0f} pieces or turns, more than {limit:.0f}; correct "
+    "its centre or P",
+    at.ERROR_ARC_SHORT: "the arc's R is too short to reach its end; correct it",
+    at.ERROR_ARC_ENDS: "the arc ends {value:.3f} mm off its circle, more than {limit:g} mm; "
+    "correct its centre",
+    at.ERROR_ARC_SAME: "an arc with R cannot end where it begins; give I and J",
+    at.ERROR_ARC_TURNS: "this Marlin divides by zero for a clockwise circle with P1; leave P out",
+    at.ERROR_POSITIVE: "the value {value:g} is out of range; it must be above 0 (P of G4: not "
     "below 0)",
 }
 
 
-def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    return np.zeros((rows, columns)), np.full(4 * rows, -1, np.int32)
+def _skipped(raw: bytes) -> int:
+    """Count the bytes before the command, as the kernel does: blanks and an N word."""
+    k = 0
+    while raw[k : k + 1] in (b" ", b"\t", b"\r"):
+        k += 1
+    if raw[k : k + 1] in (b"N", b"n") and raw[k + 1 : k + 2] in _BLANK_OR_DIGIT:
+        k += 1
+        while raw[k : k + 1] in _BLANK_OR_DIGIT:
+            k += 1
+    return k
 
 
-def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    larger, index = _new_table(rows.shape[1], 2 * len(rows))
-    for number in range(count):
-        lex.intern_row(larger, index, number, rows[number])
-    return larger, index
+_BLANK_OR_DIGIT = frozenset(bytes([c]) for c in b" 0123456789")
 
 
-class _Names:
-    """Names numbered as they come."""
+def _height(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
-    def __init__(self) -> None:
-        self.names: list[str] = []
-        self._numbers: dict[str, int] = {"": -1}
 
-    def number(self, name: str) -> int:
-        """Return the number of a name, entered if it is new; -1 for the empty name."""
-        number = self._numbers.setdefault(name, len(self.names))
-        if number == len(self.names):
-            self.names.append(name)
-        return number
+def _part(column: NDArray[T], count: int) -> NDArray[T]:
+    """Return the first rows; a copy where most of the room would be kept for nothing."""
+    part = column[:count]
+    return part if 2 * count > len(column) else part.copy()

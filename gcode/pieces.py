@@ -9,25 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.klipper.planner import plan_moves
+from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
 from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
-from models.machine import Klipper, Machine
+from models.machine import Machine
 
-__all__ = ["MIN_STREAM_ACCEL_MM_S2", "Passage", "Piece", "Splitter"]
+__all__ = ["Passage", "Piece", "Splitter"]
 
 T = TypeVar("T", Moves, Events, Phases)
 
-LONGEST_MOVE_S = 3600.0
-"""A single move that takes longer is taken for a mistake."""
-
-MIN_STREAM_ACCEL_MM_S2 = 30_000.0
-"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
+"""A move that feeds more filament than the first, and per mm of its way more than the second, is
+one of the extruder: X and Y creep, and would be cut into thousands of segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +92,8 @@ class Splitter:
     def __init__(
         self, machine: Machine, *, longest_s: float = 60.0, compensate: bool = True
     ) -> None:
-        self._firmware: Klipper = machine.firmware
+        self._machine = machine
+        self._kit = kit(machine)
         self._longest_s = longest_s
         self._compensate = compensate
         self._moves: Moves | None = None
@@ -120,7 +120,7 @@ class Splitter:
         self._tables = (block.limits, block.modal)
         moves, events = block.moves, block.events
         local = _shifted(events, -block.first_move)
-        raw = self._raw_moves(moves, local)
+        raw = self._raw_moves(block, local)
         if self._moves is None or self._events is None:
             self._moves, self._events, self._raw = moves, local, raw
             self._text, self._text_offset = block.text, block.text_offset
@@ -134,35 +134,37 @@ class Splitter:
         self._text += block.text[held - block.text_offset :]
 
     def _barriers(self, events: Events) -> NDArray[np.bool_]:
-        """Mark the lines that end a piece: stops, and a G92 of more than E."""
+        """Mark lines that end a piece: stops, G92 of more than E, other limits of a stream."""
         found = events.kind >= EventKind.STOP
-        for k in np.flatnonzero(events.kind == EventKind.MODE):
-            first = int(events.byte_start[k]) - self._text_offset
-            line = self._text[first : int(events.byte_end[k]) - self._text_offset].upper()
-            if b"G92" in line:
-                code = line.split(b";", 1)[0]
-                found[k] |= any(axis in code for axis in (b"X", b"Y", b"Z")) or b"E" not in code
+        stream_limits, limits = self._kit.stream_limits, self._tables[0]
+        before = self._limits_id
+        rows = np.flatnonzero(events.kind == EventKind.LIMITS)
+        for k, after in zip(rows.tolist(), events.limits_id[rows].tolist(), strict=True):
+            if after != before and stream_limits(limits[after]) != stream_limits(limits[before]):
+                found[k] = True
+            before = after
+        rows = np.flatnonzero(events.kind == EventKind.MODE)
+        firsts = (events.byte_start[rows] - self._text_offset).tolist()
+        ends = (events.byte_end[rows] - self._text_offset).tolist()
+        for k, first, end in zip(rows.tolist(), firsts, ends, strict=True):
+            if _shifts_origin(self._text[first:end]):
+                found[k] = True
         return found
 
-    def _raw_moves(self, moves: Moves, events: Events) -> NDArray[np.bool_]:
+    def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
         """Mark the moves of X or Y that must keep their lines."""
+        moves = block.moves
         travel = moves.end_mm - moves.start_mm
         xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
-        raw = xy & (((moves.known & 3) != 3) | ((moves.known & KEPT) != 0))
+        # Our lines name places; where Z is not known, a line that moves it cannot be one of them.
+        needed = np.where(travel[:, 2] != 0.0, 7, 3)
+        raw = xy & (((moves.known & needed) != needed) | ((moves.known & KEPT) != 0))
+        raw |= xy & _finds_height(block)
+        raw |= xy & self._kit.too_steep(travel)
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
-        climb = np.abs(travel[:, 2])
-        steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * self._firmware.planner.max_z_accel_mm_s2
-        raw |= xy & steep
-        path = np.where(length > 0.0, length, np.abs(travel[:, 3]))
-        lasts_s = path / moves.speed_mm_s
-        if np.any(lasts_s > LONGEST_MOVE_S):
-            row = int(np.argmax(lasts_s))
-            raise GcodeError(
-                f"the move takes {lasts_s[row] / 3600.0:.1f} h at {moves.speed_mm_s[row]:g} mm/s, "
-                f"more than {LONGEST_MOVE_S / 3600.0:g} h; check its F",
-                line=int(moves.line[row]),
-            )
-        raw |= xy & (lasts_s > self._longest_s)
+        raw |= xy & (length > self._longest_s * moves.speed_mm_s)
+        feed = np.abs(travel[:, 3])
+        raw |= xy & (feed > WILD_FEED_MM) & (feed > WILD_RATIO * length)
         # Behind an object mark the firmware may jump: that travel runs as the slicer wrote it.
         marks = events.move_index[events.kind == EventKind.OBJECT]
         if self._after_mark:
@@ -200,10 +202,16 @@ class Splitter:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
             limits = self._tables[0]
-            phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
-            if len(phases) != last:
+            phases = plan_moves(_rows(moves, slice(0, last)), limits, self._machine)
+            if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
                 # A move of no length has no plan; leave its neighbourhood as it is.
                 self._raw[:last] |= xy[:last]
+                continue
+            slow = phases.accel_s + phases.cruise_s + phases.decel_s > self._longest_s
+            if np.any(slow & xy[:last]):
+                # Slower under the limits in force than their F says.
+                lines = moves.line[:last]
+                self._raw[:last] |= xy[:last] & np.isin(lines, lines[slow])
                 continue
             total = _end_s(phases)
             if total <= self._longest_s:
@@ -212,10 +220,10 @@ class Splitter:
                 yield self._piece(last, phases)
                 continue
             last, natural = _place_to_cut(moves, phases, self._longest_s)
-            if natural:
+            if natural and self._kit.extruder_alone_stops:
                 phases = _rows(phases, slice(0, last))
             else:
-                phases = plan_moves(_rows(moves, slice(0, last)), limits, self._firmware)
+                phases = plan_moves(_rows(moves, slice(0, last)), limits, self._machine)
             yield self._piece(last, phases)
 
     def _piece(self, last: int, phases: Phases) -> Piece:
@@ -261,6 +269,30 @@ class Splitter:
             self._moves = _rows(moves, slice(m, None))
             self._events = _shifted(_rows(events, slice(e, None)), -m)
         return taken
+
+
+@lru_cache(maxsize=64)
+def _shifts_origin(line: bytes) -> bool:
+    """Whether a line is a G92 of more than E; files repeat such lines thousands of times."""
+    line = line.upper()
+    if b"G92" not in line:
+        return False
+    code = line.split(b";", 1)[0]
+    return any(axis in code for axis in (b"X", b"Y", b"Z")) or b"E" not in code
+
+
+def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
+    """Mark moves whose lines name Z where it is only guessed: they may well climb."""
+    moves = block.moves
+    known = (moves.known & 4) != 0
+    found = ~known & np.append(known[1:], False)
+    if len(known) and not known[-1]:
+        first, end = (
+            moves.byte_start[-1] - block.text_offset,
+            moves.byte_end[-1] - block.text_offset,
+        )
+        found[-1] = b"Z" in block.text[first:end].split(b";", 1)[0].upper()
+    return np.asarray(found)
 
 
 def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, bool]:

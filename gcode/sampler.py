@@ -7,6 +7,7 @@ one unbroken uniform grid, standing still through dwells and stops.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from gcode.types import Phases
 
 __all__ = ["Sampler", "Samples", "sample_phases"]
 
+_MOST = 1 << 17  # samples at once: a dwell may last for hours
 _NO_TIMES: NDArray[np.float64] = np.empty(0)
 
 
@@ -32,15 +34,29 @@ class Samples:
     e_mm : ndarray, shape (n,)
     move_index : ndarray of int64, shape (n,)
         The move in force, or the last one before a stand.
+    moving : ndarray of bool, shape (n,)
+        That move has not ended.
     """
 
     t_s: NDArray[np.float64]
     xyz_mm: NDArray[np.float64]
     e_mm: NDArray[np.float64]
     move_index: NDArray[np.int64]
+    moving: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.t_s)
+
+    def part(self, start: int, stop: int) -> Samples:
+        """Return the samples start..stop - 1."""
+        rows = slice(start, stop)
+        return Samples(
+            self.t_s[rows],
+            self.xyz_mm[:, rows],
+            self.e_mm[rows],
+            self.move_index[rows],
+            self.moving[rows],
+        )
 
 
 def sample_phases(
@@ -96,27 +112,28 @@ class Sampler:
         self._next = 0
         self._last: Phases | None = None
 
-    def push(self, phases: Phases) -> Samples:
-        """Take the next phases; return the samples up to the end of the last of them."""
-        if len(phases) == 0:
-            return _no_samples()
-        known = phases if self._last is None else _join(self._last, phases)
-        self._last = _tail(phases)
-        # A sample that falls on the end belongs to what comes next.
-        return self._sample(known, math.ceil(_end_s(phases) / self.dt_s))
+    def push(self, phases: Phases) -> Iterator[Samples]:
+        """Take the next phases; yield the samples up to the end of the last of them."""
+        if len(phases):
+            known = phases if self._last is None else _join(self._last, phases)
+            self._last = _tail(phases)
+            # A sample that falls on the end belongs to what comes next.
+            yield from self._sample(known, math.ceil(_end_s(phases) / self.dt_s))
 
-    def flush(self) -> Samples:
-        """Return the rest: the last sample stands at the end of the last phase."""
-        if self._last is None:
-            return _no_samples()
-        return self._sample(self._last, math.ceil(_end_s(self._last) / self.dt_s) + 1)
+    def flush(self) -> Iterator[Samples]:
+        """Yield the rest: the last sample stands at the end of the last phase."""
+        if self._last is not None:
+            yield from self._sample(self._last, math.ceil(_end_s(self._last) / self.dt_s) + 1)
 
-    def _sample(self, phases: Phases, stop: int) -> Samples:
-        n = max(stop - self._next, 0)
-        position, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, n)
-        t_s = np.arange(self._next, self._next + n, dtype=np.float64) * self.dt_s
-        self._next += n
-        return Samples(t_s, position[:3], position[3], phases.move_index[row])
+    def _sample(self, phases: Phases, stop: int) -> Iterator[Samples]:
+        end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+        while self._next < stop:
+            n = min(stop - self._next, _MOST)
+            position, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, n)
+            t_s = np.arange(self._next, self._next + n, dtype=np.float64) * self.dt_s
+            self._next += n
+            moving = t_s <= end_s[row]
+            yield Samples(t_s, position[:3], position[3], phases.move_index[row], moving)
 
 
 def _sweep(
@@ -138,6 +155,7 @@ def _sweep(
         phases.start_mm_s,
         phases.cruise_mm_s,
         phases.accel_mm_s2,
+        phases.s_curve,
         position,
         row,
     )
@@ -160,7 +178,3 @@ def _join(first: Phases, second: Phases) -> Phases:
             for name in Phases.__dataclass_fields__
         )
     )
-
-
-def _no_samples() -> Samples:
-    return Samples(np.empty(0), np.empty((3, 0)), np.empty(0), np.empty(0, np.int64))

@@ -76,7 +76,8 @@ class ErrorFilter:
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
         forms = [modal_form(plant) for plant in plants]
-        rows = [np.zeros((0, 4)) if form is None else form for form in forms]
+        # Without the rows of zeros that fill up a modal form.
+        rows = [np.zeros((0, 4)) if f is None else f[np.any(f != 0.0, axis=1)] for f in forms]
         order, axes = max(1, *(len(form) for form in rows)), len(plants)
         self.pole = np.zeros((axes, order), complex)
         self.weight = np.zeros((axes, order), complex)
@@ -156,6 +157,8 @@ def fit_segments(
         Samples nearer than this to the start of a stretch are not ends of segments.
     """
     dt = timeline.dt_s
+    # A vertex on a coarse grid (a motor's whole steps) lies up to half of it beside its place.
+    slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
     capacity = command_mm.shape[1] + len(timeline.groups)
     end_s, end_mm = np.empty(capacity), np.empty((4, capacity))
     groups = np.empty(capacity, dtype=np.int64)
@@ -179,8 +182,8 @@ def fit_segments(
         n = fit_stretch(
             command_mm,
             direction,
-            ALONG_SHARE * error_filter.share * tolerance_mm,
-            error_filter.share * across_tolerance_mm(tolerance_mm),
+            ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
+            error_filter.share * across_tolerance_mm(tolerance_mm) + slack_mm,
             LOOSE_MM,
             Z_TOLERANCE_MM,
             E_TOLERANCE_MM,

@@ -50,7 +50,7 @@ class Timeline:
     moving : ndarray of bool, shape (n,)
         X or Y moves at the sample.
     rests : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples in which u(i) = u(i - 1) must hold.
+        Ranges [a, b) of samples in which u(i) = u(i - 1) must hold; the path stands at a - 1.
     groups : list of Group
     start_s, end_s : ndarray, shape (len(groups),)
         When each group starts and ends; a stretch is padded to the grid at its end.

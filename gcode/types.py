@@ -6,8 +6,10 @@ thousand rows. Byte offsets count from the start of the file, line numbers from 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +43,20 @@ class EventKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Planner limits that G-code can change (Klipper: SET_VELOCITY_LIMIT, M204)."""
+    """Planner limits that G-code can change, in force for a move.
 
-    velocity_mm_s: float
-    accel_mm_s2: float
-    square_corner_velocity_mm_s: float
-    minimum_cruise_ratio: float
+    Every firmware has its own in `gcode/firmware/*/limits.py`: a frozen dataclass of floats. The
+    interpreter keeps them as rows of a table; a row and the limits are the same numbers in order.
+    """
+
+    def as_row(self) -> tuple[float, ...]:
+        """Return the fields in order."""
+        return tuple(getattr(self, field.name) for field in fields(self))
+
+    @classmethod
+    def from_row(cls, row: Iterable[float]) -> Self:
+        """Return the limits whose fields are these numbers."""
+        return cast(Callable[..., Self], cls)(*row)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +92,8 @@ class Moves:
         Source line; `byte_end` is one past its newline. An arc's pieces share one line.
     layer, feature, object_id : ndarray of int32, shape (n,)
         -1 where unknown.
+    tool : ndarray of int32, shape (n,)
+        Number of the tool that the file chose last; 0 before any.
     """
 
     start_mm: NDArray[np.float64]
@@ -96,6 +108,7 @@ class Moves:
     layer: NDArray[np.int32]
     feature: NDArray[np.int32]
     object_id: NDArray[np.int32]
+    tool: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.line)
@@ -152,6 +165,9 @@ class ProgramBlock:
 class Phases:
     """Planned moves: each an acceleration, a cruise and a deceleration along a straight line.
 
+    A move that the firmware swallows because it is too short has no duration; the next one starts
+    where the machine really is.
+
     Attributes
     ----------
     t_s : ndarray, shape (n,)
@@ -165,6 +181,9 @@ class Phases:
     accel_mm_s2 : ndarray, shape (n,)
     move_index : ndarray of int64, shape (n,)
         Index of the move in the whole file.
+    s_curve : ndarray of bool, shape (n,)
+        The speed changes along a quintic Bezier curve instead of a straight line, in the same
+        time and over the same way (Marlin's S_CURVE_ACCELERATION).
     """
 
     t_s: NDArray[np.float64]
@@ -178,6 +197,7 @@ class Phases:
     end_mm_s: NDArray[np.float64]
     accel_mm_s2: NDArray[np.float64]
     move_index: NDArray[np.int64]
+    s_curve: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.t_s)

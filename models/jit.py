@@ -1,20 +1,78 @@
 """A typed face for numba's decorator, so that kernels stay visible to mypy.
 
-Every kernel of the house is compiled ahead of its first use once per machine type (`cache=True`),
+Every kernel of the house is compiled at its first use once per machine type and kept on disk,
 releases the GIL, and keeps IEEE arithmetic (fastmath stays off: outputs must be reproducible).
+
+What is kept holds the code of the kernels that a kernel calls and the constants of other modules,
+and numba looks at the kernel's own file only. So the stamp that tells whether it is still good
+counts every module of ours that the kernel's module imports, and theirs.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-__all__ = ["kernel"]
+__all__ = ["kernel", "source_digest"]
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+_IMPORT = re.compile(rb"^(?:from|import) +([A-Za-z_][\w.]*)", re.MULTILINE)
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache on disk, with a stamp of all sources that went into the machine code."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        file = Path(function.__code__.co_filename)
+        self._cache_file = IndexDataCacheFile(  # type: ignore[no-untyped-call]
+            cache_path=self._cache_path,
+            filename_base=self._impl.filename_base,
+            source_stamp=(
+                self._impl.locator.get_source_stamp(),
+                source_digest(file, file.parents[function.__module__.count(".")]),
+            ),
+        )
+
+
+@cache
+def source_digest(file: Path, root: Path) -> str:
+    """Return a digest of a module's text and of all modules below `root` that it leads to.
+
+    Parameters
+    ----------
+    file, root : Path
+        The module, and the folder that its packages lie in.
+    """
+    found: dict[Path, bytes] = {}
+    open_ends = [file]
+    while open_ends:
+        path = open_ends.pop()
+        if path not in found:
+            found[path], modules = _text_digest(path)
+            candidates = (root / f"{module.replace('.', '/')}.py" for module in modules)
+            open_ends += [candidate for candidate in candidates if candidate.is_file()]
+    total = hashlib.sha256()
+    for path in sorted(found):
+        total.update(found[path])
+    return total.hexdigest()
+
+
+@cache
+def _text_digest(path: Path) -> tuple[bytes, tuple[str, ...]]:
+    """Return a digest of a module's text, and the names of the modules that it imports."""
+    text = path.read_bytes()
+    names = tuple(name.decode() for name in dict.fromkeys(_IMPORT.findall(text)))
+    return hashlib.sha256(text).digest(), names
 
 
 @overload
@@ -49,12 +107,13 @@ def kernel(
 
     def compiled(body: Callable[..., Any]) -> Callable[..., Any]:
         decorate = numba.njit(
-            cache=True,
             nogil=True,
             fastmath=False,
             parallel=parallel,
             inline="always" if inline else "never",
         )
-        return cast("Callable[..., Any]", decorate(body))
+        dispatcher: Any = decorate(body)
+        dispatcher._cache = _KernelCache(body)
+        return cast("Callable[..., Any]", dispatcher)
 
     return compiled if function is None else compiled(function)

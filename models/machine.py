@@ -10,9 +10,11 @@ import hashlib
 import json
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from models.errors import ModelError
+from models.firmware import Firmware, Klipper
+from models.firmware.common import Document, Finite, NonNegative, Positive
 from models.plants import PlantSetSpec
 from models.ripple import AxisRipple, MachineRipple, RippleAxis
 from models.schedule import AxisSchedule
@@ -20,24 +22,11 @@ from models.schedule import AxisSchedule
 __all__ = [
     "AxisTravel",
     "CommandLimits",
-    "Extruder",
-    "FirmwareRetraction",
-    "FirmwareShaper",
-    "Klipper",
     "Machine",
-    "PlannerLimits",
 ]
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class AxisTravel(_Document):
+class AxisTravel(Document):
     """Where an axis may go; no emitted coordinate lies outside."""
 
     min_mm: Finite
@@ -50,76 +39,7 @@ class AxisTravel(_Document):
         return self
 
 
-class PlannerLimits(_Document):
-    """The planner limits from printer.cfg ([printer]); the file may change them as it goes."""
-
-    max_velocity_mm_s: Positive = 500.0
-    max_accel_mm_s2: Positive = 5000.0
-    square_corner_velocity_mm_s: NonNegative = 5.0
-    minimum_cruise_ratio: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    max_z_velocity_mm_s: Positive = 20.0
-    max_z_accel_mm_s2: Positive = 200.0
-
-
-class Extruder(_Document):
-    """Extruder facts from printer.cfg ([extruder])."""
-
-    nozzle_diameter_mm: Positive = 0.4
-    filament_diameter_mm: Positive = 1.75
-    instantaneous_corner_velocity_mm_s: NonNegative = 1.0
-    max_extrude_only_velocity_mm_s: Positive = 100.0
-    max_extrude_only_accel_mm_s2: Positive = 5000.0
-    max_extrude_only_distance_mm: Positive = 50.0
-    max_extrude_cross_section_mm2: Positive | None = None
-    """None: Klipper's default, 4 nozzle_diameter^2."""
-
-
-class FirmwareRetraction(_Document):
-    """[firmware_retraction] of printer.cfg, what G10 and G11 do."""
-
-    retract_length_mm: NonNegative = 0.8
-    retract_speed_mm_s: Positive = 35.0
-    unretract_extra_length_mm: NonNegative = 0.0
-    unretract_speed_mm_s: Positive = 35.0
-
-
-class FirmwareShaper(_Document):
-    """The firmware's own input shaper as configured, to be restored after our moves."""
-
-    type_x: str = "mzv"
-    freq_x_hz: NonNegative = 0.0
-    damping_x: NonNegative = 0.1
-    type_y: str = "mzv"
-    freq_y_hz: NonNegative = 0.0
-    damping_y: NonNegative = 0.1
-
-
-class Klipper(_Document):
-    """Facts of a Klipper machine that its G-code cannot tell."""
-
-    kind: Literal["klipper"] = "klipper"
-    planner: PlannerLimits = PlannerLimits()
-    extruder: Extruder = Extruder()
-    arc_resolution_mm: Positive = 1.0
-    arcs: bool = True
-    retraction: FirmwareRetraction | None = FirmwareRetraction()
-    shaper: FirmwareShaper | None = None
-    """None: unknown. It is switched off for our moves and stays off, and the report says so."""
-    harmless_macros: tuple[str, ...] = ()
-    """Configured macros that neither move nor wait, for instance _ON_LAYER_CHANGE."""
-    stopping_macros: tuple[str, ...] = ()
-    """Configured macros that wait but end at the position where they began."""
-    unknown_commands: Literal["unknown", "skip"] = "unknown"
-    """What an upper-case name that no table knows does: leaves the state unknown (it may be a
-    macro), or nothing (the firmware is known to lack it)."""
-    homed_at_start: bool = False
-    """True: X, Y and Z are known (at `home_mm`) before the first line."""
-    home_mm: tuple[Finite, Finite, Finite] | None = None
-    """Where G28 leaves the axes, if the machine says; None: unknown after homing."""
-    max_segments_per_s: Positive = 1000.0
-
-
-class CommandLimits(_Document):
+class CommandLimits(Document):
     """What the compensated command of X and Y may ask of the machine."""
 
     velocity_mm_s: Positive = 500.0
@@ -128,7 +48,7 @@ class CommandLimits(_Document):
     """Largest step of a motor's speed from one straight segment to the next."""
 
 
-class Machine(_Document):
+class Machine(Document):
     """One printer.
 
     Attributes
@@ -151,12 +71,12 @@ class Machine(_Document):
     kinematics: Literal["cartesian", "corexy"]
     travel: dict[Literal["x", "y", "z"], AxisTravel]
     command: CommandLimits = CommandLimits()
-    firmware: Klipper = Klipper()
+    firmware: Firmware = Klipper()
     axes: dict[Literal["x", "y"], PlantSetSpec]
     pressure_advance_s: NonNegative = 0.0
     mesh_slope: NonNegative = 0.0
-    schedules: dict[Literal["x", "y"], AxisSchedule] = {}
-    ripple: dict[RippleAxis, AxisRipple] = {}
+    schedules: dict[Literal["x", "y"], AxisSchedule] = Field(default_factory=dict)
+    ripple: dict[RippleAxis, AxisRipple] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _complete(self) -> Machine:

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from pydantic_core import from_json
 
 from models.errors import ModelError
+from models.firmware import FIRMWARE_KINDS
 from models.machine import Machine
 
 __all__ = [
@@ -89,7 +90,11 @@ def explain(error: ValidationError) -> str:
     complaints = error.errors(include_url=False)
     # An unfitting branch of a union complains too; the deepest complaint is the one meant.
     first = max(complaints, key=lambda c: len(c["loc"]))
-    where = ".".join(str(part) for part in first["loc"]) or "document"
+    place = list(first["loc"])
+    if place[:1] == ["firmware"] and place[1:2] and place[1] in FIRMWARE_KINDS:
+        # The kind chooses the schema and is no part of the document's path.
+        del place[1]
+    where = ".".join(str(part) for part in place) or "document"
     message = first["msg"].removeprefix("Value error, ")
     given = first["input"]
     shown = "" if isinstance(given, (dict, list, tuple)) else f" (given: {given!r:.80})"

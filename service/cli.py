@@ -7,6 +7,7 @@ file, and the input as it was.
 
 from __future__ import annotations
 
+import errno
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -49,6 +50,15 @@ PlateOption = Annotated[
 MachineOption = Annotated[
     str,
     typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
+]
+DialectOption = Annotated[
+    str | None,
+    typer.Option(
+        "--dialect",
+        metavar="NAME",
+        help="How the file is read: klipper, marlin, prusa, bambu or reprapfirmware. [default: "
+        "as the machine's firmware reads it]",
+    ),
 ]
 ReportOption = Annotated[
     Path | None, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
@@ -134,6 +144,11 @@ def compensate(
         typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
     ] = None,
     plate: PlateOption = None,
+    dialect: DialectOption = None,
+    keep_times: Annotated[
+        bool,
+        typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),
+    ] = False,
     report: ReportOption = None,
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
@@ -146,6 +161,8 @@ def compensate(
         "along": along,
         "tolerance_um": tolerance_um,
         "plate": plate,
+        "dialect": dialect,
+        "times": "kept" if keep_times else None,
     }
     options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
@@ -170,19 +187,30 @@ def plan(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="motion.npz")],
     rate: Annotated[float, typer.Option(min=1.0, max=100_000.0, help="Samples per second.")] = 1e3,
     plate: PlateOption = None,
+    dialect: DialectOption = None,
 ) -> None:
     """Write the motion the machine will make. Columns t, x, y, z, e."""
     _check_input(source)
     target = _check_output(output)
     if target == source.resolve():
         raise _Refused("OUT must not be IN: the motion is no G-code")
+    read_as = _options(dialect=dialect).dialect
     found = _machine(machine)
 
-    from service.console import progress_shown
+    from service.console import print_planned, progress_shown
     from service.pipeline.road import plan_file
 
     with progress_shown("stillpath") as progress:
-        plan_file(source, target, found.machine, rate_hz=rate, plate=plate, progress=progress)
+        planned = plan_file(
+            source,
+            target,
+            found.machine,
+            rate_hz=rate,
+            plate=plate,
+            dialect=read_as,
+            progress=progress,
+        )
+    print_planned(planned)
 
 
 @app.command()
@@ -193,17 +221,21 @@ def simulate(
         Path, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
     ],
     plate: PlateOption = None,
+    dialect: DialectOption = None,
 ) -> None:
     """Report how far the nozzle will be from its path. No G-code is written."""
     _check_input(source)
     _check_folder(report)
+    read_as = _options(dialect=dialect).dialect
     found = _machine(machine)
 
     from service.console import print_result, progress_shown
     from service.pipeline.road import simulate_file
 
     with progress_shown("stillpath") as progress:
-        result = simulate_file(source, found.machine, plate=plate, progress=progress)
+        result = simulate_file(
+            source, found.machine, plate=plate, dialect=read_as, progress=progress
+        )
     result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)
@@ -311,11 +343,16 @@ def _check_input(source: Path) -> None:
         raise _Refused(f"{source} is a folder, not a G-code file")
     if not source.exists():
         raise _Refused(f"there is no file {source}")
+    if not source.is_file():
+        # The road reads a file twice, and opening a pipe waits for somebody to write.
+        raise _Refused(f"{source} is a pipe or a device; save it as a file first")
 
 
 def _check_output(target: Path) -> Path:
     if target.is_dir():
         raise _Refused(f"{target} is a folder; name the file to write")
+    if target.exists() and not target.is_file():
+        raise _Refused(f"{target} is a pipe or a device; name a file to write")
     # A link is followed, so that what it points to is replaced and not the link.
     target = target.resolve()
     if not target.parent.is_dir():
@@ -345,7 +382,9 @@ def _is_ours(error: ValueError) -> bool:
 
 def _of_system(error: OSError) -> str:
     place = f"{error.filename}: " if error.filename else ""
-    return f"{place}{error.strerror or error}"
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    remedy = "; make room there, or write to another disk" if full else ""
+    return f"{place}{error.strerror or error}{remedy}"
 
 
 def _fail(message: str, code: int) -> int:

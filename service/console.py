@@ -14,10 +14,11 @@ from rich.table import Table
 from service.interruption import interruptible
 
 if TYPE_CHECKING:
+    from service.pipeline.motion import PlannedTime
     from service.pipeline.progress import Progress
     from service.pipeline.result import Result
 
-__all__ = ["print_result", "progress_shown"]
+__all__ = ["print_planned", "print_result", "progress_shown"]
 
 _PLAIN_EVERY_S = 5.0
 
@@ -66,8 +67,23 @@ def print_result(result: Result, console: Console | None = None) -> None:
             f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
             f"{100 * result.put_back_extruding_share:.2f} % of the extruding time"
         )
+    if result.slicer_time_s is not None:
+        console.print(
+            f"{result.slicer or 'the slicer'} says {result.slicer_time_s:.0f} s for the file as it "
+            "came"
+        )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def print_planned(planned: PlannedTime, console: Console | None = None) -> None:
+    """Print how long a file takes, and what its slicer says."""
+    said = ""
+    if planned.slicer_time_s is not None:
+        said = f"; {planned.slicer or 'the slicer'} says {planned.slicer_time_s:.0f} s"
+    (console or Console(highlight=False)).print(f"print time {planned.time_s:.1f} s{said}")
+    for warning in planned.warnings:
+        sys.stderr.write(f"warning: {warning}\n")
 
 
 def _shown(title: str) -> AbstractContextManager[Callable[[Progress], None]]:

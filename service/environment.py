@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
+import sys
 import tempfile
 from pathlib import Path
 
 __all__ = ["prepare_environment"]
 
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
+"""Parameters of glibc's mallopt (malloc.h)."""
+_KEPT_BYTES, _STEP_BYTES = 256 << 20, 16 << 20
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -16,12 +22,28 @@ def prepare_environment() -> None:
 
     BLAS gets one thread: the matrices are small, and more threads only burn CPU. Numba gets a
     writable folder for compiled kernels where the installed package cannot hold them. Child
-    processes inherit both.
+    processes inherit both. Memory that is freed stays with the process.
     """
+    _keep_freed_memory()
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
     if "NUMBA_CACHE_DIR" not in os.environ and not _package_is_writable():
         os.environ["NUMBA_CACHE_DIR"] = str(_kernel_cache())
+
+
+def _keep_freed_memory() -> None:
+    """Tell the allocator of glibc to reuse what is freed; elsewhere nothing happens.
+
+    Arrays of samples come and go by the megabyte. Given back to the kernel every time, and zeroed
+    by it anew, they cost a tenth of a job's time.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
+        mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+        mallopt(_TOP_PAD, _STEP_BYTES)
 
 
 def _package_is_writable() -> bool:

@@ -9,35 +9,49 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["arc_length", "contour_distances", "group_sums", "residual_sums"]
+__all__ = ["BOX", "contour_distances", "group_sums", "motion_sums", "path_tables"]
 
 Array = NDArray[np.float64]
-_MARGIN_MM = 1e-9
-"""Arc lengths are sums with rounding errors; jumps stay shorter by this much."""
+
+BOX = 16
+"""Segments of the path that share a box."""
 
 
 @kernel
-def arc_length(path: Array, s: Array) -> None:
-    """Fill `s` with the length of the polyline `path`, shape (2, n), from its first vertex."""
-    total = 0.0
-    for j in range(path.shape[1]):
-        if j > 0:
-            total += math.hypot(path[0, j] - path[0, j - 1], path[1, j] - path[1, j - 1])
-        s[j] = total
+def path_tables(path: Array, inverse: Array, boxes: Array) -> None:
+    """Prepare the polyline `path`, shape (2, n), for many distances.
+
+    Parameters
+    ----------
+    inverse : ndarray, shape (n - 1,)
+        Becomes 1 / length^2 of every segment, 0 for one of no length.
+    boxes : ndarray, shape (ceil((n - 1) / BOX), 4)
+        Becomes lowest x, highest x, lowest y, highest y of `BOX` segments each.
+    """
+    segments = path.shape[1] - 1
+    for j in range(segments):
+        dx, dy = path[0, j + 1] - path[0, j], path[1, j + 1] - path[1, j]
+        size = dx * dx + dy * dy
+        inverse[j] = 1.0 / size if size > 0.0 else 0.0
+    for b in range(len(boxes)):
+        x, y = path[0, b * BOX], path[1, b * BOX]
+        left, right, below, above = x, x, y, y
+        for j in range(b * BOX + 1, min(segments, (b + 1) * BOX) + 1):
+            x, y = path[0, j], path[1, j]
+            left, right = min(left, x), max(right, x)
+            below, above = min(below, y), max(above, y)
+        boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3] = left, right, below, above
 
 
-@kernel
-def _segment_squared(path: Array, j: int, px: float, py: float) -> float:
+@kernel(inline=True)
+def _segment_squared(path: Array, inverse: Array, j: int, px: float, py: float) -> float:
     """Squared distance from a point to the segment between the vertices j and j + 1."""
     ax, ay = path[0, j], path[1, j]
     dx, dy = path[0, j + 1] - ax, path[1, j + 1] - ay
     ex, ey = px - ax, py - ay
-    size = dx * dx + dy * dy
-    if size > 0.0:
-        along = (ex * dx + ey * dy) / size
-        along = min(1.0, max(0.0, along))
-        ex -= along * dx
-        ey -= along * dy
+    along = min(1.0, max(0.0, (ex * dx + ey * dy) * inverse[j]))
+    ex -= along * dx
+    ey -= along * dy
     squared: float = ex * ex + ey * ey
     return squared
 
@@ -45,7 +59,8 @@ def _segment_squared(path: Array, j: int, px: float, py: float) -> float:
 @kernel
 def contour_distances(
     path: Array,
-    s: Array,
+    inverse: Array,
+    boxes: Array,
     points: Array,
     centres: NDArray[np.int64],
     window: int,
@@ -54,11 +69,8 @@ def contour_distances(
     """Distance of points to the stretch of the path that is near them in time.
 
     Point i belongs to the vertex `centres[i]` of the path; its distance is taken to the segments
-    between the vertices up to `window` before and after.
-
-    From a vertex at distance D the path must be at least D - best long before it can come
-    nearer than `best`, so the search leaps to the segment in which that length runs out.
-    Going straight, D grows with the length, and the leaps double.
+    between the vertices up to `window` before and after. A guess, the lag of the point before, is
+    nearly always right; boxes of segments that are all further away are passed over.
 
     Returns
     -------
@@ -73,59 +85,24 @@ def contour_distances(
         centre = centres[i]
         low = max(0, centre - window)
         high = min(n - 1, centre + window)
-        # The lag of the point before is nearly always right.
-        start = min(max(centre + lag, low), max(high - 1, low))
         if high == low:
             out[i] = math.hypot(px - path[0, low], py - path[1, low])
             continue
-        best2 = _segment_squared(path, start, px, py)
-        best = math.sqrt(best2)
-        best_at = start
+        best_at = min(max(centre + lag, low), high - 1)
+        best2 = _segment_squared(path, inverse, best_at, px, py)
         looked += 1
-        j = start + 1
-        while j < high:
-            ex, ey = px - path[0, j], py - path[1, j]
-            reach = math.sqrt(ex * ex + ey * ey) - best - _MARGIN_MM
-            # The segment j..j+1 when nothing may be skipped, else the one where `reach` ends.
-            if reach > 0.0:
-                goal = s[j] + reach
-                if s[high] <= goal:
-                    break
-                step = 1
-                while j + step < high and s[j + step] <= goal:
-                    j += step
-                    step *= 2
-                while step > 0:
-                    if j + step < high and s[j + step] <= goal:
-                        j += step
-                    step //= 2
-            found2 = _segment_squared(path, j, px, py)
-            looked += 1
-            if found2 < best2:
-                best2, best, best_at = found2, math.sqrt(found2), j
-            j += 1
-        j = start
-        while j > low:
-            ex, ey = px - path[0, j], py - path[1, j]
-            reach = math.sqrt(ex * ex + ey * ey) - best - _MARGIN_MM
-            if reach > 0.0:
-                goal = s[j] - reach
-                if s[low] >= goal:
-                    break
-                step = 1
-                while j - step > low and s[j - step] >= goal:
-                    j -= step
-                    step *= 2
-                while step > 0:
-                    if j - step > low and s[j - step] >= goal:
-                        j -= step
-                    step //= 2
-            found2 = _segment_squared(path, j - 1, px, py)
-            looked += 1
-            if found2 < best2:
-                best2, best, best_at = found2, math.sqrt(found2), j - 1
-            j -= 1
-        out[i] = best
+        for b in range(low // BOX, (high - 1) // BOX + 1):
+            ex = max(boxes[b, 0] - px, px - boxes[b, 1], 0.0)
+            ey = max(boxes[b, 2] - py, py - boxes[b, 3], 0.0)
+            if ex * ex + ey * ey >= best2:
+                continue
+            first, last = max(low, b * BOX), min(high, (b + 1) * BOX)
+            looked += last - first
+            for j in range(first, last):
+                found2 = _segment_squared(path, inverse, j, px, py)
+                if found2 < best2:
+                    best2, best_at = found2, j
+        out[i] = math.sqrt(best2)
         lag = best_at - centre
     return looked
 
@@ -140,49 +117,83 @@ def group_sums(
     largest: Array,
     counts: NDArray[np.int64],
 ) -> None:
-    """Add squares, maxima and counts of the used values to row `group - lowest`."""
-    for k in range(len(values)):
+    """Add squares, maxima and counts of the used values to row `group - lowest`.
+
+    `values`, `squares` and `largest` have one row per channel.
+    """
+    for k in range(len(groups)):
         if use[k]:
             row = groups[k] - lowest
-            value = values[k]
-            squares[row] += value * value
             counts[row] += 1
-            if value > largest[row]:
-                largest[row] = value
+            for c in range(len(values)):
+                value = values[c, k]
+                squares[c, row] += value * value
+                largest[c, row] = max(largest[c, row], value)
 
 
 @kernel
-def residual_sums(
-    path: Array, points: Array, state: Array, still_mm: float, shortest: int, window: int
+def motion_sums(
+    path: Array,
+    points: Array,
+    extruding: NDArray[np.bool_],
+    still_mm: float,
+    shortest: int,
+    window: int,
+    rest: Array,
+    sums: Array,
 ) -> None:
-    """Add up the deviation in the first `window` samples of every rest.
+    """Add up the distances of points to the path's point of the same instant.
 
-    A rest counts once `shortest` samples stood still after a motion. `state` is carried on:
-    last x, y of the path, still samples (-1 before the first motion), pending square sum,
-    count and maximum, settled square sum, count and maximum, and number of rests.
+    Parameters
+    ----------
+    path, points : ndarray, shapes (2, n) and (channels, 2, n)
+    still_mm : float
+        Steps of an axis up to this are no motion.
+    shortest, window : int
+        A rest counts once `shortest` samples stood still after a motion, with its first `window`.
+    rest : ndarray, shape (6,)
+        Carried on: last x, y of the path, still samples (-1 before the first motion), samples of
+        the rest that wait, samples that count, rests that count.
+    sums : ndarray, shape (channels, 8)
+        Carried on, squares: sum and maximum of all, of extruding, of the rest that waits, and of
+        rests that count.
     """
+    still = rest[2]
     for k in range(path.shape[1]):
         x, y = path[0, k], path[1, k]
-        if math.isnan(state[0]):
-            state[0], state[1] = x, y
-        moved = abs(x - state[0]) > still_mm or abs(y - state[1]) > still_mm
-        state[0], state[1] = x, y
+        if math.isnan(rest[0]):
+            rest[0], rest[1] = x, y
+        moved = abs(x - rest[0]) > still_mm or abs(y - rest[1]) > still_mm
+        rest[0], rest[1] = x, y
         if moved:
             # The sample at which the path arrives is the first of the rest.
-            state[2] = 0.0
-            state[3] = state[4] = state[5] = 0.0
-        elif state[2] >= 0.0:
-            state[2] += 1.0
-        if state[2] < 0.0 or state[2] >= window:
-            continue
-        error = math.hypot(points[0, k] - x, points[1, k] - y)
-        state[3] += error * error
-        state[4] += 1.0
-        state[5] = max(state[5], error)
-        if state[2] >= shortest:
-            if state[2] == shortest:
-                state[9] += 1.0
-            state[6] += state[3]
-            state[7] += state[4]
-            state[8] = max(state[8], state[5])
-            state[3] = state[4] = state[5] = 0.0
+            still = 0.0
+            rest[3] = 0.0
+        elif still >= 0.0:
+            still += 1.0
+        rests = 0.0 <= still < window
+        settled = rests and still >= shortest
+        if rests:
+            rest[3] += 1.0
+        if settled:
+            rest[4] += rest[3]
+            rest[3] = 0.0
+            rest[5] += 1.0 if still == shortest else 0.0
+        for c in range(len(points)):
+            ex, ey = points[c, 0, k] - x, points[c, 1, k] - y
+            squared = ex * ex + ey * ey
+            sums[c, 0] += squared
+            sums[c, 1] = max(sums[c, 1], squared)
+            if extruding[k]:
+                sums[c, 2] += squared
+                sums[c, 3] = max(sums[c, 3], squared)
+            if moved:
+                sums[c, 4] = sums[c, 5] = 0.0
+            if rests:
+                sums[c, 4] += squared
+                sums[c, 5] = max(sums[c, 5], squared)
+            if settled:
+                sums[c, 6] += sums[c, 4]
+                sums[c, 7] = max(sums[c, 7], sums[c, 5])
+                sums[c, 4] = sums[c, 5] = 0.0
+    rest[2] = still

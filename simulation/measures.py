@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulation._contour_kernels import (
-    arc_length,
+    BOX,
     contour_distances,
     group_sums,
-    residual_sums,
+    motion_sums,
+    path_tables,
 )
 
 __all__ = [
@@ -24,7 +25,6 @@ __all__ = [
     "ContourMeter",
     "GroupTally",
     "MotionMeter",
-    "ResidualMeter",
     "Tally",
     "contour_error",
     "distance_to_path",
@@ -34,6 +34,10 @@ __all__ = [
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
+
+_RESIDUAL_S = 0.1
+_SHORTEST_REST_S = 0.02
+_STILL_MM = 1e-9
 
 
 @dataclass(slots=True)
@@ -60,16 +64,21 @@ class Tally:
 
 @dataclass(slots=True)
 class GroupTally:
-    """A `Tally` for each integer id (layer, feature)."""
+    """Tallies of several channels for each integer id (layer, feature)."""
 
+    channels: int
     lowest: int = 0
-    square_sum: Array = field(default_factory=lambda: np.zeros(0))
-    max: Array = field(default_factory=lambda: np.zeros(0))
     count: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    square_sum: Array = field(init=False)
+    max: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.square_sum = np.zeros((self.channels, 0))
+        self.max = np.zeros((self.channels, 0))
 
     def add(self, values: Array, groups: Ints, use: Mask) -> None:
-        """Add the values where `use` is true to their group."""
-        if len(values) == 0:
+        """Add the values, shape (channels, n), where `use` is true to their group."""
+        if len(groups) == 0:
             return
         self._cover(int(groups.min()), int(groups.max()))
         group_sums(
@@ -82,12 +91,11 @@ class GroupTally:
             self.count,
         )
 
-    def tallies(self) -> dict[int, Tally]:
-        """Return id to tally, for the ids that have values, rising."""
+    def tallies(self, channel: int = 0) -> dict[int, Tally]:
+        """Return id to tally of a channel, for the ids that have values, rising."""
+        squares, largest = self.square_sum[channel], self.max[channel]
         return {
-            self.lowest + int(i): Tally(
-                float(self.square_sum[i]), float(self.max[i]), int(self.count[i])
-            )
+            self.lowest + int(i): Tally(float(squares[i]), float(largest[i]), int(self.count[i]))
             for i in np.flatnonzero(self.count)
         }
 
@@ -98,31 +106,37 @@ class GroupTally:
         after = max(high - (self.lowest + len(self.count) - 1), 0)
         if before or after:
             self.lowest -= before
-            self.square_sum = np.pad(self.square_sum, (before, after))
-            self.max = np.pad(self.max, (before, after))
             self.count = np.pad(self.count, (before, after))
+            self.square_sum = np.pad(self.square_sum, ((0, 0), (before, after)))
+            self.max = np.pad(self.max, ((0, 0), (before, after)))
 
 
 @dataclass(frozen=True, slots=True)
 class ContourErrors:
-    """Errors of the samples first, first + stride, ... of the whole motion."""
+    """Errors of the samples first, first + stride, ... of the whole motion.
+
+    Attributes
+    ----------
+    first, stride : int
+    error_mm : ndarray, shape (channels, m)
+    """
 
     first: int
     stride: int
     error_mm: Array
 
     def __len__(self) -> int:
-        """Return the number of errors."""
-        return len(self.error_mm)
+        """Return the number of samples."""
+        return int(self.error_mm.shape[1])
 
     @property
     def index(self) -> NDArray[np.int64]:
         """Sample numbers that the errors belong to."""
-        return self.first + self.stride * np.arange(len(self.error_mm), dtype=np.int64)
+        return self.first + self.stride * np.arange(len(self), dtype=np.int64)
 
 
 class ContourMeter:
-    """Contour error of a motion that arrives in blocks.
+    """Contour errors of motions beside one path that arrive in blocks.
 
     Parameters
     ----------
@@ -132,6 +146,8 @@ class ContourMeter:
         The path counts this long before and after a point's instant; less at start and end.
     stride : int
         Every which sample is measured (0, stride, 2 stride, ...); the path keeps all samples.
+    channels : int
+        Number of motions.
 
     Attributes
     ----------
@@ -139,24 +155,31 @@ class ContourMeter:
         Point-to-segment distances worked out so far.
     """
 
-    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2) -> None:
+    def __init__(
+        self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2, channels: int = 1
+    ) -> None:
         self._window = round(window_s / dt_s)
         self._stride = stride
         self._path = np.zeros((2, 0))
-        self._points = np.zeros((2, 0))
         self._path_from = 0
+        # Only the samples that are measured, from number `_next` on.
+        self._points = np.zeros((channels, 2, 0))
         self._next = 0
         self.evaluations = 0
 
     def push(self, y_d_mm: Array, y_mm: Array) -> ContourErrors:
-        """Add a block of planned and executed positions, both of shape (2, n).
+        """Add a block of planned and executed positions, shapes (2, n) and (channels, 2, n).
 
         Returns the errors of the samples whose window has become complete.
         """
-        if y_d_mm.shape != y_mm.shape or len(y_d_mm) != 2:
-            raise ValueError(f"planned {y_d_mm.shape} and executed {y_mm.shape} must be (2, n)")
-        self._path = np.hstack([self._path, y_d_mm])
-        self._points = np.hstack([self._points, y_mm])
+        if y_mm.shape != (len(self._points), *y_d_mm.shape) or len(y_d_mm) != 2:
+            raise ValueError(
+                f"planned {y_d_mm.shape} and executed {y_mm.shape} must be (2, n) and "
+                f"({len(self._points)}, 2, n)"
+            )
+        due = -(self._path_from + self._path.shape[1]) % self._stride
+        self._path = np.concatenate([self._path, y_d_mm], axis=1)
+        self._points = np.concatenate([self._points, y_mm[:, :, due :: self._stride]], axis=2)
         return self._measure(self._path_from + self._path.shape[1] - self._window)
 
     def flush(self) -> ContourErrors:
@@ -167,127 +190,115 @@ class ContourMeter:
         """Errors of the due samples before `stop`; forget what no later sample needs."""
         first = self._next
         count = max(0, -(-(stop - first) // self._stride))
-        errors = np.empty(count)
+        errors = np.empty((len(self._points), count))
         if count:
             self._next = first + count * self._stride
-            offset = first - self._path_from
-            end = offset + (count - 1) * self._stride + 1
-            length = np.empty(self._path.shape[1])
-            arc_length(self._path, length)
-            self.evaluations += contour_distances(
-                self._path,
-                length,
-                np.ascontiguousarray(self._points[:, offset : end : self._stride]),
-                offset + self._stride * np.arange(count, dtype=np.int64),
-                self._window,
-                errors,
-            )
+            centres = first - self._path_from + self._stride * np.arange(count, dtype=np.int64)
+            tables = _path_tables(self._path)
+            for points, error in zip(self._points, errors, strict=True):
+                self.evaluations += contour_distances(
+                    self._path, *tables, points, centres, self._window, error
+                )
+            self._points = self._points[:, :, count:].copy()
             drop = max(0, self._next - self._window - self._path_from)
             drop = min(drop, self._path.shape[1])
             self._path = self._path[:, drop:].copy()
-            self._points = self._points[:, drop:].copy()
             self._path_from += drop
         return ContourErrors(first, self._stride, errors)
 
 
-class ResidualMeter:
-    """Residual vibration: |y - y_d| in the first `window_s` of each rest.
+class MotionMeter:
+    """All measures of motions beside one path, with when something is extruded.
 
-    A rest begins when the planned path stops changing after a motion, and counts if it lasts
-    `shortest_s`; rests shorter than `window_s` count as long as they last.
+    Parameters
+    ----------
+    dt_s, window_s, stride, channels
+        As `ContourMeter` has them.
+
+    Attributes
+    ----------
+    contour_extruding, contour_all : list of Tally
+        Of every channel, in mm, at every `stride`-th sample.
     """
 
-    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.1, shortest_s: float = 0.02) -> None:
-        self._window = max(1, round(window_s / dt_s))
-        self._shortest = min(round(shortest_s / dt_s), self._window - 1)
-        self._state = np.array([np.nan, np.nan, -1.0, 0, 0, 0, 0, 0, 0, 0])
-
-    def push(self, y_d_mm: Array, y_mm: Array) -> None:
-        """Add a block of planned and executed positions, both of shape (2, n)."""
-        residual_sums(
-            np.ascontiguousarray(y_d_mm),
-            np.ascontiguousarray(y_mm),
-            self._state,
-            1e-9,
-            self._shortest,
-            self._window,
-        )
+    def __init__(
+        self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2, channels: int = 1
+    ) -> None:
+        self.contour_extruding = [Tally() for _ in range(channels)]
+        self.contour_all = [Tally() for _ in range(channels)]
+        self._contour = ContourMeter(dt_s, window_s, stride, channels)
+        self._stride = stride
+        self._seen = self._seen_extruding = 0
+        self._extruding = np.zeros(0, bool)
+        self._still_window = max(1, round(_RESIDUAL_S / dt_s))
+        self._shortest = min(round(_SHORTEST_REST_S / dt_s), self._still_window - 1)
+        self._rest = np.array([np.nan, np.nan, -1.0, 0.0, 0.0, 0.0])
+        self._sums = np.zeros((channels, 8))
 
     @property
-    def tally(self) -> Tally:
-        """Deviation [mm] over all rests so far."""
-        return Tally(float(self._state[6]), float(self._state[8]), int(self._state[7]))
+    def tracking_all(self) -> list[Tally]:
+        """Tracking error [mm] of every channel, at every sample."""
+        return self._tallies(0, self._seen)
+
+    @property
+    def tracking_extruding(self) -> list[Tally]:
+        """The same while extruding."""
+        return self._tallies(2, self._seen_extruding)
+
+    @property
+    def residual(self) -> list[Tally]:
+        """Deviation [mm] in the first 0.1 s of each rest, of every channel.
+
+        A rest begins when the planned path stops changing after a motion, and counts if it lasts
+        20 ms; rests shorter than 0.1 s count as long as they last.
+        """
+        return self._tallies(6, int(self._rest[4]))
 
     @property
     def rests(self) -> int:
         """Number of rests so far."""
-        return int(self._state[9])
+        return int(self._rest[5])
 
-
-class MotionMeter:
-    """All measures of one motion, with who is extruding and in which layer and feature.
-
-    Attributes
-    ----------
-    contour_extruding, contour_all, tracking_extruding, tracking_all : Tally
-        In mm; contour error at every `stride`-th sample, tracking error at every sample.
-    layers, features : GroupTally
-        Contour error while extruding, by id.
-    residual : ResidualMeter
-    """
-
-    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2) -> None:
-        self.contour_extruding, self.contour_all = Tally(), Tally()
-        self.tracking_extruding, self.tracking_all = Tally(), Tally()
-        self.layers, self.features = GroupTally(), GroupTally()
-        self.residual = ResidualMeter(dt_s)
-        self._contour = ContourMeter(dt_s, window_s, stride)
-        self._from = 0
-        self._extruding = np.zeros(0, bool)
-        self._layer = np.zeros(0, np.int32)
-        self._feature = np.zeros(0, np.int32)
-
-    def push(
-        self,
-        y_d_mm: Array,
-        y_mm: Array,
-        extruding: Mask,
-        layer: Ints | None = None,
-        feature: Ints | None = None,
-    ) -> ContourErrors:
-        """Add a block: positions (2, n), the rest (n,); layer and feature default to -1.
+    def push(self, y_d_mm: Array, y_mm: Array, extruding: Mask) -> ContourErrors:
+        """Add a block: planned (2, n) and executed positions (channels, 2, n), the rest (n,).
 
         Returns the contour errors that the block completed.
         """
-        unknown = np.full(len(extruding), -1, np.int32)
-        error = tracking_error(y_d_mm, y_mm)
-        self.tracking_all.add(error)
-        self.tracking_extruding.add(error, extruding)
-        self.residual.push(y_d_mm, y_mm)
-        self._extruding = np.concatenate([self._extruding, extruding])
-        self._layer = np.concatenate([self._layer, unknown if layer is None else layer])
-        self._feature = np.concatenate([self._feature, unknown if feature is None else feature])
-        return self._add(self._contour.push(y_d_mm, y_mm))
+        path, points = np.ascontiguousarray(y_d_mm), np.ascontiguousarray(y_mm)
+        due = -self._seen % self._stride
+        errors = self._contour.push(path, points)
+        motion_sums(
+            path,
+            points,
+            np.ascontiguousarray(extruding),
+            _STILL_MM,
+            self._shortest,
+            self._still_window,
+            self._rest,
+            self._sums,
+        )
+        self._seen += len(extruding)
+        self._seen_extruding += int(np.count_nonzero(extruding))
+        self._extruding = np.concatenate([self._extruding, extruding[due :: self._stride]])
+        return self._add(errors)
 
     def flush(self) -> ContourErrors:
         """End the motion: return the contour errors that waited for their window."""
         return self._add(self._contour.flush())
 
     def _add(self, errors: ContourErrors) -> ContourErrors:
-        if len(errors) == 0:
-            return errors
-        at = errors.index - self._from
-        use = self._extruding[at]
-        self.contour_all.add(errors.error_mm)
-        self.contour_extruding.add(errors.error_mm, use)
-        self.layers.add(errors.error_mm, self._layer[at], use)
-        self.features.add(errors.error_mm, self._feature[at], use)
-        done = int(at[-1]) + 1
-        self._from += done
-        self._extruding = self._extruding[done:]
-        self._layer = self._layer[done:]
-        self._feature = self._feature[done:]
+        count = len(errors)
+        use = self._extruding[:count]
+        for c, error in enumerate(errors.error_mm):
+            self.contour_all[c].add(error)
+            self.contour_extruding[c].add(error, use)
+        self._extruding = self._extruding[count:]
         return errors
+
+    def _tallies(self, column: int, count: int) -> list[Tally]:
+        return [
+            Tally(float(row[column]), float(np.sqrt(row[column + 1])), count) for row in self._sums
+        ]
 
 
 def tracking_error(y_d_mm: Array, y_mm: Array) -> Array:
@@ -302,8 +313,8 @@ def contour_error(
 ) -> Array:
     """Return the contour error of samples 0, stride, 2 stride, ... of a whole motion."""
     meter = ContourMeter(dt_s, window_s, stride)
-    first = meter.push(y_d_mm, y_mm)
-    return np.concatenate([first.error_mm, meter.flush().error_mm])
+    first = meter.push(y_d_mm, y_mm[None])
+    return np.concatenate([first.error_mm[0], meter.flush().error_mm[0]])
 
 
 def distance_to_path(
@@ -325,9 +336,15 @@ def distance_to_path(
         Rising; each within the path.
     """
     path = np.ascontiguousarray(path_mm)
-    length = np.empty(path.shape[1])
-    arc_length(path, length)
     out = np.empty(len(index))
     points = np.ascontiguousarray(points_mm)
-    contour_distances(path, length, points, index, round(window_s / dt_s), out)
+    window = round(window_s / dt_s)
+    contour_distances(path, *_path_tables(path), points, index, window, out)
     return out
+
+
+def _path_tables(path: Array) -> tuple[Array, Array]:
+    segments = max(path.shape[1] - 1, 0)
+    inverse, boxes = np.empty(segments), np.empty((-(-segments // BOX), 4))
+    path_tables(path, inverse, boxes)
+    return inverse, boxes

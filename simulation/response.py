@@ -52,6 +52,12 @@ class PlantStream:
             self._axes.append(_Axis(plant, modes, np.zeros(shape)))
         self._origin: Array | None = None
 
+    def stand(self) -> None:
+        """Stand still from here on: the next sample pushed is the first one again."""
+        for axis in self._axes:
+            axis.state[:] = 0.0
+        self._origin = None
+
     def push(self, u_mm: Array) -> Array:
         """Return the positions that answer the command block `u_mm`, shape (axes, n)."""
         u = np.ascontiguousarray(u_mm, dtype=np.float64)

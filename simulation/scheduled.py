@@ -49,6 +49,12 @@ class MachineStream:
         self._streams: list[PlantStream] = []
         self.operate_at(point)
 
+    def stand(self) -> None:
+        """Stand still from here on: the next sample pushed is the first one again."""
+        self._past = self._past[:, :0]
+        for stream in self._streams:
+            stream.stand()
+
     def operate_at(self, point: OperatingPoint) -> None:
         """Go on with the plants of this point, which still vibrate from what was before."""
         level = self._grid.level(point)

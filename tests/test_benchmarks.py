@@ -22,6 +22,7 @@ GEAR = str(ROOT / "examples" / "cura_ender3_gear24.gcode")
         ["ripple.py"],
         ["proof.py", "--machines", "ender3"],
         ["containers.py", GEAR],
+        ["estimates.py", str(ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode")],
         ["papers/feedback.py"],
         ["quality.py", GEAR, "--machines", "voron-v0", "--tolerance-um", "2", "--jobs", "1"],
         ["identification.py", "--file", GEAR, "--machines", "ender3"],

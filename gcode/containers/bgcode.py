@@ -23,6 +23,8 @@ from gcode.containers.compression import Compression, compress, decompress
 from gcode.containers.limits import BLOCK_BYTES, check_unpacked, largest_unpacked
 from gcode.containers.meatpack import Unpacker, pack
 from gcode.errors import GcodeError
+from gcode.slicers.facts import SlicerFacts, facts_in
+from gcode.slicers.retiming import retimed
 
 __all__ = ["BinaryGcode", "Block", "BlockType", "Encoding", "read_blocks"]
 
@@ -91,7 +93,13 @@ class Block:
 class BinaryGcode:
     """What a binary file needs to be written anew around another text.
 
-    Metadata and thumbnails are kept byte for byte, the slicer's print time among them.
+    Metadata and thumbnails are kept byte for byte, but for the slicer's print time if the print
+    takes longer.
+
+    Attributes
+    ----------
+    delay_s : float
+        How much longer the print takes with the new text.
 
     Parameters
     ----------
@@ -110,6 +118,7 @@ class BinaryGcode:
     """
 
     def __init__(self, source: Path, text: BinaryIO, told: Callable[[float], None]) -> None:
+        self.delay_s = 0.0
         self._before: list[Block] = []
         self._after: list[Block] = []
         first: Block | None = None
@@ -141,11 +150,15 @@ class BinaryGcode:
             The text holds a byte that MeatPack cannot carry, or a line of more than 16 MiB.
         """
         target.write(_file_header(checked=self._checked))
-        target.writelines(block.raw for block in self._before)
+        target.writelines(self._renewed(block) for block in self._before)
         for piece in _pieces(text):
             target.write(self._gcode_block(piece))
             told(text.tell())
-        target.writelines(block.raw for block in self._after)
+        target.writelines(self._renewed(block) for block in self._after)
+
+    def facts(self) -> SlicerFacts:
+        """Return what the metadata say about the file."""
+        return facts_in(self._head(), self._tail())
 
     def write_plain(self, text: BinaryIO, target: BinaryIO) -> None:
         """Write plain G-code, with metadata and thumbnails as comments around the text."""
@@ -159,12 +172,33 @@ class BinaryGcode:
 
     def _gcode_block(self, text: bytes) -> bytes:
         data = text if self._encoding is Encoding.ASCII else pack(text)
-        packed = compress(data, self._compression)
-        header = struct.pack("<HHI", BlockType.GCODE, self._compression, len(data))
-        if self._compression is not Compression.NONE:
-            header += struct.pack("<I", len(packed))
-        block = header + struct.pack("<H", self._encoding) + packed
+        return self._block(BlockType.GCODE, self._compression, (self._encoding,), data)
+
+    def _block(
+        self,
+        type: BlockType,  # noqa: A002
+        compression: Compression,
+        parameters: tuple[int, ...],
+        data: bytes,
+    ) -> bytes:
+        packed = compress(data, compression)
+        block = struct.pack("<HHI", type, compression, len(data))
+        if compression is not Compression.NONE:
+            block += struct.pack("<I", len(packed))
+        block += struct.pack(f"<{len(parameters)}H", *parameters) + packed
         return block + struct.pack("<I", zlib.crc32(block)) if self._checked else block
+
+    def _renewed(self, block: Block) -> bytes:
+        """Return the bytes of a block, with the print's new time."""
+        content = self._content(block)
+        if block.type is not BlockType.PRINT_METADATA or content == block.content():
+            return block.raw
+        return self._block(block.type, Compression(block.compression), block.parameters, content)
+
+    def _content(self, block: Block) -> bytes:
+        content = block.content()
+        timed = block.type is BlockType.PRINT_METADATA and self.delay_s != 0.0
+        return retimed(content, self.delay_s) if timed else content
 
     def _head(self) -> bytes:
         facts = dict(self._metadata(BlockType.FILE_METADATA))
@@ -192,7 +226,7 @@ class BinaryGcode:
     def _metadata(self, type: BlockType) -> Iterator[tuple[bytes, bytes]]:  # noqa: A002
         for block in [*self._before, *self._after]:
             if block.type is type:
-                for line in block.content().splitlines():
+                for line in self._content(block).splitlines():
                     key, equals, value = line.partition(b"=")
                     if equals:
                         yield key, value

@@ -18,6 +18,7 @@ from gcode.containers.bgcode import BinaryGcode
 from gcode.containers.sniff import Kind, kind_named, sniff
 from gcode.containers.threemf import ThreeMf
 from gcode.errors import GcodeError
+from gcode.slicers.facts import SlicerFacts, read_facts
 
 __all__ = ["Container", "Told", "open_text", "rewriting"]
 
@@ -44,6 +45,17 @@ class Container:
     source: Path
     text: BinaryIO
     _packed: BinaryGcode | ThreeMf | None
+
+    def facts(self) -> SlicerFacts:
+        """Return what the file says about itself, in its text or around it."""
+        if isinstance(self._packed, BinaryGcode):
+            return self._packed.facts()
+        return read_facts(self.text)
+
+    def delay(self, seconds: float) -> None:
+        """Take note that the print takes longer than the container says it does."""
+        if self._packed is not None:
+            self._packed.delay_s = seconds
 
     def write(self, text: BinaryIO, target: Path, told: Told = lambda _: None) -> None:
         """Write a text in the same kind of container, with the settings and all else of the old.

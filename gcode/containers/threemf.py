@@ -27,6 +27,8 @@ from gcode.errors import GcodeError
 __all__ = ["ThreeMf"]
 
 _PLATE = re.compile(r"Metadata/plate_([1-9]\d{0,3})\.gcode")
+_SLICE_INFO = "Metadata/slice_info.config"
+_LARGEST_INFO_BYTES = 1 << 24
 _COPY_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
 _BROKEN = (
@@ -46,6 +48,11 @@ _BROKEN = (
 
 class ThreeMf:
     """What a package needs to be written anew around another text of one plate.
+
+    Attributes
+    ----------
+    delay_s : float
+        How much longer the plate takes to print with the new text.
 
     Parameters
     ----------
@@ -67,6 +74,7 @@ class ThreeMf:
     def __init__(
         self, source: Path, text: BinaryIO, told: Callable[[float], None], plate: int | None
     ) -> None:
+        self.delay_s = 0.0
         self._source = source
         with _reading(source) as archive:
             _check(archive, largest_unpacked(source))
@@ -91,6 +99,8 @@ class ThreeMf:
                             told(text.tell())
                     elif info.filename == f"{self._name}.md5":
                         member.write(_renewed(archive.read(info), digest))
+                    elif info.filename == _SLICE_INFO and info.file_size < _LARGEST_INFO_BYTES:
+                        member.write(_retimed(archive.read(info), self._name, self.delay_s))
                     else:
                         with archive.open(info) as original:
                             shutil.copyfileobj(original, member, _COPY_BYTES)
@@ -162,6 +172,21 @@ def _chosen(names: list[str], plate: int | None) -> str:
     if plate not in plates:
         raise GcodeError(f"the package holds no sliced plate {plate}; there is {listed}")
     return plates[plate]
+
+
+def _retimed(info: bytes, name: str, delay_s: float) -> bytes:
+    """Return the list of plates with another prediction, in whole seconds, for one of them."""
+    found = _PLATE.fullmatch(name)
+    number = found[1].encode() if found else b""
+    for plate in re.finditer(rb"<plate>.*?</plate>", info, re.DOTALL):
+        if re.search(rb'key="index"\s+value="%s"' % number, plate[0]):
+            told = re.search(rb'key="prediction"\s+value="(\d+)"', plate[0])
+            if told is None:
+                return info
+            start = plate.start() + told.start(1)
+            seconds = max(round(int(told[1]) + delay_s), 0)
+            return info[:start] + b"%d" % seconds + info[start + len(told[1]) :]
+    return info
 
 
 def _md5(text: BinaryIO) -> tuple[str, int]:

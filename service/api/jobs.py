@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import uuid
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -22,6 +22,7 @@ from service.jobs.supervisor import Supervisor
 from service.machines.resolve import PinnedMachine, Resolver
 from service.machines.revision import NotApproved, UnknownMachine
 from service.pipeline.options import DEFAULT_TOLERANCE_UM, BasisName, Options, RobustMode
+from service.pipeline.reading import DialectName
 from service.settings import Settings
 
 __all__ = ["router"]
@@ -108,6 +109,14 @@ async def create_job(
     plate: Annotated[
         int | None, Query(ge=1, description="Which plate of a 3MF package with several.")
     ] = None,
+    times: Annotated[
+        Literal["new", "kept"],
+        Query(description="Whether the slicer's times in the file follow the new motion."),
+    ] = "new",
+    dialect: Annotated[
+        DialectName | None,
+        Query(description="How the file is read; by default as the machine's firmware reads it."),
+    ] = None,
     name: Annotated[
         str, Query(max_length=255, description="File name, for a raw body.")
     ] = "upload.gcode",
@@ -128,6 +137,8 @@ async def create_job(
         along=along,
         tolerance_um=tolerance_um,
         plate=plate,
+        dialect=dialect,
+        times=times,
     )
     job_id = uuid.uuid4().hex
     incoming = store.incoming_dir / job_id

@@ -100,8 +100,14 @@ def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
     Raises
     ------
     ModelError
-        If the configuration lacks what Klipper requires, or holds words for numbers.
+        If the configuration lacks what Klipper requires, or holds words for numbers; if the
+        machine is no Klipper machine.
     """
+    if machine.firmware.kind != "klipper":
+        raise ModelError(
+            f"{machine.name} runs {machine.firmware.kind}; a printer.cfg is Klipper's and says "
+            "nothing of it"
+        )
     document = machine.model_dump(mode="json")
     extruder = document["firmware"]["extruder"]
     if extruder["max_extrude_cross_section_mm2"] is None:

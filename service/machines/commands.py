@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 from models.errors import ModelError
 
 if TYPE_CHECKING:
+    from models.machine import Machine
     from service.machines.resolve import Resolver
     from service.machines.revision import Revision
     from service.machines.settings import MachineSettings
@@ -234,6 +235,36 @@ def put(
     )
 
 
+@app.command("set-firmware")
+def set_firmware(
+    name: Name,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The firmware section, as JSON.")],
+    as_name: Annotated[
+        str | None, typer.Option("--as", metavar="NAME", help="A copy under a free name.")
+    ] = None,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Give a machine another firmware: its next revision, or with --as a copy."""
+    from service.machines.transfer import with_firmware_file
+
+    resolver = open_machines()
+    machine, source = with_firmware_file(resolver.to_look_at(name).machine, file)
+    if as_name is not None:
+        machine = machine.model_copy(update={"name": as_name})
+    revision = resolver.store.add_revision(
+        machine.name,
+        machine,
+        author=who(by),
+        message=message or f"firmware from {file.name}",
+        sources=[source],
+        expected=None if as_name is None else 0,
+    )
+    _told(revision)
+    for line in _refused(machine):
+        typer.echo(line)
+
+
 @app.command()
 def delete(name: Name) -> None:
     """Move a machine with its history to the trash."""
@@ -260,12 +291,14 @@ def check(
 
     resolver = open_machines()
     config = None if printer_cfg is None else read_printer_config(printer_cfg)
+    machine = resolver.to_look_at(name, files=True).machine
     found = check_before_job(
-        resolver.to_look_at(name, files=True).machine,
+        machine,
         datetime.now(UTC),
         max_age_days=resolver.max_age_days,
         config=config,
     )
+    found += _refused(machine)
     notes = [] if config is None else [f"note: {line}" for line in not_followed(config)]
     for line in [*found, *notes]:
         typer.echo(line)
@@ -346,6 +379,14 @@ def _leading(revision: Revision, axis: Any) -> str:
 
 def _told(revision: Revision) -> None:
     typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
+
+
+def _refused(machine: Machine) -> list[str]:
+    """Return a line that says why the machine's firmware cannot execute a compensated file."""
+    from gcode.firmware.registry import kit
+
+    reason = kit(machine).refusal
+    return [] if reason is None else [f"{machine.name} can be simulated, not compensated: {reason}"]
 
 
 def _table(*columns: str) -> Any:

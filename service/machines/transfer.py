@@ -9,11 +9,18 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
 from models.errors import ModelError
+from models.machine import Machine
+from models.provenance import SourceFile
 from models.store import explain, read_machine
-from service.machines.revision import Approval, Revision, document_text, source_file
+from service.machines.revision import (
+    Approval,
+    Revision,
+    document_text,
+    source_file,
+)
 from service.machines.store import MachineStore
 
-__all__ = ["export_history", "import_file"]
+__all__ = ["export_history", "import_file", "with_firmware_file"]
 
 _LARGEST_BYTES = 64_000_000
 
@@ -80,6 +87,28 @@ def import_file(
         sources=[source_file(file.name, content)],
         expected=0,
     )
+
+
+def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFile]:
+    """Return the machine with the firmware section of a JSON file, and that file as a source.
+
+    Raises
+    ------
+    ModelError
+        Naming the first field of the section that is wrong.
+    """
+    content = _content(file)
+    try:
+        section = from_json(content)
+    except ValueError as error:
+        raise ModelError(f"{file}: not JSON ({error})") from None
+    if not isinstance(section, dict) or "kind" not in section:
+        raise ModelError(f"{file}: a firmware section is an object that says its kind")
+    try:
+        changed = Machine.model_validate({**machine.model_dump(mode="json"), "firmware": section})
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}") from None
+    return changed, source_file(file.name, content)
 
 
 def _content(file: Path) -> bytes:

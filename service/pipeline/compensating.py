@@ -11,7 +11,8 @@ from compensation.base import Compensator, DesignError
 from compensation.registry import compensator
 from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
-from gcode.firmware.klipper.encoder import Encoded, KlipperEncoder
+from gcode.firmware.encoding import Encoded
+from gcode.firmware.registry import kit
 from gcode.pieces import Piece
 from gcode.sampler import sample_phases
 from gcode.segments import ErrorFilter, Segments, fit_segments
@@ -31,7 +32,6 @@ DT_S = 1e-3
 
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
-_GRID_MM = 1e-3
 MIN_STEP_MM_S = 5.0
 
 
@@ -83,7 +83,9 @@ class PieceCompensator:
         self._machine = machine
         self._tolerance_mm = 1e-3 * options.tolerance_um
         self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
-        self.encoder = KlipperEncoder(machine)
+        firmware = kit(machine)
+        self.encoder = firmware.encoder()
+        self._step_mm = firmware.step_mm
         self._filter = _error_filter(machine)
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
@@ -161,7 +163,7 @@ class PieceCompensator:
                 tolerance,
                 self._filter,
                 step_mm_s=step_mm_s,
-                grid_mm=_GRID_MM,
+                grid_mm=self.encoder.grid_mm,
             )
             encoded = self.encoder.encode(piece, timeline, segments)
             step = self._speed_step(encoded.phases)
@@ -174,10 +176,21 @@ class PieceCompensator:
         )
 
     def _speed_step(self, phases: Phases) -> float:
-        velocity = phases.direction[:, :2] * phases.cruise_mm_s[:, None]
+        """Largest step of a motor's speed beyond what rounding to whole steps may bring."""
+        speed = phases.cruise_mm_s
+        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        rounding = max(self._step_mm[:2]) / np.maximum(duration, 1e-4)
+        if max(self._step_mm) > 0.0:
+            # Ramps are parts of a step there, and no motor can tell.
+            lifted = phases.accel_s * (speed - phases.start_mm_s)
+            fallen = phases.accel_mm_s2 * phases.decel_s**2
+            speed = speed - 0.5 * (lifted + fallen) / np.maximum(duration, 1e-9)
+        velocity = phases.direction[:, :2] * speed[:, None]
         if self._machine.kinematics == "corexy":
             velocity = velocity @ np.array([[1.0, 1.0], [1.0, -1.0]])
-        return float(np.max(np.abs(np.diff(velocity, axis=0)), initial=0.0))
+            rounding = 2.0 * rounding
+        step = np.maximum(*np.abs(np.diff(velocity.T)))
+        return float(np.max(step - rounding[:-1] - rounding[1:], initial=0.0))
 
     def _check_travel(self, command: NDArray[np.float64]) -> None:
         for i, axis in enumerate(("x", "y")):
@@ -227,11 +240,13 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     n = piece.command_mm.shape[1]
     t = timeline.dt_s * np.arange(n)
     starts = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
-    group = np.clip(np.searchsorted(starts, np.arange(n), "right") - 1, 0, len(starts) - 1)
-    shift = (encoded.group_start_s - timeline.start_s)[group]
+    starts[0] = 0
+    lengths = np.diff(np.append(np.clip(starts, 0, n), n))
+    t += np.repeat(encoded.group_start_s - timeline.start_s, lengths)
     # In a rest, time waits where the stretch behind it begins.
-    until = np.append(encoded.group_start_s[1:], np.inf)[group]
-    moved = np.maximum.accumulate(np.minimum(t + shift, until)) - float(timeline.start_s[0])
+    until = np.append(encoded.group_start_s[1:], np.inf)
+    np.minimum(t, np.repeat(until, lengths), out=t)
+    moved = np.maximum.accumulate(t) - float(timeline.start_s[0])
     position, _ = sample_phases(executed, moved)
     gap = position[:2] - piece.command_mm[:2]
     return np.asarray(np.sqrt(gap[0] ** 2 + gap[1] ** 2))
@@ -257,7 +272,7 @@ def as_executed(
     planned, row = sample_phases(moved, (0.0, dt_s, n))
     position, _ = sample_phases(executed, (-origin, dt_s, n))
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    moving = dt_s * np.arange(n) <= moved.t_s[row] + duration[row]
-    direction = phases.direction[row]
-    xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
-    return planned, position, row, moving & xy & (direction[:, 3] > 0.0)
+    direction = phases.direction
+    feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    until = np.where(feeds, moved.t_s + duration, -np.inf)
+    return planned, position, row, dt_s * np.arange(n) <= until[row]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import tempfile
 from collections.abc import Iterator
@@ -10,22 +11,38 @@ from pathlib import Path
 
 __all__ = ["default_cache_dir", "replacing"]
 
+_NAME_PART = 40
+"""Characters of a name that its temporary file carries on; names have at most 255 bytes."""
+
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """Yield a temporary file beside `target` that takes its place when the block ends well."""
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+    """Yield a temporary file beside `target` that takes its place when the block ends well.
+
+    Raises
+    ------
+    OSError
+        The folder or the disk does not take it; or `target` is a device or a pipe, which must not
+        be replaced by a file.
+    """
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EINVAL, "is no regular file; name one to write", str(target))
+    prefix = f".{target.name[:_NAME_PART]}."
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
         mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
-        temporary.chmod(mode & 0o7777)
-        with temporary.open("rb") as file:
+        with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        with contextlib.suppress(OSError):  # file systems of memory cards know no modes
+            temporary.chmod(mode & 0o7777)
         temporary.replace(target)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(target)  # a full disk does not say which
         raise
 
 

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.shapers import shape, shaper_pulses
+from gcode.types import Moves
 from models.machine import Machine
 from models.schedule import EMPTY, OperatingPoint
 from service.pipeline.band import BandContent
 from service.pipeline.result import Channel, ErrorFigures, GroupFigures, LayerView, Track
 from service.pipeline.yardstick import BestShaper
-from simulation.measures import ContourErrors, MotionMeter, Tally
+from simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 from simulation.scheduled import MachineStream
 
 __all__ = ["Measurement", "MotionSamples", "part_of"]
@@ -44,17 +45,17 @@ class MotionSamples:
         X and Y as planned, and as the firmware executes them.
     z_mm : ndarray, shape (n,)
     extruding : ndarray of bool, shape (n,)
-    line : ndarray of int64, shape (n,)
-    layer, feature : ndarray of int32, shape (n,)
+    row : ndarray of int64, shape (n,)
+        Row of `moves` that each sample belongs to.
+    moves : Moves
     """
 
     path_mm: Array
     executed_mm: Array
     z_mm: Array
     extruding: NDArray[np.bool_]
-    line: NDArray[np.int64]
-    layer: NDArray[np.int32]
-    feature: NDArray[np.int32]
+    row: NDArray[np.int64]
+    moves: Moves
 
     def __len__(self) -> int:
         return int(self.path_mm.shape[1])
@@ -81,12 +82,15 @@ class Measurement:
         self._point = EMPTY
         self._band = BandContent(machine, dt_s)
         self._names = ("before", "after", "shaper") if compensated else ("before", "shaper")
-        self._meters = {name: MotionMeter(dt_s, stride=STRIDE) for name in self._names}
+        self._meter = MotionMeter(dt_s, stride=STRIDE, channels=len(self._names))
+        self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._streams: dict[str, MachineStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
-        self._track = {name: _Bins() for name in self._names}
+        self._track = _Bins(len(self._names))
         self._views = _Views(self._names)
+        self._count = 0
+        self._waiting: list[_Points] = []
         self._fresh = True
         self._last: MotionSamples | None = None
 
@@ -100,6 +104,8 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = part_of(samples, len(samples) - 1, len(samples))
+            self._waiting.append(_Points.of(samples, slice(-self._count % STRIDE, None, STRIDE)))
+            self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
             self._measure(self._shaper.push(samples))
 
@@ -116,9 +122,8 @@ class Measurement:
                 executed_mm=position,
                 z_mm=last.z_mm[rows],
                 extruding=np.zeros(samples, dtype=bool),
-                line=last.line[rows],
-                layer=last.layer[rows],
-                feature=last.feature[rows],
+                row=last.row[rows],
+                moves=last.moves,
             )
         )
         return position
@@ -133,43 +138,53 @@ class Measurement:
     def finish(self) -> None:
         """Say that the motion has ended."""
         self._measure(self._shaper.flush())
-        self._note(None, {name: meter.flush() for name, meter in self._meters.items()})
+        self._note(self._meter.flush())
 
-    def _measure(self, shaped: tuple[Array, MotionSamples] | None) -> None:
+    def _measure(self, shaped: _Shaped | None) -> None:
         if shaped is None:
             return
-        command, samples = shaped
-        if self._fresh:
+        if not self._streams:
             self._streams = {
                 name: MachineStream(self._machine, self._dt_s, self._point) for name in self._names
             }
-            self._fresh = False
-        commands = {"before": samples.path_mm, "after": samples.executed_mm, "shaper": command}
-        errors = {}
-        for name in self._names:
-            y = self._streams[name].push(commands[name], samples.path_mm)
-            errors[name] = self._meters[name].push(
-                samples.path_mm, y, samples.extruding, samples.layer, samples.feature
-            )
-        self._note(samples, errors)
+        elif self._fresh:
+            for stream in self._streams.values():
+                stream.stand()
+        self._fresh = False
+        commands = {"before": shaped.path_mm, "after": shaped.executed_mm, "shaper": shaped.command}
+        answers = [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
+        self._note(self._meter.push(shaped.path_mm, np.stack(answers), shaped.extruding))
 
-    def _note(self, samples: MotionSamples | None, errors: dict[str, ContourErrors]) -> None:
-        for name, found in errors.items():
-            self._track[name].add(found, self._dt_s)
-        self._views.add(samples, errors)
+    def _note(self, errors: ContourErrors) -> None:
+        done = 0
+        while done < len(errors):
+            points = self._waiting[0]
+            count = min(len(points), len(errors) - done)
+            found = errors.error_mm[:, done : done + count]
+            done += count
+            if count < len(points):
+                self._waiting[0] = points.part(slice(count, None))
+                points = points.part(slice(count))
+            else:
+                del self._waiting[0]
+            self._layers.add(found, points.layer, points.extruding)
+            self._features.add(found, points.feature, points.extruding)
+            self._views.add(points, found)
+        self._track.add(errors, self._dt_s)
 
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""
         labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
+        meter = self._meter
         return [
             Channel(
                 name=name,
                 label=labels[name],
-                extruding=_figures(meter.contour_extruding, meter.tracking_extruding),
-                all_motion=_figures(meter.contour_all, meter.tracking_all),
-                residual_rms_um=1e3 * meter.residual.tally.rms,
+                extruding=_figures(meter.contour_extruding[c], meter.tracking_extruding[c]),
+                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c]),
+                residual_rms_um=1e3 * meter.residual[c].rms,
             )
-            for name, meter in self._meters.items()
+            for c, name in enumerate(self._names)
         ]
 
     def warnings(self) -> list[str]:
@@ -178,15 +193,14 @@ class Measurement:
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
-        return self._groups({n: m.layers.tallies() for n, m in self._meters.items()}, None)
+        return self._groups(self._layers, None)
 
     def features(self, names: Sequence[str]) -> list[GroupFigures]:
         """Return the figures by feature."""
-        return self._groups({n: m.features.tallies() for n, m in self._meters.items()}, names)
+        return self._groups(self._features, names)
 
-    def _groups(
-        self, tallies: dict[str, dict[int, Tally]], names: Sequence[str] | None
-    ) -> list[GroupFigures]:
+    def _groups(self, groups: GroupTally, names: Sequence[str] | None) -> list[GroupFigures]:
+        tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
         for key, tally in tallies["before"].items():
             label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
@@ -204,15 +218,61 @@ class Measurement:
 
     def track(self) -> Track:
         """Return the error along the print."""
-        width = max(bins.width_s for bins in self._track.values())
+        rows = self._track.rms_um()
         return Track(
-            bin_s=width,
-            contour_rms_um={n: bins.rms_um(width) for n, bins in self._track.items()},
+            bin_s=self._track.width_s, contour_rms_um=dict(zip(self._names, rows, strict=True))
         )
 
     def layer_views(self) -> list[LayerView]:
         """Return the layers to draw."""
         return self._views.views()
+
+
+@dataclass(frozen=True, slots=True)
+class _Points:
+    """What belongs to the samples at which contour errors are measured."""
+
+    path_mm: Array
+    z_mm: Array
+    extruding: NDArray[np.bool_]
+    line: NDArray[np.int64]
+    layer: NDArray[np.int32]
+    feature: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, samples: MotionSamples, which: slice) -> _Points:
+        row, moves = samples.row[which], samples.moves
+        return cls(
+            samples.path_mm[:, which].copy(),
+            samples.z_mm[which].copy(),
+            samples.extruding[which].copy(),
+            moves.line[row],
+            moves.layer[row],
+            moves.feature[row],
+        )
+
+    def part(self, which: slice) -> _Points:
+        return _Points(
+            self.path_mm[:, which],
+            self.z_mm[which],
+            self.extruding[which],
+            self.line[which],
+            self.layer[which],
+            self.feature[which],
+        )
+
+    def __len__(self) -> int:
+        return len(self.z_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shaped:
+    """Motion with the best shaper's command for it, shapes (2, n) and (n,)."""
+
+    command: Array
+    path_mm: Array
+    executed_mm: Array
+    extruding: NDArray[np.bool_]
 
 
 class _ShaperStream:
@@ -224,45 +284,52 @@ class _ShaperStream:
             shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
         ]
         self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
-        self._held: MotionSamples | None = None
-        self._before: Array | None = None
+        self._path, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
+        self._extruding = np.zeros(0, bool)
 
-    def push(self, samples: MotionSamples) -> tuple[Array, MotionSamples] | None:
-        """Return shaped commands and the samples they belong to, all but the last few."""
-        held = samples if self._held is None else _join(self._held, samples)
-        ready = len(held) - self._reach
-        if ready <= 0:
-            self._held = held
-            return None
-        out = self._shape(held, ready)
-        self._before = held.path_mm[:, max(0, ready - self._reach) : ready].copy()
-        self._held = part_of(held, ready, len(held))
-        return out
+    def push(self, samples: MotionSamples) -> _Shaped | None:
+        """Return shaped commands and the motion they belong to, all but the last few samples."""
+        if self._path.shape[1] == 0:
+            # The machine stood where it begins.
+            self._path = np.repeat(samples.path_mm[:, :1], self._reach, axis=1)
+        self._path = np.concatenate([self._path, samples.path_mm], axis=1)
+        self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
+        self._extruding = np.concatenate([self._extruding, samples.extruding])
+        ready = len(self._extruding) - self._reach
+        return self._shape(ready) if ready > 0 else None
 
-    def flush(self) -> tuple[Array, MotionSamples] | None:
+    def flush(self) -> _Shaped | None:
         """Return what is held, as if the machine stood still from now on."""
-        if self._held is None:
+        if self._path.shape[1] == 0:
             return None
-        out = self._shape(self._held, len(self._held))
-        self._held = self._before = None
+        out = self._shape(len(self._extruding))
+        self._path = self._path[:, :0]
         return out
 
-    def _shape(self, held: MotionSamples, ready: int) -> tuple[Array, MotionSamples]:
-        before = held.path_mm[:, :1] if self._before is None else self._before
-        path = np.hstack([before, held.path_mm])
-        first = before.shape[1]
-        shaped = np.stack(
-            [shape(row, self._dt_s, p) for row, p in zip(path, self._pulses, strict=True)]
+    def _shape(self, ready: int) -> _Shaped:
+        # The path begins `reach` samples before what is held.
+        span = slice(self._reach, self._reach + ready)
+        shaped = [
+            shape(row, self._dt_s, p)[span] for row, p in zip(self._path, self._pulses, strict=True)
+        ]
+        out = _Shaped(
+            np.stack(shaped),
+            self._path[:, span],
+            self._executed[:, :ready],
+            self._extruding[:ready],
         )
-        return shaped[:, first : first + ready], part_of(held, 0, ready)
+        self._path = self._path[:, ready:]
+        self._executed = self._executed[:, ready:]
+        self._extruding = self._extruding[ready:]
+        return out
 
 
 class _Bins:
-    """Mean square over bins of time; two bins become one when there are too many."""
+    """Mean squares over bins of time; two bins become one when there are too many."""
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int) -> None:
         self.width_s = 1.0
-        self._sum = np.zeros(_TRACK_BINS)
+        self._sum = np.zeros((channels, _TRACK_BINS))
         self._count = np.zeros(_TRACK_BINS)
         self._used = 0
 
@@ -272,20 +339,20 @@ class _Bins:
         last = float(errors.index[-1]) * dt_s
         while last >= self.width_s * _TRACK_BINS:
             half = _TRACK_BINS // 2
-            self._sum = np.append(self._sum.reshape(half, 2).sum(axis=1), np.zeros(half))
-            self._count = np.append(self._count.reshape(half, 2).sum(axis=1), np.zeros(half))
+            pairs = self._sum.reshape(-1, half, 2).sum(axis=2)
+            self._sum = np.pad(pairs, ((0, 0), (0, half)))
+            self._count = np.pad(self._count.reshape(half, 2).sum(axis=1), (0, half))
             self.width_s *= 2.0
         at = (errors.index * (dt_s / self.width_s)).astype(np.int64)
-        self._sum += np.bincount(at, errors.error_mm**2, _TRACK_BINS)
+        for total, error in zip(self._sum, errors.error_mm, strict=True):
+            total += np.bincount(at, error**2, _TRACK_BINS)
         self._count += np.bincount(at, minlength=_TRACK_BINS)
         self._used = int(last / self.width_s) + 1
 
-    def rms_um(self, width_s: float) -> list[float]:
-        step = max(1, round(width_s / self.width_s))
-        used = -(-self._used // step) * step
-        total = np.pad(self._sum, (0, step))[:used].reshape(-1, step).sum(axis=1)
-        count = np.pad(self._count, (0, step))[:used].reshape(-1, step).sum(axis=1)
-        return [round(float(v), 3) for v in 1e3 * np.sqrt(total / np.maximum(count, 1.0))]
+    def rms_um(self) -> list[list[float]]:
+        """Return the bins of every channel."""
+        mean = self._sum / np.maximum(self._count, 1.0)
+        return [[round(float(v), 3) for v in 1e3 * np.sqrt(row[: self._used])] for row in mean]
 
 
 class _Views:
@@ -293,32 +360,19 @@ class _Views:
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = list(names)
-        self._waiting: MotionSamples | None = None
-        self._from = 0
         self._every = 1
         self._layers: dict[int, _View] = {}
 
-    def add(self, samples: MotionSamples | None, errors: dict[str, ContourErrors]) -> None:
-        if samples is not None:
-            self._waiting = samples if self._waiting is None else _join(self._waiting, samples)
-        first = next(iter(errors.values()))
-        if self._waiting is None or len(first) == 0:
-            return
-        at = first.index - self._from
-        held = self._waiting
-        layer = held.layer[at]
-        for number in np.unique(layer[layer >= 0]):
+    def add(self, points: _Points, error_mm: Array) -> None:
+        layer = points.layer
+        for number in np.unique(layer[layer >= 0]).tolist():
             if number % self._every:
                 continue
-            view = self._layers.setdefault(int(number), _View(self._names))
-            chosen = layer == number
-            view.add(held, at[chosen], {n: e.error_mm[chosen] for n, e in errors.items()})
+            view = self._layers.setdefault(number, _View(self._names))
+            view.add(points, error_mm, np.flatnonzero(layer == number))
         while len(self._layers) > 2 * _LAYERS_SHOWN:
             self._every *= 2
             self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
-        done = int(at[-1]) + 1
-        self._from += done
-        self._waiting = part_of(held, done, len(held))
 
     def views(self) -> list[LayerView]:
         numbers = sorted(k for k, v in self._layers.items() if v.count > 1)
@@ -335,18 +389,17 @@ class _View:
         self._names = list(names)
         self.count = 0
 
-    def add(self, held: MotionSamples, at: NDArray[np.int64], errors: dict[str, Array]) -> None:
-        keep = np.arange(0, len(at), self._step)
+    def add(self, points: _Points, error_mm: Array, chosen: NDArray[np.int64]) -> None:
+        at = chosen[:: self._step]
         rows = np.stack(
             [
-                held.path_mm[0, at],
-                held.path_mm[1, at],
-                held.z_mm[at],
-                held.extruding[at].astype(float),
-                held.line[at].astype(float),
-                *(1e3 * errors[n] for n in self._names),
+                *points.path_mm[:, at],
+                points.z_mm[at],
+                points.extruding[at].astype(float),
+                points.line[at].astype(float),
+                *(1e3 * error_mm[:, at]),
             ]
-        )[:, keep]
+        )
         self._rows.append(rows)
         self.count += rows.shape[1]
         while self.count > 2 * _POINTS_PER_LAYER:
@@ -378,18 +431,6 @@ def _figures(contour: Tally, tracking: Tally) -> ErrorFigures:
     )
 
 
-def _join(first: MotionSamples, second: MotionSamples) -> MotionSamples:
-    return MotionSamples(
-        np.hstack([first.path_mm, second.path_mm]),
-        np.hstack([first.executed_mm, second.executed_mm]),
-        np.concatenate([first.z_mm, second.z_mm]),
-        np.concatenate([first.extruding, second.extruding]),
-        np.concatenate([first.line, second.line]),
-        np.concatenate([first.layer, second.layer]),
-        np.concatenate([first.feature, second.feature]),
-    )
-
-
 def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
     """Return the samples start..stop - 1."""
     return MotionSamples(
@@ -397,7 +438,6 @@ def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
         samples.executed_mm[:, start:stop],
         samples.z_mm[start:stop],
         samples.extruding[start:stop],
-        samples.line[start:stop],
-        samples.layer[start:stop],
-        samples.feature[start:stop],
+        samples.row[start:stop],
+        samples.moves,
     )

@@ -8,17 +8,20 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from gcode.containers.opening import open_text
 from gcode.errors import GcodeError
-from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.planning import check_moves_end, check_print_ends
+from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.sampler import Sampler, Samples
-from gcode.types import EventKind, Moves, ProgramBlock
+from gcode.slicers.facts import SlicerFacts
+from gcode.types import EventKind, Moves, Phases, ProgramBlock
 from models.machine import Machine
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import DT_S
@@ -26,14 +29,30 @@ from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples
 from service.pipeline.operating import Operation
 from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from service.pipeline.result import Result, StageTime
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
-__all__ = ["plan_file", "simulate_file"]
+__all__ = ["STANDING_S", "PlannedTime", "plan_file", "simulate_file"]
 
+STANDING_S = 2.0
+"""How long a stand is measured: all vibration has died down after that."""
 _BLOCK_BYTES = 1 << 17
 _COLUMNS = ("t", "x", "y", "z", "e")
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTime:
+    """How long a file takes: as planned, and as its slicer says (None: it does not).
+
+    `warnings` say what the firmware passes over, or what of the file raises doubts.
+    """
+
+    time_s: float
+    slicer: str
+    slicer_time_s: float | None
+    warnings: list[str]
 
 
 def plan_file(
@@ -43,8 +62,9 @@ def plan_file(
     *,
     rate_hz: float = 1000.0,
     plate: int | None = None,
+    dialect: DialectName | None = None,
     progress: ProgressCallback | None = None,
-) -> None:
+) -> PlannedTime:
     """Write the motion that the firmware makes of a file as a table of samples.
 
     Parameters
@@ -59,7 +79,13 @@ def plan_file(
         Samples per second.
     plate : int, optional
         Which plate of a 3MF package with several.
+    dialect : str, optional
+        How the file is read; None: as the machine's firmware reads it.
     progress : callable, optional
+
+    Returns
+    -------
+    PlannedTime
 
     Raises
     ------
@@ -68,6 +94,7 @@ def plan_file(
     """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 100_000):
         raise GcodeError(f"the rate of {rate_hz:g} samples per second is outside 0 to 100000")
+    motion = _Motion(source, plate, machine, dialect, 1.0 / rate_hz, progress)
     with (
         replacing(target_npz) as temporary,
         tempfile.TemporaryDirectory(dir=target_npz.parent, prefix=".stillpath-plan-") as folder,
@@ -76,7 +103,7 @@ def plan_file(
         files = {name: path.open("wb") for name, path in columns.items()}
         count = 0
         try:
-            for part in _Motion(source, plate, machine, 1.0 / rate_hz, progress):
+            for part in motion:
                 samples = part.samples
                 rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
                 for name, row in zip(_COLUMNS, rows, strict=True):
@@ -92,6 +119,7 @@ def plan_file(
                     header = {"descr": "<f8", "fortran_order": False, "shape": (count,)}
                     np.lib.format.write_array_header_1_0(out, header)
                     shutil.copyfileobj(column, out, 1 << 20)
+    return PlannedTime(motion.time_s, motion.facts.slicer, motion.facts.estimate_s, motion.warnings)
 
 
 def simulate_file(
@@ -99,6 +127,7 @@ def simulate_file(
     machine: Machine,
     *,
     plate: int | None = None,
+    dialect: DialectName | None = None,
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> Result:
@@ -110,7 +139,7 @@ def simulate_file(
     with clock.stage("yardstick"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     measurement = Measurement(machine, DT_S, shaper, compensated=False)
-    motion = _Motion(source, plate, machine, DT_S, progress)
+    motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
     extruding_s = 0.0
     peak_velocity = 0.0
@@ -140,6 +169,8 @@ def simulate_file(
         best_shaper=shaper.label,
         original_time_s=motion.time_s,
         time_s=motion.time_s,
+        slicer=motion.facts.slicer,
+        slicer_time_s=motion.facts.estimate_s,
         original_bytes=size,
         written_bytes=size,
         segments=0,
@@ -155,7 +186,7 @@ def simulate_file(
         pieces=0,
         put_back=[],
         put_back_extruding_share=0.0,
-        warnings=measurement.warnings(),
+        warnings=[*motion.warnings, *measurement.warnings()],
         notes=operation.notes(),
         layers=measurement.layers(),
         features=measurement.features(motion.feature_names),
@@ -190,10 +221,9 @@ class _Part:
             path_mm=self.samples.xyz_mm[:2],
             executed_mm=self.samples.xyz_mm[:2],
             z_mm=self.samples.xyz_mm[2],
-            extruding=feeds[row],
-            line=moves.line[row],
-            layer=moves.layer[row],
-            feature=moves.feature[row],
+            extruding=feeds[row] & self.samples.moving,
+            row=row,
+            moves=moves,
         )
 
 
@@ -205,55 +235,102 @@ class _Motion:
         source: Path,
         plate: int | None,
         machine: Machine,
+        dialect: DialectName | None,
         dt_s: float,
         progress: ProgressCallback | None,
+        *,
+        longest_stand_s: float = np.inf,
     ) -> None:
+        self._longest_stand_s = longest_stand_s
+        self._left_out_s = self._end_s = 0.0
         self._source, self._plate, self._machine = source, plate, machine
+        self._dialect = dialect_for(machine, dialect)
+        self._asked = dialect
         self._dt_s, self._progress = dt_s, progress
         self._began = time.monotonic()
         self._held: list[tuple[int, Moves]] = []
+        self._jumps: list[int] = []
+        """Moves in front of which the position was lost, by their index in the file."""
         self.time_s = 0.0
         self.feature_names: list[str] = []
+        self.facts = SlicerFacts()
+        self.warnings: list[str] = []
 
     def __iter__(self) -> Iterator[_Part]:
-        reader = Interpreter(self._machine)
-        planner = Planner(self._machine.firmware)
+        reader = Interpreter(self._machine, dialect=self._dialect)
+        planner = kit(self._machine).planner()
         sampler = Sampler(self._dt_s)
         self.feature_names = reader.feature_names
         moves = 0
         unpacking = telling(self._progress, "unpacking", 0.0)
         with open_text(self._source, plate=self._plate, told=unpacking) as container:
+            self.facts = container.facts()
             file = container.text
+            doubtful = doubts(file, self._machine, self._asked)
             size = max(file.seek(0, io.SEEK_END), 1)
             file.seek(0)
             while True:
                 data = file.read(_BLOCK_BYTES)
                 for block in reader.push(data) if data else reader.flush():
                     moves += len(block.moves)
-                    jumped = bool(np.any(block.events.kind == EventKind.UNKNOWN))
                     self._hold(block)
-                    yield from self._part(sampler.push(planner.push(block)), jumped)
+                    phases = planner.push(block)
+                    self._check(phases, planner.time_s)
+                    for samples in sampler.push(self._shortened(phases)):
+                        yield from self._parts(samples)
                 self.time_s = planner.time_s
                 self._say(file.tell() / size)
                 if not data:
                     break
-        yield from self._part(sampler.push(planner.flush()), False)
-        yield from self._part(sampler.flush(), False)
+        phases = planner.flush()
+        self._check(phases, planner.time_s)
+        for samples in chain(sampler.push(self._shortened(phases)), sampler.flush()):
+            yield from self._parts(samples)
         self.time_s = planner.time_s
+        self.warnings = [*doubtful, *passed_over(reader)]
         if moves == 0:
             raise GcodeError("the file contains no moves: is it G-code?")
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):
             self._held.append((block.first_move, block.moves))
+        lost = block.events.kind == EventKind.UNKNOWN
+        self._jumps += block.events.move_index[lost].tolist()
 
-    def _part(self, samples: Samples, jumped: bool) -> Iterator[_Part]:
-        if len(samples) == 0:
-            return
+    def _check(self, phases: Phases, time_s: float) -> None:
+        if self._held:
+            check_moves_end(phases, self._line)
+            check_print_ends(time_s, int(self._held[-1][1].line[-1]))
+
+    def _line(self, move_index: int) -> int:
+        first, moves = [held for held in self._held if held[0] <= move_index][-1]
+        return int(moves.line[move_index - first])
+
+    def _shortened(self, phases: Phases) -> Phases:
+        """Leave out what the machine stands longer than it must."""
+        if len(phases) == 0 or np.isinf(self._longest_stand_s):
+            return phases
+        end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+        stands_s = phases.t_s - np.append(self._end_s, end_s[:-1])
+        left_out_s = np.cumsum(np.maximum(stands_s - self._longest_stand_s, 0.0)) + self._left_out_s
+        self._left_out_s, self._end_s = float(left_out_s[-1]), float(end_s[-1])
+        return replace(phases, t_s=phases.t_s - left_out_s)
+
+    def _parts(self, samples: Samples) -> Iterator[_Part]:
+        """Cut samples where the position is lost between two moves."""
+        begun, jumped = 0, False
+        while self._jumps and self._jumps[0] <= samples.move_index[-1]:
+            at = int(np.searchsorted(samples.move_index, self._jumps.pop(0)))
+            if at > begun:
+                yield self._part(samples.part(begun, at), jumped)
+            begun, jumped = at, True
+        yield self._part(samples.part(begun, len(samples)), jumped)
+
+    def _part(self, samples: Samples, jumped: bool) -> _Part:
         first = int(samples.move_index[0])
         while len(self._held) > 1 and self._held[1][0] <= first:
             self._held.pop(0)
-        yield _Part(samples, _joined([m for _, m in self._held]), self._held[0][0], jumped)
+        return _Part(samples, _joined([m for _, m in self._held]), self._held[0][0], jumped)
 
     def _say(self, fraction: float) -> None:
         if self._progress is None:

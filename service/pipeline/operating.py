@@ -35,14 +35,14 @@ class Operation:
 
     Notes
     -----
-    Diameter and density are those of the machine document (`firmware.extruder`, `schedules`).
+    Diameter and density are those of the machine document (`firmware`, `schedules`).
     """
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
         masses = mass_schedules(machine)
         density_g_cm3 = masses[0].filament_density_g_cm3 if masses else 0.0
-        area_mm2 = 0.25 * math.pi * machine.firmware.extruder.filament_diameter_mm**2
+        area_mm2 = 0.25 * math.pi * machine.firmware.hotend.filament_diameter_mm**2
         self._kg_per_mm = 1e-6 * area_mm2 * density_g_cm3
         self.printed_kg = 0.0
         self._furthest_mm: float | None = None

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.pipeline.reading import DialectName
+
 __all__ = ["DEFAULT_TOLERANCE_UM", "BasisName", "Options", "RobustMode"]
 
 DEFAULT_TOLERANCE_UM = 2.0
@@ -21,7 +23,9 @@ class Options(BaseModel):
     with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
     `basis`, `robust` and `along` are settings of `fbf`: `along` is the weight of the error along
     the path against that across it (None: as suits `robust`). `plate` chooses one of several in a
-    3MF package; it is no setting of the compensation.
+    3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
+    the file follow the new motion. `dialect` is how the file is read (None: as the machine's
+    firmware reads it).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -38,3 +42,5 @@ class Options(BaseModel):
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
     plate: Annotated[int, Field(ge=1)] | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM
+    times: Literal["new", "kept"] = "new"
+    dialect: DialectName | None = None

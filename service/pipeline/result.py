@@ -99,6 +99,9 @@ class Result(_Figures):
     best_shaper: str
     original_time_s: float
     time_s: float
+    slicer: str = ""
+    slicer_time_s: float | None = None
+    """The slicer's own estimate for the file as it came, where it has one."""
     original_bytes: int
     written_bytes: int
     segments: int

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import io
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import fields, replace
@@ -20,12 +21,16 @@ import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
-from gcode.firmware.klipper.planner import join_phases, plan_moves
-from gcode.firmware.klipper.writer import KlipperWriter
+from gcode.firmware.planning import check_print_ends, join_phases, plan_moves
+from gcode.firmware.registry import kit
+from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
 from gcode.pieces import Passage, Piece, Splitter
 from gcode.sampler import sample_phases
-from gcode.types import EventKind, Moves, Phases
+from gcode.slicers.facts import SlicerFacts
+from gcode.slicers.retiming import Retiming
+from gcode.types import EventKind, Events, Moves, Phases
+from models.errors import ModelError
 from models.machine import Machine
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import (
@@ -38,10 +43,11 @@ from service.pipeline.compensating import (
 )
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.measure import Measurement, MotionSamples, part_of
-from service.pipeline.motion import plan_file, simulate_file
+from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options
 from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
@@ -50,12 +56,13 @@ __all__ = ["compensate_file", "plan_file", "simulate_file"]
 
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
-_STANDING_S = 2.0
 _EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
 _TIME_EXCESS_S = 20e-3
-_FILAMENT_MM = 1e-4
+_WARN_PUT_BACK_SHARE = 0.2
+_END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
+"""How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
 
 
 def compensate_file(
@@ -100,9 +107,17 @@ def compensate_file(
         replacing(target) as temporary,
         open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
     ):
-        with rewriting(container, temporary, name=target, told=packing) as text:
-            job = _Job(container.text, text, machine, options, cache_dir, progress)
-            result = job.run(source.name)
+        with (
+            rewriting(container, temporary, name=target, told=packing) as text,
+            tempfile.TemporaryFile(dir=target.parent) as spool,
+        ):
+            facts = container.facts()
+            job = _Job(container.text, spool, machine, options, cache_dir, progress)
+            result = job.run(source.name, facts)
+            spool.seek(0)
+            job.retiming.copy(spool, text, job.delay_s)
+            if options.times == "new":
+                container.delay(job.delay_s)
         sizes = {
             "original_bytes": source.stat().st_size,
             "written_bytes": temporary.stat().st_size,
@@ -111,7 +126,10 @@ def compensate_file(
 
 
 class _Job:
-    """State of one file on its way."""
+    """State of one file on its way.
+
+    What is written waits in the target for its times: `retiming` knows how to copy it.
+    """
 
     def __init__(
         self,
@@ -128,6 +146,9 @@ class _Job:
         self._began = time.monotonic()
         self._clock = StageClock()
         self._changes = options.method != "none"
+        self._kit = kit(machine)
+        if self._changes and self._kit.refusal is not None:
+            raise ModelError(f"{machine.name} cannot execute this file: {self._kit.refusal}")
         # A method that cannot be designed says so before the yardstick takes its seconds.
         tuned_first = options.method.startswith("shaper:")
         if self._changes and not tuned_first:
@@ -139,36 +160,43 @@ class _Job:
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
         if tuned_first:
             self._work = PieceCompensator(machine, options, self._shaper)
-        self._reader = Interpreter(machine)
-        self._checker = Interpreter(machine)
+        dialect = dialect_for(machine, options.dialect)
+        self._reader = Interpreter(machine, dialect=dialect)
+        self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._operation = Operation(machine)
         self._measurement = Measurement(machine, DT_S, self._shaper, compensated=True)
         if self._changes:
-            self._writer = KlipperWriter(machine, self._work.encoder.limits, self._stamp())
+            self._writer = StreamWriter(self._kit, self._stamp())
+        ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
+        self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum = _Sums()
+        self._sum.warnings += doubts(source, machine, options.dialect)
 
-    def run(self, name: str) -> Result:
+    @property
+    def delay_s(self) -> float:
+        """How much later than the original the written file is where the road has come to."""
+        return self._sum.time_s - self._sum.original_s
+
+    def run(self, name: str, facts: SlicerFacts) -> Result:
         size = max(self._source.seek(0, io.SEEK_END), 1)
         self._source.seek(0)
-        if self._changes:
-            self._emit(self._writer.header())
         for item in self._items():
             self._point = self._operation.at(item.moves)
             self._measurement.operate_at(self._point)
             if isinstance(item, Piece):
-                self._emit(self._piece(item))
+                self._piece(item)
             else:
-                self._emit(self._passage(item))
+                self._passage(item)
             self._operation.passed(item.moves)
             self._say("compensating", self._source.tell() / size)
         if self._sum.moves == 0:
             raise GcodeError("the file contains no moves: is it G-code?")
         if self._changes:
-            self._emit(self._writer.footer(self._sum.newline))
+            self._emit(self._writer.end(self._sum.newline, self._checker.extruder_mm))
         self._measurement.finish()
         self._say("done", 1.0)
-        return self._result(name, size)
+        return self._result(name, size, facts)
 
     def _items(self) -> Iterator[Piece | Passage]:
         while True:
@@ -195,10 +223,12 @@ class _Job:
                 return
             yield item
 
-    def _piece(self, piece: Piece) -> bytes:
+    def _piece(self, piece: Piece) -> None:
+        delay_s = self.delay_s
         self._sum.pieces += 1
         self._sum.moves += len(piece.moves)
         original_s = _duration_s(piece.phases)
+        self._check_end(piece, original_s)
         self._sum.original_s += original_s
         if self._sum.jumped:
             # Homed, say: the machine did not come here along the path.
@@ -209,7 +239,7 @@ class _Job:
             with self._clock.stage("compensate"):
                 made = self._work.compensate(piece, self._point)
             with self._clock.stage("write"):
-                text = self._writer.piece(piece, made.encoded)
+                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
                 executed = self._read_back(text)
@@ -219,7 +249,8 @@ class _Job:
             self._writer = writer
             if checker is not None:
                 self._checker = checker
-            return self._put_back(piece, original_s, str(error))
+            self._put_back(piece, original_s, str(error))
+            return
         self._work.compensator.commit()
         self._sum.add_piece(made, executed, gap)
         with self._clock.stage("measure"):
@@ -228,9 +259,10 @@ class _Job:
             samples = _samples(piece, row, planned, position, extruding)
             # The last sample of an item is the first one of the next.
             self._measurement.add(part_of(samples, 0, last))
-        return text
+        late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
+        self._emit(text, piece, np.append(delay_s + late_s, self.delay_s))
 
-    def _put_back(self, piece: Piece, seconds: float, reason: str) -> bytes:
+    def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece leave as it came."""
         phases = piece.phases
         row_s = phases.accel_s + phases.cruise_s + phases.decel_s
@@ -246,18 +278,20 @@ class _Job:
         )
         self._sum.original_s -= seconds
         self._sum.moves -= len(piece.moves)
-        return self._passage(piece)
+        self._passage(piece)
 
-    def _passage(self, passage: Passage) -> bytes:
+    def _passage(self, passage: Passage) -> None:
         text = passage.text
         if self._changes:
-            text = self._writer.passage(passage)
+            text = self._writer.passage(passage, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 self._checker.push(text)
+        self._emit(text, passage, self.delay_s)
         self._sum.moves += len(passage.moves)
         self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
         with self._clock.stage("plan"):
             parts = list(plan_passage(passage, self._machine))
+        self._check_end(passage, sum(_takes_s(part) for part in parts))
         with self._clock.stage("measure"):
             for part in parts:
                 if part is None:
@@ -267,7 +301,11 @@ class _Job:
                     self._measure_passage(passage, part)
                 else:
                     self._stand(part)
-        return text
+
+    def _check_end(self, item: Passage, seconds: float) -> None:
+        lines: Moves | Events = item.moves if len(item.moves) else item.events
+        if len(lines):
+            check_print_ends(self._sum.original_s + seconds, int(lines.line[-1]))
 
     def _measure_passage(self, passage: Passage, phases: Phases) -> None:
         moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
@@ -291,8 +329,7 @@ class _Job:
         """Let the machine stand where it is."""
         self._sum.original_s += dwell_s
         self._sum.time_s += dwell_s
-        # All vibration has died down after a while.
-        stood = self._measurement.stand(round(min(dwell_s, _STANDING_S) / DT_S))
+        stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
         if stood is not None:
             self._observe(stood)
 
@@ -312,10 +349,8 @@ class _Job:
         blocks = self._checker.push(text)
         parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
         if len(parts) == 1:
-            return plan_moves(parts[0][0], parts[0][1], self._machine.firmware)
-        from gcode.firmware.klipper.planner import Planner
-
-        planner = Planner(self._machine.firmware)
+            return plan_moves(parts[0][0], parts[0][1], self._machine)
+        planner = self._kit.planner()
         phases = [planner.push_moves(moves, limits) for moves, limits in parts]
         phases.append(planner.flush())
         return join_phases(phases)
@@ -328,14 +363,16 @@ class _Job:
         executed: Phases,
     ) -> None:
         """Compare executed with intended motion; raise `Unfit` with the reason."""
-        tolerance = 1e-3 * self._options.tolerance_um
+        step = np.array(self._kit.step_mm)
+        # Where vertices lie on steps, and when steps come, are off by up to a step each.
+        tolerance = 1e-3 * self._options.tolerance_um + 2.0 * float(np.hypot(*step[:2]))
         worst_print = float(np.max(gap[made.extruding], initial=0.0))
         worst = float(np.max(gap, initial=0.0))
         if worst_print > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
             raise Unfit(
                 f"read back, the motion is {1e3 * worst_print:.1f} um from its command while "
                 f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
-                f"{self._options.tolerance_um:g} um)"
+                f"{1e3 * tolerance:g} um)"
             )
         encoded = made.encoded
         stretch = made.timeline.end_s[-1] - made.timeline.start_s[-1]
@@ -345,7 +382,7 @@ class _Job:
             raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
         end = executed.start_mm[-1] + executed.direction[-1] * _length_mm(executed)
         wanted = piece.moves.end_mm[-1]
-        if np.max(np.abs(end[:3] - wanted[:3])) > 1e-6 or abs(end[3] - wanted[3]) > _FILAMENT_MM:
+        if np.any(np.abs(end - wanted) > step + _END_MM):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 
     def _stamp(self) -> str:
@@ -356,9 +393,12 @@ class _Job:
             f"method={self._options.method} settings={settings}"
         )
 
-    def _emit(self, text: bytes) -> None:
+    def _emit(
+        self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
+    ) -> None:
         self._sum.written += len(text)
         self._target.write(text)
+        self.retiming.push(text, item, delay_s)
 
     def _say(self, stage: str, fraction: float) -> None:
         if self._progress is None:
@@ -368,14 +408,22 @@ class _Job:
         seconds = self._sum.time_s if hasattr(self, "_sum") else 0.0
         self._progress(Progress(stage, fraction, seconds, elapsed, eta))
 
-    def _result(self, name: str, size: int) -> Result:
+    def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
         total, measured = self._sum, self._measurement
         put_back_s = sum(p.extruding_seconds for p in total.put_back)
-        warnings = [*total.warnings, *measured.warnings()]
+        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
         if self._changes and self._writer.shaper_unknown:
             warnings.append(
                 "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
                 "is switched off and stays off; set it again after the print."
+            )
+        put_back_share = put_back_s / total.extruding_s if total.extruding_s else 0.0
+        if put_back_share > _WARN_PUT_BACK_SHARE:
+            longest = max(total.put_back, key=lambda piece: piece.extruding_seconds)
+            warnings.append(
+                f"{put_back_share:.0%} of the extruding time left as it came and is not "
+                f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
+                f"{longest.reason}"
             )
         shaper = self._shaper
         return Result(
@@ -389,6 +437,8 @@ class _Job:
             best_shaper=shaper.label,
             original_time_s=total.original_s,
             time_s=total.time_s,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
             original_bytes=size,
             written_bytes=total.written,
             segments=total.segments,
@@ -403,7 +453,7 @@ class _Job:
             extruding_s=total.extruding_s,
             pieces=total.pieces,
             put_back=total.put_back,
-            put_back_extruding_share=put_back_s / total.extruding_s if total.extruding_s else 0.0,
+            put_back_extruding_share=put_back_share,
             warnings=warnings,
             notes=self._operation.notes(),
             layers=measured.layers(),
@@ -438,13 +488,11 @@ class _Sums:
         if len(segments):
             rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
             self.peak_rate = max(self.peak_rate, float(rate.max()))
-        command = made.command_mm[:2]
-        self.peak_velocity = max(
-            self.peak_velocity, float(np.max(np.hypot(*np.diff(command)), initial=0.0)) / DT_S
-        )
-        self.peak_accel = max(
-            self.peak_accel, float(np.max(np.abs(np.diff(command, 2)), initial=0.0)) / DT_S**2
-        )
+        steps = np.diff(made.command_mm[:2])
+        speed2 = float(np.max(steps[0] ** 2 + steps[1] ** 2, initial=0.0)) / DT_S**2
+        self.peak_velocity = max(self.peak_velocity, float(np.sqrt(speed2)))
+        accel = float(np.max(np.abs(np.diff(steps)), initial=0.0)) / DT_S**2
+        self.peak_accel = max(self.peak_accel, accel)
         self.gap2 += float(gap @ gap)
         self.gap_count += len(gap)
         self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
@@ -471,7 +519,7 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
         end = len(passage.moves) if k is None else int(events.move_index[k])
         if end > done:
             rows = _move_rows(passage, done, end)
-            phases = plan_moves(rows, passage.limits, machine.firmware)
+            phases = plan_moves(rows, passage.limits, machine)
             if len(phases):
                 numbers = phases.move_index - phases.move_index[0] + done
                 yield replace(phases, move_index=numbers)
@@ -480,6 +528,10 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
             yield float(events.dwell_s[k])
         if k is not None and events.kind[k] == EventKind.UNKNOWN:
             yield None
+
+
+def _takes_s(part: Phases | float | None) -> float:
+    return _duration_s(part) if isinstance(part, Phases) else part or 0.0
 
 
 def _duration_s(phases: Phases) -> float:
@@ -512,15 +564,13 @@ def _samples(
     executed: np.ndarray,
     extruding: np.ndarray,
 ) -> MotionSamples:
-    moves = item.moves
     return MotionSamples(
         path_mm=planned[:2],
         executed_mm=executed[:2],
         z_mm=planned[2],
         extruding=extruding,
-        line=moves.line[row],
-        layer=moves.layer[row],
-        feature=moves.feature[row],
+        row=row,
+        moves=item.moves,
     )
 
 

@@ -144,7 +144,7 @@ def bands(
 
 def _accelerations(machine: Machine, modes: Sequence[RingingMode]) -> list[float]:
     """Rising accelerations up to the machine's own, or what rings as much as can be used."""
-    largest = machine.firmware.planner.max_accel_mm_s2
+    largest = machine.firmware.largest_accel_mm_s2
     useful = min(_LARGEST_UM / mode.um_per_mm_s2 for mode in modes)
     top = min(largest, max(useful, _LOWEST_MM_S2))
     return _rounded(np.linspace(0.4 * top, top, 13))
@@ -156,13 +156,13 @@ def _rounded(accels: np.ndarray) -> list[float]:
 
 
 def _fastest(machine: Machine, flow_mm_s: float, run_mm: float, accel: float) -> float:
-    limits = machine.firmware.planner
+    machine_mm_s = machine.firmware.fastest_mm_s
     within = math.sqrt(0.8 * run_mm * accel)
-    fastest = min(flow_mm_s, limits.max_velocity_mm_s, within)
+    fastest = min(flow_mm_s, machine_mm_s, within)
     if fastest < _LOWEST_MM_S:
         raise ModelError(
             f"walls can be printed at {fastest:.1f} mm/s at most (hotend {flow_mm_s:.1f}, machine "
-            f"{limits.max_velocity_mm_s:g}, its acceleration {within:.0f}); ringing shows from "
+            f"{machine_mm_s:g}, its acceleration {within:.0f}); ringing shows from "
             f"{_LOWEST_MM_S:g} mm/s on: raise --max-flow, take a finer nozzle, or correct the "
             "machine's limits"
         )

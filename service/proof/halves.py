@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gcode.firmware.registry import kit
 from models.machine import Machine
 from models.plants import continuous
 from service.pipeline.files import replacing
@@ -193,7 +194,8 @@ def _ringing(result: Result) -> dict[str, Ringing]:
 
 def _warnings(machine: Machine, result: Result) -> list[str]:
     out = list(result.warnings)
-    if machine.firmware.shaper is None:
+    voice = kit(machine).voice()
+    if voice.shaper_off and voice.shaper_on is None:
         out.append(
             "the firmware's input shaper is switched off for both halves, and the machine does not "
             "say what it was (firmware.shaper): restart the firmware after the print"

@@ -11,8 +11,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+from gcode.firmware.registry import kit
 from models.errors import ModelError
-from models.machine import FirmwareRetraction, Machine
+from models.firmware import FirmwareRetraction
+from models.machine import Machine
 
 __all__ = ["Place", "PrintSettings", "Program", "place"]
 
@@ -112,17 +114,18 @@ class Program:
     """
 
     def __init__(self, machine: Machine, settings: PrintSettings) -> None:
-        extruder = machine.firmware.extruder
+        self._voice = kit(machine).voice()
+        extruder = machine.firmware.hotend
         self._machine, self._settings = machine, settings
         self.width_mm = 1.125 * extruder.nozzle_diameter_mm
         self.layer_mm = 0.5 * extruder.nozzle_diameter_mm
         self.section_mm2 = self.layer_mm * (self.width_mm - (1 - math.pi / 4) * self.layer_mm)
         self._filament_mm2 = math.pi * (0.5 * extruder.filament_diameter_mm) ** 2
         self._retraction = machine.firmware.retraction or FirmwareRetraction()
-        planner = machine.firmware.planner
-        self._travel_mm_s = min(_TRAVEL_MM_S, planner.max_velocity_mm_s)
-        self._z_mm_s = min(10.0, planner.max_z_velocity_mm_s)
-        self.gentle_mm_s2 = min(_GENTLE_MM_S2, planner.max_accel_mm_s2)
+        firmware = machine.firmware
+        self._travel_mm_s = min(_TRAVEL_MM_S, firmware.fastest_mm_s)
+        self._z_mm_s = min(10.0, firmware.fastest_z_mm_s)
+        self.gentle_mm_s2 = min(_GENTLE_MM_S2, firmware.largest_accel_mm_s2)
         self._out: list[str] = []
         self._at: Point | None = None
         self._z_mm = 0.0
@@ -152,7 +155,7 @@ class Program:
             "M221 S100",
             "M107",
             # Planned motion is predicted, and shown, without the firmware's shaper.
-            "SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0",
+            *self._voice.shaper_off.decode().splitlines(),
         )
         self.limit_accel(self.gentle_mm_s2)
         self.region("purge")
@@ -166,14 +169,8 @@ class Program:
         """Give the machine back: limits, shaper, heaters off, nozzle up and aside."""
         machine = self._machine
         self._retract()
-        shaper = machine.firmware.shaper
-        self.limit_accel(machine.firmware.planner.max_accel_mm_s2)
-        if shaper is not None:
-            self._add(
-                f"SET_INPUT_SHAPER SHAPER_TYPE_X={shaper.type_x} SHAPER_FREQ_X={shaper.freq_x_hz:g}"
-                f" DAMPING_RATIO_X={shaper.damping_x:g} SHAPER_TYPE_Y={shaper.type_y}"
-                f" SHAPER_FREQ_Y={shaper.freq_y_hz:g} DAMPING_RATIO_Y={shaper.damping_y:g}"
-            )
+        self.limit_accel(machine.firmware.largest_accel_mm_s2)
+        self._add(*(self._voice.shaper_on or b"").decode().splitlines())
         if self._settings.end_gcode is not None:
             self._add(*self._settings.end_gcode.splitlines())
             return
@@ -213,7 +210,7 @@ class Program:
 
     def limit_accel(self, accel_mm_s2: float) -> None:
         """Set the acceleration of what follows."""
-        self._add(f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:g}")
+        self._add(*self._voice.acceleration(accel_mm_s2).decode().splitlines())
 
     def stand(self, seconds: float) -> None:
         """Stand still, filament back."""

@@ -13,6 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from gcode.slicers.features import feature_title
 from service.pipeline.result import Channel, GroupFigures, Result
 from service.reports.pages import asset, content_hash, rendered, write_texts
 
@@ -54,6 +57,7 @@ def render_report(result: Result) -> str:
         asset(_PACKAGE, "report.css"),
         {
             "um": _um,
+            "feature": feature_title,
             "short": _short,
             "plain": _plain,
             "duration": _duration,
@@ -166,7 +170,11 @@ def _legend_top(result: Result) -> float:
 
 
 def _rounded(values: Sequence[float], digits: int) -> list[float | None]:
-    return [round(value, digits) if math.isfinite(value) else None for value in values]
+    rounded = np.round(values, digits)
+    found: list[float | None] = rounded.tolist()
+    for k in np.flatnonzero(~np.isfinite(rounded)):
+        found[k] = None
+    return found
 
 
 def _mapped(values: dict[str, float]) -> dict[str, float | None]:

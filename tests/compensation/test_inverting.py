@@ -155,14 +155,18 @@ def test_terms_of_ts_follow_the_slowest_zero() -> None:
         compensator("ts", near, 1e-3)
 
 
-def test_rests_stand_where_the_plan_rests_and_not_where_its_motions_end() -> None:
+def test_rests_stand_where_the_plan_rests_and_not_where_its_motions_go_on() -> None:
     y_d = np.zeros((2, 200))
-    y_d[:, 100:] = 1.0
-    # The motion ended a little after the sample before the rest, and went on before its last one.
-    y_d[:, 99], y_d[:, 149] = 0.9999, 1.0002
-    y_d[:, 150:] = 1.0 + 0.01 * np.arange(50)
-    out = stand_still(y_d, y_d, np.array([[100, 150]]), 20)
+    y_d[:, 99:] = 1.0
+    # The motion goes on before the last sample of a rest, and soon after the first of a short one.
+    y_d[:, 149:] = 1.0002 + 0.01 * np.arange(51)
+    y_d[:, 160:] = y_d[:, 160, None]
+    y_d[:, 161:] += 0.0016
+    out = stand_still(y_d, y_d, np.array([[100, 150], [161, 162], [163, 164]]), 20)
     np.testing.assert_array_equal(out[:, 99:150], 1.0)
+    assert np.all(out[:, 160:162] == y_d[:, [160]])
+    # Rests that touch: what lies between them is done from one sample to the next.
+    assert np.all(out[:, 162:164] == y_d[:, [162]])
 
 
 def test_stand_still_joins_smoothly() -> None:

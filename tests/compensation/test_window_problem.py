@@ -8,7 +8,7 @@ from scipy.optimize import LinearConstraint, minimize
 
 from compensation.lifted_window import lifted_window
 from compensation.preview import PreviewDesign
-from compensation.window_problem import Bounds, solve_window
+from compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
 from models.plants import Mode, ModesSpec, discretise
 
 DT_S = 1e-3
@@ -57,10 +57,9 @@ def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> 
         "speed": Bounds(1e3, 0.95 * speed, -1e6, 1e6),
         "travel": Bounds(1e3, 1e3, -1e6, 5.001),
     }[kind]
-    assert not all(bounds.kept(np.diff(whole, 2), np.diff(whole), free))
+    assert not all(bounds.kept(Extremes.of(free, 0.0, 0.0)))
     bounded = solve(design, z, path, np.ones(WINDOW), NO_RESTS, bounds)
-    moved = np.concatenate([[0.0, 0.0], bounded])
-    assert all(bounds.kept(np.diff(moved, 2), np.diff(moved), bounded))
+    assert all(bounds.kept(Extremes.of(bounded, 0.0, 0.0)))
 
     # The same quadratic programme by scipy, from the definition.
     stacked = np.concatenate([*design.filtered, np.sqrt(design.price) * design.basis])
@@ -81,6 +80,46 @@ def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> 
                      options={"gtol": 1e-10, "xtol": 1e-12, "maxiter": 3000})  # fmt: skip
     ours = np.linalg.lstsq(np.cumsum(first, axis=0), bounded, rcond=None)[0]
     assert cost(ours)[0] <= cost(found.x)[0] * (1 + 1e-3) + 1e-9
+
+
+@pytest.mark.parametrize("rests", [[[70, 120]], [[0, 30]], [[-5, 10], [40, 60], [90, 200]]])
+def test_rests_are_least_squares_over_what_they_leave(
+    design: PreviewDesign, rests: list[list[int]]
+) -> None:
+    """The definition, with dense matrices: tied functions, pinned commands, a price on bends."""
+    lifted = design.lifted
+    rng = np.random.default_rng(5)
+    z = rng.normal(0, 1e-2, lifted.states)
+    path, weight = corner() + z[-2], rng.choice([0.05, 0.2, 1.0], WINDOW)
+    tied, offset, begin = design.basis.copy(), np.zeros(WINDOW), 0
+    pins = []
+    spans = [(max(a, 0), min(b, WINDOW)) for a, b in rests]
+    for a, b in spans:
+        path[a:b] = path[a - 1] if a else z[-2]
+        tied[a] = -design.basis[begin:a].sum(axis=0)
+        tied[a + 1 : b] = 0.0
+        offset[a] = -(z[-2] - z[-1]) if begin == 0 else 0.0
+        pins += [a - 1] if a else []
+        begin = b
+    price = max(EFFORT_PRICE, design.price)
+    rows = [np.sqrt(price) * tied, np.sqrt(price) * design.basis]
+    wanted = [-np.sqrt(price) * offset, np.zeros(WINDOW)]
+    for target, free, g in zip(lifted.target, lifted.from_state, lifted.integrated, strict=True):
+        rows.append(weight[:, None] * (g @ tied))
+        wanted.append(weight * (target * path - free @ z - g @ offset))
+    command = np.cumsum(np.cumsum(tied, axis=0), axis=0)
+    k = np.arange(1.0, WINDOW + 1.0)
+    fixed = z[-2] + k * (z[-2] - z[-1]) + np.cumsum(np.cumsum(offset))
+    # Least squares with equalities: the usual saddle point.
+    m, y = np.concatenate(rows), np.concatenate(wanted)
+    held = command[pins]
+    saddle = np.block([[m.T @ m, held.T], [held, np.zeros((len(pins), len(pins)))]])
+    right = np.concatenate([m.T @ y, path[pins] - fixed[pins]])
+    found = np.linalg.solve(saddle, right)[: design.n]
+    ours = solve(design, z, path, weight, np.array(rests), WIDE)
+    np.testing.assert_allclose(ours, fixed + command @ found, atol=1e-8)
+    for a, b in spans:
+        np.testing.assert_array_equal(ours[a:b], path[a])
 
 
 def test_rests_are_kept_within_bounds(design: PreviewDesign) -> None:

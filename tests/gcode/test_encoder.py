@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.klipper._encoder_kernels import format_moves, merge_still
-from gcode.firmware.klipper.encoder import KlipperEncoder
-from gcode.firmware.klipper.planner import plan_moves
+from gcode.firmware._encoding_kernels import merge_still
+from gcode.firmware._writing_kernels import format_moves
+from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
 from gcode.interpreter import interpret_bytes
 from gcode.pieces import Piece
 from gcode.segments import ErrorFilter, fit_segments
@@ -92,7 +93,7 @@ def test_rests_pass_as_they_came(machine: Machine, work: PieceCompensator, name:
 def test_rest_durations_are_klippers(machine: Machine) -> None:
     """A retraction of .8 mm at 35 mm/s and 5000 mm/s2 takes .8 / 35 + 35 / 5000 s."""
     piece = pieces_of(HEAD + BODIES["retraction"], machine)[1]
-    encoder = KlipperEncoder(machine)
+    encoder = kit(machine).encoder()
     groups = group_rows(piece.phases)
     rest_s = encoder.rest_durations(piece, groups)
     accel = machine.firmware.extruder.max_extrude_only_accel_mm_s2
@@ -102,7 +103,7 @@ def test_rest_durations_are_klippers(machine: Machine) -> None:
 def test_plain_path_survives(machine: Machine) -> None:
     """Without compensation the encoded motion is the plan, within the fit's tolerance."""
     piece = pieces_of(HEAD + BODIES["hop and retraction"], machine)[1]
-    encoder = KlipperEncoder(machine)
+    encoder = kit(machine).encoder()
     groups = group_rows(piece.phases)
     timeline = build_timeline(piece.phases, groups, encoder.rest_durations(piece, groups), 1e-3)
     plants = [plant_set(machine.axes[a], 1e-3).nominal for a in ("x", "y")]
@@ -192,9 +193,10 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
 
 
 def test_stream_limits_are_the_machines(machine: Machine) -> None:
-    encoder = KlipperEncoder(machine)
-    assert encoder.limits.velocity_mm_s == machine.command.velocity_mm_s
+    firmware = kit(machine)
+    stream = firmware.stream_limits(firmware.initial_limits())
+    assert stream.as_row() == (machine.command.velocity_mm_s, 300_000.0, 500.0, 0.0)
     piece = pieces_of(HEAD + BODIES["corners"], machine)[1]
     moves = piece.moves
-    phases = plan_moves(moves, piece.limits, machine.firmware)
+    phases = plan_moves(moves, piece.limits, machine)
     assert len(phases) == len(moves)

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.firmware.klipper.planner import Planner, join_phases
+from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
 from models.machine import Machine
 

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gcode.errors import GcodeError
+from gcode.firmware.planning import plan_moves
 from gcode.pieces import Passage, Piece
 from gcode.types import EventKind
 from models.machine import AxisTravel, Machine
@@ -225,3 +227,75 @@ def test_off_holds_until_the_end_and_through_homing(machine):
 
 def pieces_of_head(machine: Machine) -> list[bytes]:
     return [piece.text for piece in pieces_of(HEAD, machine)]
+
+
+@pytest.mark.parametrize(
+    ("lines", "line"),
+    [
+        ("G1 X120 E1 F.5\n", 7),
+        ("G1 X61 E1 F600\nSET_VELOCITY_LIMIT VELOCITY=1e-9 ACCEL=100\nG1 X62 E1\n", 9),
+        ("SET_VELOCITY_LIMIT ACCEL=1e-9\nG1 X70 E.1\n", 8),
+        ("G1 E50 F2\n", 7),
+    ],
+)
+@pytest.mark.parametrize("compensate", [True, False])
+def test_moves_that_hardly_end(
+    machine: Machine, lines: str, line: int, *, compensate: bool
+) -> None:
+    """By the plan, not by F: the limits in force may be what is slow."""
+
+    def plan() -> None:
+        for item in cut((HEAD + lines).encode(), machine, compensate=compensate):
+            plan_moves(item.moves, item.limits, machine)
+
+    with pytest.raises(
+        GcodeError, match=f"line {line}: the move takes .*more than 20 min; correct"
+    ):
+        plan()
+
+
+def test_moves_that_last_leave_as_they_came(machine: Machine) -> None:
+    """A move of two minutes under a low limit is a passage; the pieces beside it stay."""
+    slow = "SET_VELOCITY_LIMIT VELOCITY=.5\nG1 X60 Y110 E1\nSET_VELOCITY_LIMIT VELOCITY=300\n"
+    text = HEAD + "G1 X90 E1 F6000\nG1 X60 E1\n" + slow + "G1 X90 E1\nG1 X60 E1\n"
+    items = cut(text.encode(), machine)
+    check(items, text.encode())
+    pieces = [b"\n".join(x.text.splitlines()) for x in items if isinstance(x, Piece)]
+    assert b"G1 X90 E1 F6000\nG1 X60 E1" in pieces
+    assert b"G1 X90 E1\nG1 X60 E1" in pieces
+    assert not any(b"Y110" in piece for piece in pieces)
+
+
+def test_a_climb_from_a_height_that_nobody_knows_stays(machine: Machine) -> None:
+    """Our lines would name its Z."""
+    text = "G28 X Y\nG1 X60 Y50 F6000\nG1 X70 E1\nG91\nG1 X5 Z.2 E1\nG90\nG1 X80 E1\nG1 X60 E1\n"
+    items = cut(text.encode(), machine)
+    pieces = [x.text for x in items if isinstance(x, Piece)]
+    assert any(b"X80" in piece for piece in pieces)
+    assert not any(b"Z.2" in piece for piece in pieces)
+
+
+@pytest.mark.parametrize(("fed", "ours"), [(9.0, True), (40.0, False), (-40.0, False)])
+def test_a_wild_extruder_leaves_as_it_came(machine: Machine, fed: float, ours: bool) -> None:
+    """Forty mm of filament on one of way: no print does that, and a stream would creep along."""
+    firmware = machine.firmware.model_copy(
+        update={
+            "extruder": machine.firmware.extruder.model_copy(
+                update={"max_extrude_cross_section_mm2": 1e9}
+            )
+        }
+    )
+    loose = machine.model_copy(update={"firmware": firmware})
+    text = HEAD + f"G1 X80 E1 F6000\nG1 X81 E{fed}\nG1 X60 E1\n"
+    pieces = [x.text for x in cut(text.encode(), loose) if isinstance(x, Piece)]
+    assert any(b"X81" in piece for piece in pieces) is ours
+    assert any(b"X80" in piece for piece in pieces)
+
+
+@pytest.mark.parametrize("chunk", [1, 1 << 17])
+def test_a_line_that_finds_the_height_stays(machine: Machine, chunk: int) -> None:
+    """Z is guessed at 0: behind a start macro that left it elsewhere this line moves it."""
+    text = b"G1 X104 Y100 F3000\nG1 Y189 E3\nG1 X107 Z0 E1\nG1 X90 E1\nG1 Y100 E1\n"
+    pieces = [x.text for x in cut(text, machine, chunk=chunk) if isinstance(x, Piece)]
+    assert b"".join(pieces).count(b"E") == 3
+    assert not any(b"Z0" in piece for piece in pieces)

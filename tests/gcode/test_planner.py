@@ -10,13 +10,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
-from gcode.firmware.klipper.planner import Planner, join_phases, plan_moves
+from gcode.firmware.klipper.limits import KlipperLimits
+from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
-from gcode.types import Limits, Moves, Phases
-from models.machine import Klipper, Machine
+from gcode.types import Moves, Phases
+from models.firmware import Klipper
+from models.machine import Machine
 
 FIRMWARE = Klipper()
-LIMITS = [Limits(500.0, 5000.0, 5.0, 0.5), Limits(80.0, 1000.0, 8.0, 0.0)]
+LIMITS = [KlipperLimits(500.0, 5000.0, 5.0, 0.5), KlipperLimits(80.0, 1000.0, 8.0, 0.0)]
 
 
 def moves_of(
@@ -39,11 +42,17 @@ def moves_of(
         layer=small,
         feature=small,
         object_id=small,
+        tool=small,
     )
 
 
 def part_of(moves: Moves, a: int, b: int) -> Moves:
     return Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__))
+
+
+def plan_moves(moves: Moves, limits: list[KlipperLimits], firmware: Klipper) -> Phases:
+    planner = Planner(firmware)
+    return join_phases([planner.push_moves(moves, limits), planner.flush()])
 
 
 def duration(phases: Phases) -> float:
@@ -133,7 +142,9 @@ def test_nothing() -> None:
 # The rules once more, in plain Python, from the description of the firmware
 
 
-def twin(moves: Moves, limits: list[Limits], firmware: Klipper) -> list[tuple[float, float, float]]:
+def twin(
+    moves: Moves, limits: list[KlipperLimits], firmware: Klipper
+) -> list[tuple[float, float, float]]:
     """Squared start, cruise and end speed of every move with a displacement."""
     planner, extruder = firmware.planner, firmware.extruder
     rows = []

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
+from math import comb
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.klipper.planner import Planner, join_phases
+from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
 from gcode.sampler import Sampler, Samples, sample_phases
 from gcode.types import Phases
@@ -65,11 +68,11 @@ def test_ends_and_stand(plan: Phases) -> None:
 def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> None:
     sampler = Sampler(dt_s)
     bounds = [0, *sorted(min(cut, len(plan)) for cut in cuts), len(plan)]
-    parts: list[Samples] = [
-        sampler.push(Phases(*(getattr(plan, name)[a:b] for name in Phases.__dataclass_fields__)))
-        for a, b in pairwise(bounds)
-    ]
-    parts.append(sampler.flush())
+    parts: list[Samples] = []
+    for a, b in pairwise(bounds):
+        part = Phases(*(getattr(plan, name)[a:b] for name in Phases.__dataclass_fields__))
+        parts += sampler.push(part)
+    parts += sampler.flush()
     t_s = np.concatenate([part.t_s for part in parts])
     np.testing.assert_array_equal(t_s, np.arange(len(t_s)) * dt_s)
     position, row = sample_phases(plan, t_s)
@@ -79,6 +82,8 @@ def test_streaming_has_no_gap(plan: Phases, cuts: list[int], dt_s: float) -> Non
         np.concatenate([p.move_index for p in parts]), plan.move_index[row]
     )
     assert position[:, -1] == pytest.approx([0, 10, 1, 1], abs=1e-9)
+    end_s = plan.t_s + plan.accel_s + plan.cruise_s + plan.decel_s
+    np.testing.assert_array_equal(np.concatenate([p.moving for p in parts]), t_s <= end_s[row])
 
 
 def test_refused(plan: Phases) -> None:
@@ -91,4 +96,42 @@ def test_refused(plan: Phases) -> None:
         sample_phases(plan, (0.0, 0.0, 1))
     with pytest.raises(ValueError, match="above 0"):
         Sampler(0.0)
-    assert len(Sampler(1.0).push(none)) == len(Sampler(1.0).flush()) == 0
+    assert [*Sampler(1.0).push(none), *Sampler(1.0).flush()] == []
+
+
+def test_hours_come_in_parts(plan: Phases) -> None:
+    """A dwell of a day in front of the last move: as many samples, never all at once."""
+    late = replace(plan, t_s=plan.t_s + np.where(np.arange(len(plan)) == len(plan) - 1, 86400, 0))
+    sampler = Sampler(0.01)
+    lengths = [len(part) for part in sampler.push(late)]
+    assert max(lengths) <= 1 << 17
+    assert sum(lengths) == pytest.approx(8.64e6, rel=1e-3)
+
+
+def test_s_curves_are_marlins_bezier(plan: Phases) -> None:
+    """Velocity by Bernstein's formula with three equal control points at either end, summed up."""
+    curved = replace(plan, s_curve=np.ones(len(plan), dtype=bool))
+    end = plan.t_s[-1] + plan.accel_s[-1] + plan.cruise_s[-1] + plan.decel_s[-1]
+    dt = 1e-5
+    t = np.arange(0.0, end, dt)
+    position, row = sample_phases(curved, t)
+    speed = np.zeros(len(t))
+    slows = plan.t_s + plan.accel_s + plan.cruise_s
+    for v0, v1, length, begin in (
+        (plan.start_mm_s, plan.cruise_mm_s, plan.accel_s, plan.t_s),
+        (plan.cruise_mm_s, plan.end_mm_s, plan.decel_s, slows),
+    ):
+        inside = (t >= begin[row]) & (t < begin[row] + length[row]) & (length[row] > 0.0)
+        at = row[inside]
+        u = (t[inside] - begin[at]) / length[at]
+        high = sum(comb(5, i) * u**i * (1.0 - u) ** (5 - i) for i in (3, 4, 5))
+        speed[inside] = v0[at] * (1.0 - high) + v1[at] * high
+    cruise = (t >= (plan.t_s + plan.accel_s)[row]) & (t < slows[row])
+    speed[cruise] = plan.cruise_mm_s[row[cruise]]
+    velocity = plan.direction[row].T * speed
+    summed = np.cumsum(velocity, axis=1) * dt
+    np.testing.assert_allclose(position - position[:, :1], summed, atol=5e-3)
+    # The same time and way as without the curve.
+    straight, _ = sample_phases(plan, np.append(plan.t_s, end))
+    bent, _ = sample_phases(curved, np.append(plan.t_s, end))
+    np.testing.assert_allclose(bent, straight, atol=1e-9)

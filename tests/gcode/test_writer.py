@@ -14,7 +14,8 @@ import pytest
 
 from gcode.interpreter import Interpreter
 from gcode.types import EventKind
-from models.machine import FirmwareShaper, Machine
+from models.firmware.klipper import FirmwareShaper
+from models.machine import Machine
 from models.store import load_machine
 from service.pipeline.options import Options
 from service.pipeline.result import Result
@@ -304,3 +305,17 @@ def test_filament_adds_up(road: Road, machine: Machine) -> None:
         reader.push(data)
         ends.append(reader.position_mm)
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("height", ["", "G1 Z.3\n"])
+def test_a_height_that_the_file_leaves_alone_is_not_named(road: Road, height: str) -> None:
+    """Off the grid, or unknown behind a start macro: naming it would drive the nozzle there."""
+    text = (
+        "START_PRINT\nG90\nM83\n" + height + "G1 X50 Y50 F6000\n"
+        "SET_GCODE_OFFSET Z_ADJUST=0.009174993 MOVE=1 MOVE_SPEED=5\n"
+        "G1 X80 Y50 E1 F6000\nG1 X80 Y90 E1\nG1 E-1 F2100\nG1 X50 F6000\nG1 E1 F2100\nM400\n"
+    )
+    lines = check(road, text)
+    assert any(line.startswith(b"; stillpath: stream on") for line in lines)
+    named = [line for line in lines if re.match(rb"G1 .*Z", line)]
+    assert [line.split(b" ;#")[0] for line in named] == height.encode().splitlines()

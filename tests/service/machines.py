@@ -5,7 +5,8 @@ from __future__ import annotations
 from datetime import date
 from typing import Any
 
-from models.machine import Machine, PlannerLimits
+from models.firmware.klipper import PlannerLimits
+from models.machine import Machine
 from models.plants import PlantSetSpec
 from models.store import load_machine
 

@@ -82,6 +82,8 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
         "along": None,
         "plate": None,
         "tolerance_um": 2.0,
+        "times": "new",
+        "dialect": None,
     }
     result = client.get(job["links"]["result"])
     assert result.content == b"; compensated\nG1 X1\n"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +15,8 @@ import pytest
 from compensation.base import DesignError
 from gcode.errors import GcodeError
 from service.cli import run
+from service.pipeline.files import replacing
+from service.pipeline.motion import PlannedTime
 from service.pipeline.options import Options
 from service.pipeline.progress import Progress
 from service.version import __version__
@@ -34,14 +38,17 @@ def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
         target.write_bytes(b"; compensated\n" + source.read_bytes())
         return make_result(layers=2)
 
-    def simulate_file(source, machine, *, plate=None, cache_dir=None, progress=None):
-        seen.plate = plate
+    def simulate_file(source, machine, *, plate=None, dialect=None, cache_dir=None, progress=None):
+        seen.plate, seen.dialect = plate, dialect
         seen.behave()
         return make_result(channels=("before", "shaper"), layers=2)
 
-    def plan_file(source, target_npz, machine, *, rate_hz=1000.0, plate=None, progress=None):
-        seen.rate_hz, seen.plate = rate_hz, plate
+    def plan_file(
+        source, target_npz, machine, *, rate_hz=1000.0, plate=None, dialect=None, progress=None
+    ):
+        seen.rate_hz, seen.plate, seen.dialect = rate_hz, plate, dialect
         target_npz.write_bytes(b"npz")
+        return PlannedTime(12.0, "Slicer", 11.0, ["the file is for Marlin"])
 
     module = types.ModuleType("service.pipeline.road")
     module.compensate_file = compensate_file
@@ -95,6 +102,8 @@ def test_options_reach_the_road(road, source, tmp_path):
         "2",
         "--plate",
         "3",
+        "--dialect",
+        "marlin",
     ]
     assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
     assert road.machine == "voron-v0"
@@ -105,6 +114,8 @@ def test_options_reach_the_road(road, source, tmp_path):
         "along": 0.1,
         "plate": 3,
         "tolerance_um": 2.0,
+        "times": "new",
+        "dialect": "marlin",
     }
 
 
@@ -194,8 +205,13 @@ def test_a_bug_is_not_dressed_up_as_a_bad_file(road, source, tmp_path):
 def test_plan_and_simulate(road, source, tmp_path, capsys):
     motion, report = tmp_path / "motion.npz", tmp_path / "report"
     plan = ["plan", str(source), "-m", "ender3"]
-    assert run([*plan, "-o", str(motion), "--rate", "500"]) == 0
-    assert road.rate_hz == 500.0
+    assert run([*plan, "-o", str(motion), "--rate", "500", "--dialect", "klipper"]) == 0
+    assert (road.rate_hz, road.dialect) == (500.0, "klipper")
+    out, err = capsys.readouterr()
+    assert "print time 12.0 s; Slicer says 11 s" in out
+    assert "warning: the file is for Marlin" in err
+    assert run([*plan, "-o", str(motion), "--dialect", "grbl"]) == 2
+    assert "dialect: " in capsys.readouterr().err
     assert run([*plan, "-o", str(source)]) == 2
     assert source.read_bytes() == TEXT
     assert run([*plan, "-o", str(motion), "--rate", "0"]) == 2
@@ -252,3 +268,40 @@ def test_a_job_loads_only_what_it_needs():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert ran.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
+def test_pipes_and_devices_are_neither_read_nor_replaced(road, source, tmp_path, capsys):
+    pipe, out = tmp_path / "pipe", tmp_path / "out.gcode"
+    os.mkfifo(pipe)
+    for command in (
+        ["compensate", str(pipe), "-m", "ender3", "-o", str(out)],
+        ["simulate", str(pipe), "-m", "ender3", "--report", str(tmp_path / "report")],
+        ["compensate", str(source), "-m", "ender3", "-o", str(pipe)],
+        ["plan", str(source), "-m", "ender3", "-o", str(pipe)],
+    ):
+        assert run(command) == 2
+        assert f"{pipe} is a pipe or a device; " in one_line(capsys)
+    with pytest.raises(OSError, match="is no regular file"), replacing(pipe):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["part.gcode", "pipe"]
+
+
+def test_the_longest_name_that_a_file_can_have(tmp_path):
+    target = tmp_path / ("ü" * 124 + ".gcode")
+    with replacing(target) as temporary:
+        temporary.write_bytes(TEXT)
+    assert target.read_bytes() == TEXT
+
+
+def test_a_full_disk_is_told_with_its_place(road, source, tmp_path, capsys):
+    target = tmp_path / "out.gcode"
+
+    def full():
+        with replacing(target):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    road.behave = full
+    assert compensate(source, "-o", str(target), "-m", "ender3") == 1
+    assert f"{target}: No space left on device; make room there" in one_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]

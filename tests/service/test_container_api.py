@@ -56,7 +56,7 @@ def test_the_result_is_of_the_kind_that_came(
     path.write_bytes(result.content)
     with open_text(path) as container:
         assert container.kind.value == media
-        assert container.text.read().startswith(b"; Processed by stillpath ")
+        assert b"; Processed by stillpath " in container.text.read()
 
 
 @pytest.mark.slow

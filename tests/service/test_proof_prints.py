@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.firmware.klipper.planner import Planner, join_phases
+from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
 from gcode.types import Moves
 from models.errors import ModelError
-from models.machine import AxisTravel, FirmwareShaper, Machine
+from models.firmware.klipper import FirmwareShaper
+from models.machine import AxisTravel, Machine
 from models.plants import Mode, ModesSpec
 from models.store import builtin_machines, load_machine
 from service.cli import run

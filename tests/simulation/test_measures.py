@@ -13,7 +13,6 @@ from simulation.measures import (
     ContourMeter,
     GroupTally,
     MotionMeter,
-    ResidualMeter,
     Tally,
     contour_error,
     distance_to_path,
@@ -52,12 +51,12 @@ def test_contour_meter_is_brute_force(
     y_d, y = wander(seed, n, deviation)
     meter = ContourMeter(1e-3, window * 1e-3, stride)
     edges = [0, *sorted(min(c, n) for c in cuts), n]
-    parts = [meter.push(y_d[:, a:b], y[:, a:b]) for a, b in pairwise(edges)]
+    parts = [meter.push(y_d[:, a:b], y[None, :, a:b]) for a, b in pairwise(edges)]
     parts.append(meter.flush())
     index = np.concatenate([part.index for part in parts])
     np.testing.assert_array_equal(index, np.arange(0, n, stride))
     expected = [brute_force(y_d, y, i, window) for i in index]
-    errors = np.concatenate([part.error_mm for part in parts])
+    errors = np.concatenate([part.error_mm[0] for part in parts])
     np.testing.assert_allclose(errors, expected, atol=1e-12)
     np.testing.assert_allclose(
         distance_to_path(y_d, y[:, index], index, 1e-3, window * 1e-3), expected, atol=1e-12
@@ -76,7 +75,7 @@ def test_contour_error_of_a_late_point_is_zero_on_a_straight_line() -> None:
 def test_few_segments_are_looked_at() -> None:
     y_d = np.vstack([np.arange(20_000) * 0.1, np.zeros(20_000)])
     meter = ContourMeter()
-    meter.push(y_d, y_d + 0.01)
+    meter.push(y_d, y_d[None] + 0.01)
     # 160 segments in each window.
     assert meter.evaluations < 20 * 10_000
 
@@ -84,43 +83,54 @@ def test_few_segments_are_looked_at() -> None:
 @given(st.integers(0, 1000), st.lists(st.integers(0, 400), max_size=3))
 @settings(max_examples=25, deadline=None)
 def test_motion_meter_adds_up(seed: int, cuts: list[int]) -> None:
-    n = 400
+    n, stride = 400, 3
     y_d, y = wander(seed, n, 0.02)
-    rng = np.random.default_rng(seed)
-    extruding = rng.random(n) < 0.6
-    layer = np.sort(rng.integers(-1, 4, n)).astype(np.int32)
-    feature = rng.integers(-1, 3, n).astype(np.int32)
-    meter = MotionMeter(stride=1)
-    edges = [0, *sorted(cuts), n]
-    for a, b in pairwise(edges):
-        meter.push(y_d[:, a:b], y[:, a:b], extruding[a:b], layer[a:b], feature[a:b])
+    answers = np.stack([y, y_d + 0.5 * (y - y_d)])
+    extruding = np.random.default_rng(seed).random(n) < 0.6
+    meter = MotionMeter(stride=stride, channels=2)
+    for a, b in pairwise([0, *sorted(cuts), n]):
+        meter.push(y_d[:, a:b], answers[:, :, a:b], extruding[a:b])
     meter.flush()
-    contour = np.array([brute_force(y_d, y, i, 80) for i in range(n)])
-    tracking = np.hypot(*(y - y_d))
-    for tally, values in (
-        (meter.contour_all, contour),
-        (meter.contour_extruding, contour[extruding]),
-        (meter.tracking_all, tracking),
-        (meter.tracking_extruding, tracking[extruding]),
-    ):
-        assert tally.count == len(values)
-        assert tally.rms == pytest.approx(np.sqrt(np.mean(values**2)))
-        assert tally.max == pytest.approx(values.max())
-    for groups, ids in ((meter.layers, layer), (meter.features, feature)):
-        found = groups.tallies()
-        assert sorted(found) == sorted(set(ids[extruding].tolist()))
-        for i, tally in found.items():
-            values = contour[extruding & (ids == i)]
+    for c, answer in enumerate(answers):
+        contour = np.array([brute_force(y_d, answer, i, 80) for i in range(0, n, stride)])
+        tracking = np.hypot(*(answer - y_d))
+        for tally, values in (
+            (meter.contour_all[c], contour),
+            (meter.contour_extruding[c], contour[extruding[::stride]]),
+            (meter.tracking_all[c], tracking),
+            (meter.tracking_extruding[c], tracking[extruding]),
+        ):
+            assert tally.count == len(values)
             assert tally.rms == pytest.approx(np.sqrt(np.mean(values**2)))
             assert tally.max == pytest.approx(values.max())
 
 
+@given(st.integers(0, 1000), st.lists(st.integers(0, 60), max_size=3))
+@settings(max_examples=25, deadline=None)
+def test_groups_add_up(seed: int, cuts: list[int]) -> None:
+    n = 60
+    rng = np.random.default_rng(seed)
+    values, groups = rng.random((2, n)), rng.integers(-1, 4, n).astype(np.int32)
+    use = rng.random(n) < 0.6
+    tally = GroupTally(2)
+    for a, b in pairwise([0, *sorted(cuts), n]):
+        tally.add(values[:, a:b], groups[a:b], use[a:b])
+    for c, row in enumerate(values):
+        found = tally.tallies(c)
+        assert sorted(found) == sorted(set(groups[use].tolist()))
+        for i, one in found.items():
+            mine = row[use & (groups == i)]
+            assert one.count == len(mine)
+            assert one.rms == pytest.approx(np.sqrt(np.mean(mine**2)))
+            assert one.max == pytest.approx(mine.max())
+
+
 def test_groups_grow_both_ways() -> None:
-    groups = GroupTally()
+    groups = GroupTally(1)
     use = np.array([True, True])
-    groups.add(np.array([1.0, 2.0]), np.array([5, 5], np.int32), use)
-    groups.add(np.array([3.0, 4.0]), np.array([-1, 9], np.int32), use)
-    groups.add(np.zeros(0), np.zeros(0, np.int32), np.zeros(0, bool))
+    groups.add(np.array([[1.0, 2.0]]), np.array([5, 5], np.int32), use)
+    groups.add(np.array([[3.0, 4.0]]), np.array([-1, 9], np.int32), use)
+    groups.add(np.zeros((1, 0)), np.zeros(0, np.int32), np.zeros(0, bool))
     assert {k: t.max for k, t in groups.tallies().items()} == {-1: 3.0, 5: 2.0, 9: 4.0}
     assert Tally().rms == 0.0
 
@@ -135,17 +145,19 @@ def test_residual_vibration(block: int) -> None:
     )  # fmt: skip
     y_d = np.vstack([x, np.zeros_like(x)])
     y = y_d + np.vstack([np.sin(np.arange(len(x))), np.zeros_like(x)])
-    meter = ResidualMeter()
+    meter, extruding = MotionMeter(), np.zeros(len(x), bool)
     for a in range(0, len(x), block):
-        meter.push(y_d[:, a : a + block], y[:, a : a + block])
+        part = slice(a, a + block)
+        meter.push(y_d[:, part], y[None, :, part], extruding[part])
     error = np.abs(y - y_d)[0]
     used = np.concatenate([error[99:199], error[509:570]])
     assert meter.rests == 2
-    assert meter.tally.count == len(used)
-    assert meter.tally.rms == pytest.approx(np.sqrt(np.mean(used**2)))
-    assert meter.tally.max == pytest.approx(used.max())
+    tally = meter.residual[0]
+    assert tally.count == len(used)
+    assert tally.rms == pytest.approx(np.sqrt(np.mean(used**2)))
+    assert tally.max == pytest.approx(used.max())
 
 
 def test_bad_shapes() -> None:
     with pytest.raises(ValueError, match="must be"):
-        ContourMeter().push(np.zeros((2, 3)), np.zeros((2, 4)))
+        ContourMeter().push(np.zeros((2, 3)), np.zeros((1, 2, 4)))

@@ -104,3 +104,16 @@ def test_blends_over_the_position() -> None:
     np.testing.assert_allclose(y[2001:], answers[100.0][2001:], atol=1e-10)
     # Never faster than at resonance: no step where one plant gives way to the next.
     assert np.max(np.abs(np.diff(y))) < 1.05 * 2 * np.pi * 33.0 * DT_S / (2 * 0.06)
+
+
+def test_stands_still_as_if_it_had_just_begun(growing: Machine) -> None:
+    """What was before is forgotten, and not remembered for plants to come."""
+    heavy, u = OperatingPoint(mass_kg=1.0), stroke()
+    used, fresh = MachineStream(growing, DT_S), MachineStream(growing, DT_S, heavy)
+    used.push(5.0 + u, u)
+    used.operate_at(heavy)
+    used.stand()
+    np.testing.assert_array_equal(used.push(u, u), fresh.push(u, u))
+    used.stand()
+    used.operate_at(OperatingPoint())
+    np.testing.assert_array_equal(used.push(u, u), MachineStream(growing, DT_S).push(u, u))

@@ -13,159 +13,133 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gcode.commands import cancel_object, home, retract
+from gcode.dialect import NEEDED, Action, Dialect, Word, words
+from gcode.firmware.klipper import commands
 from gcode.types import EventKind
-from models.machine import Klipper
+from models.firmware import Klipper
 
-__all__ = ["HANDBACK", "Action", "classify", "word_table"]
+__all__ = ["klipper"]
 
-
-class Action:
-    """Codes of the words that the kernel carries out itself (above every `EventKind`)."""
-
-    MOVE = 20
-    ARC_CW = 21
-    ARC_CCW = 22
-    DWELL = 23
-    PLANE_XY = 24
-    PLANE_XZ = 25
-    PLANE_YZ = 26
-    INCHES = 27
-    ABSOLUTE = 28
-    RELATIVE = 29
-    SET_POSITION = 30
-    ABSOLUTE_E = 31
-    RELATIVE_E = 32
-    ACCELERATION = 33
-    SPEED_FACTOR = 34
-    EXTRUDE_FACTOR = 35
-
-
-HANDBACK = -1
-"""The kernel hands the line back to Python."""
-
-TABLE_SIZE = 1024
-
-
-def _words(text: str) -> list[str]:
-    return text.split()
-
-
-KERNEL_WORDS = {
+KERNEL_WORDS: dict[str, Word] = {
     "G0": Action.MOVE,
     "G1": Action.MOVE,
-    "G2": Action.ARC_CW,
-    "G3": Action.ARC_CCW,
     "G4": Action.DWELL,
-    "G17": Action.PLANE_XY,
-    "G18": Action.PLANE_XZ,
-    "G19": Action.PLANE_YZ,
-    "G20": Action.INCHES,
+    "G20": Action.REFUSED,
     "G90": Action.ABSOLUTE,
     "G91": Action.RELATIVE,
     "G92": Action.SET_POSITION,
     "M82": Action.ABSOLUTE_E,
     "M83": Action.RELATIVE_E,
-    "M204": Action.ACCELERATION,
     "M220": Action.SPEED_FACTOR,
     "M221": Action.EXTRUDE_FACTOR,
 }
 
-PYTHON_WORDS = frozenset({"G10", "G11", "G28", "M486"})
-"""Classic words that Python carries out."""
+ARC_WORDS: dict[str, Word] = {
+    "G2": Action.ARC_CW,
+    "G3": Action.ARC_CCW,
+    "G17": Action.PLANE_XY,
+    "G18": Action.PLANE_XZ,
+    "G19": Action.PLANE_YZ,
+}
 
-NATIVE: dict[str, EventKind] = {
+PYTHON_WORDS: dict[str, Word] = {
+    "G28": home,
+    "M204": commands.acceleration,
+    "M486": cancel_object,
+    "T": commands.tool,
+    "ACTIVATE_EXTRUDER": commands.activate_extruder,
+    "SET_VELOCITY_LIMIT": commands.velocity_limit,
+    "SET_GCODE_OFFSET": commands.gcode_offset,
+    "SAVE_GCODE_STATE": commands.save_state,
+    "RESTORE_GCODE_STATE": commands.restore_state,
+    "EXCLUDE_OBJECT_START": commands.exclude_object,
+    "EXCLUDE_OBJECT_END": commands.exclude_object,
+}
+
+RETRACTION_WORDS: dict[str, Word] = {
+    "G10": retract,
+    "G11": retract,
+    "SET_RETRACTION": commands.set_retraction,
+}
+
+NATIVE: dict[str, Word] = {
     # Read back, messages, displays: the motion does not notice.
-    **dict.fromkeys(
-        _words(
-            "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M119 M140 M141 "
-            "M155 M300 "
-            "ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
-            "GET_RETRACTION "
-            "QUERY_ENDSTOPS QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
-            "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
-            "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRESSURE_ADVANCE SET_PRINT_STATS_INFO "
-            "SET_GCODE_VARIABLE SAVE_VARIABLE EXCLUDE_OBJECT_DEFINE "
-            "SET_SERVO BED_MESH_OUTPUT BED_MESH_MAP"
-        ),
+    **words(
+        "G21 M20 M23 M27 M73 M104 M105 M106 M107 M110 M114 M115 M117 M118 M119 M140 M141 "
+        "M155 M300 "
+        "ECHO HELP STATUS RESPOND SET_DISPLAY_TEXT SET_DISPLAY_GROUP GET_POSITION "
+        "GET_RETRACTION "
+        "QUERY_ENDSTOPS QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
+        "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
+        "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRESSURE_ADVANCE SET_PRINT_STATS_INFO "
+        "SET_GCODE_VARIABLE SAVE_VARIABLE EXCLUDE_OBJECT_DEFINE "
+        "SET_SERVO BED_MESH_OUTPUT BED_MESH_MAP",
         EventKind.HARMLESS,
     ),
     # Come to rest, wait, go on from the same place.
-    **dict.fromkeys(_words("M400 M109 M190 M191 TEMPERATURE_WAIT"), EventKind.STOP),
+    **words("M400 M109 M190 M191 TEMPERATURE_WAIT", EventKind.STOP),
     # Homing, probing, motors off, transforms, other tools: the place or the state is lost.
-    **dict.fromkeys(
-        _words(
-            "M18 M84 M112 PROBE PROBE_CALIBRATE PROBE_ACCURACY Z_TILT_ADJUST QUAD_GANTRY_LEVEL "
-            "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_CLEAR BED_MESH_OFFSET "
-            "BED_TILT_CALIBRATE BED_SCREWS_ADJUST "
-            "SCREWS_TILT_CALCULATE DELTA_CALIBRATE MANUAL_PROBE MANUAL_STEPPER FORCE_MOVE "
-            "SET_KINEMATIC_POSITION STEPPER_BUZZ SET_STEPPER_ENABLE SET_DUAL_CARRIAGE "
-            "ACTIVATE_EXTRUDER SYNC_EXTRUDER_MOTION SET_EXTRUDER_ROTATION_DISTANCE SET_SKEW "
-            "SKEW_PROFILE TUNING_TOWER TEST_RESONANCES SHAPER_CALIBRATE MEASURE_AXES_NOISE "
-            "PID_CALIBRATE SDCARD_PRINT_FILE SDCARD_RESET_FILE RESTART FIRMWARE_RESTART "
-            "EXCLUDE_OBJECT EXCLUDE_OBJECT_RESET"
-        ),
+    **words(
+        "M18 M84 M112 PROBE PROBE_CALIBRATE PROBE_ACCURACY Z_TILT_ADJUST QUAD_GANTRY_LEVEL "
+        "BED_MESH_CALIBRATE BED_MESH_PROFILE BED_MESH_CLEAR BED_MESH_OFFSET "
+        "BED_TILT_CALIBRATE BED_SCREWS_ADJUST "
+        "SCREWS_TILT_CALCULATE DELTA_CALIBRATE MANUAL_PROBE MANUAL_STEPPER FORCE_MOVE "
+        "SET_KINEMATIC_POSITION STEPPER_BUZZ SET_STEPPER_ENABLE SET_DUAL_CARRIAGE "
+        "SYNC_EXTRUDER_MOTION SET_EXTRUDER_ROTATION_DISTANCE SET_SKEW "
+        "SKEW_PROFILE TUNING_TOWER TEST_RESONANCES SHAPER_CALIBRATE MEASURE_AXES_NOISE "
+        "PID_CALIBRATE SDCARD_PRINT_FILE SDCARD_RESET_FILE RESTART FIRMWARE_RESTART "
+        "EXCLUDE_OBJECT EXCLUDE_OBJECT_RESET",
         EventKind.UNKNOWN,
     ),
     "SET_INPUT_SHAPER": EventKind.SHAPER,
 }
 
-FOREIGN = frozenset(
+FOREIGN: dict[str, Word] = words(
     # Words of other firmwares that slicers write into every file.
-    _words(
-        "G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M142 M145 M149 M150 "
-        "M200 M201 M202 M203 M205 M206 M207 M208 M209 M211 M218 M301 M302 M303 M304 M355 M420 M500 "
-        "M501 M502 M503 M556 M557 M558 M566 M569 M571 M572 M573 M574 M579 M581 M582 M584 M587 M593 "
-        "M595 M605 M620 M621 M622 M623 M624 M625 M710 M851 M862.1 M862.2 M862.3 M862.4 M862.5 "
-        "M862.6 "
-        "M900 M906 M907 M913 M914 M950 M960 M970.3 M971 M973 M974 M975 M981 M982 M983 M1002 "
-        "G92.1 G60 M861 M863 M864 M865 M221.1 M142.1"
-    )
+    "G26 M3 M4 M5 M17 M72 M74 M75 M76 M77 M80 M81 M92 M108 M113 M126 M127 M142 M145 M149 M150 "
+    "M200 M201 M202 M203 M205 M206 M207 M208 M209 M211 M218 M301 M302 M303 M304 M355 M420 M500 "
+    "M501 M502 M503 M556 M557 M558 M566 M569 M571 M572 M573 M574 M579 M581 M582 M584 M587 M593 "
+    "M595 M605 M620 M621 M622 M623 M624 M625 M710 M851 M862.1 M862.2 M862.3 M862.4 M862.5 "
+    "M862.6 "
+    "M900 M906 M907 M913 M914 M950 M960 M970.3 M971 M973 M974 M975 M981 M982 M983 M1002 "
+    "G92.1 G60 M861 M863 M864 M865 M221.1 M142.1",
+    EventKind.HARMLESS,
 )
 
 _NAME = re.compile(r"^[A-Z_][A-Z0-9_.]*$")
 
 
-def classify(name: str, firmware: Klipper) -> EventKind:
-    """Return what a command that the interpreter does not carry out does to the motion.
+def klipper(firmware: Klipper) -> Dialect:
+    """Return how Klipper reads G-code on a machine.
 
     Parameters
     ----------
-    name : str
-        Upper-case command as Klipper cuts it, such as ``M106`` or ``START_PRINT``.
     firmware : Klipper
         Names its macros and says what an unknown name does.
     """
-    if name in _upper(firmware.harmless_macros):
-        return EventKind.HARMLESS
-    if name in _upper(firmware.stopping_macros):
-        return EventKind.STOP
-    if name in NATIVE:
-        return NATIVE[name]
-    if name in FOREIGN or not _NAME.match(name):
+    skipped = firmware.unknown_commands == "skip"
+
+    def otherwise(name: str) -> EventKind:
         # A name that no macro can have is passed over with a message.
-        return EventKind.HARMLESS
-    return EventKind.HARMLESS if firmware.unknown_commands == "skip" else EventKind.UNKNOWN
+        harmless = skipped or not _NAME.match(name)
+        return EventKind.HARMLESS if harmless else EventKind.UNKNOWN
 
-
-def word_table(letter: str, firmware: Klipper) -> NDArray[np.int8]:
-    """Return the class of letter + 0 to 1023: an `EventKind`, an `Action` or HANDBACK."""
-    table = np.empty(TABLE_SIZE, np.int8)
-    for number in range(TABLE_SIZE):
-        name = f"{letter}{number}"
-        if name in PYTHON_WORDS or name in ("M117", "M118", "M23"):
-            table[number] = HANDBACK
-        elif name in KERNEL_WORDS and (firmware.arcs or name not in _ARC_WORDS):
-            table[number] = KERNEL_WORDS[name]
-        else:
-            table[number] = classify(name, firmware)
-    return table
-
-
-_ARC_WORDS = ("G2", "G3", "G17", "G18", "G19")
-
-
-def _upper(names: tuple[str, ...]) -> frozenset[str]:
-    return frozenset(name.upper() for name in names)
+    table = {
+        **FOREIGN,
+        **NATIVE,
+        **{name.upper(): EventKind.STOP for name in firmware.stopping_macros},
+        **{name.upper(): EventKind.HARMLESS for name in firmware.harmless_macros},
+        **KERNEL_WORDS,
+        **(ARC_WORDS if firmware.arcs else {}),
+        **PYTHON_WORDS,
+        **(RETRACTION_WORDS if firmware.retraction else {}),
+    }
+    return Dialect(
+        name="klipper",
+        title="Klipper",
+        words=table,
+        otherwise=otherwise,
+        extended_commands=True,
+        needed={**NEEDED, "G2": "XYZEFRIJK", "G3": "XYZEFRIJK", "G4": "P"},
+    )

@@ -8,24 +8,21 @@ Rules: klippy/toolhead.py, klippy/kinematics/extruder.py, 2026-08.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.klipper import _planner_kernels as kernels
-from gcode.types import EventKind, Limits, Moves, Phases, ProgramBlock
-from models.machine import Klipper
+from gcode.firmware.planning import empty_phases
+from gcode.firmware.queueing import QueuePlanner
+from gcode.types import Moves, Phases
+from models.firmware import Klipper
 
-__all__ = ["STOPPING", "Planner", "join_phases", "plan_moves"]
-
-STOPPING = frozenset({EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER})
-"""Events at which the motion comes to rest."""
-
-_STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
+__all__ = ["Planner"]
 
 
-class Planner:
+class Planner(QueuePlanner):
     """Plan a stream of moves.
 
     Parameters
@@ -39,6 +36,7 @@ class Planner:
     """
 
     def __init__(self, firmware: Klipper) -> None:
+        super().__init__(kernels.Q_SIZE)
         extruder, planner = firmware.extruder, firmware.planner
         area = math.pi * (0.5 * extruder.filament_diameter_mm) ** 2
         section = extruder.max_extrude_cross_section_mm2
@@ -55,90 +53,35 @@ class Planner:
         facts[kernels.C_E_RATIO] = section / area
         facts[kernels.C_NOZZLE] = extruder.nozzle_diameter_mm
         self._facts = facts
-        self._queue = np.empty((1024, kernels.Q_SIZE))
-        self._count = 0
         self._retry = 0
-        self._moves = 0
-        self._begun = False
-        self._time_s = 0.0
-        self._limits = np.empty((0, 4))
 
-    @property
-    def time_s(self) -> float:
-        """When the last planned move or dwell ends."""
-        return self._time_s
+    def _due(self) -> bool:
+        # A queue that settles nothing is not searched again before it has doubled.
+        return self._count >= self._retry
 
-    def push(self, block: ProgramBlock) -> Phases:
-        """Plan the moves of a block, with the stops that its events bring.
-
-        Raises
-        ------
-        GcodeError
-            For a move that Klipper's extruder refuses.
-        """
-        self._moves = block.first_move
-        events = block.events
-        parts = []
-        begun = 0
-        for row in np.flatnonzero(np.isin(events.kind, _STOPPING)).tolist():
-            end = int(events.move_index[row]) - block.first_move
-            parts.append(self._plan(block.moves, begun, end, block.limits))
-            parts.append(self.stop(float(events.dwell_s[row])))
-            begun = end
-        parts.append(self._plan(block.moves, begun, len(block.moves), block.limits))
-        return join_phases(parts)
-
-    def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
-        """Plan moves that follow the last ones without a stop; return what is settled by now.
-
-        Parameters
-        ----------
-        limits : sequence of Limits
-            The table of `Moves.limits_id`; it may only grow.
-        """
-        return self._plan(moves, 0, len(moves), limits)
-
-    def stop(self, dwell_s: float = 0.0) -> Phases:
-        """Come to rest after the last move and stand for `dwell_s`."""
-        phases = self._take(final=True)
-        if self._begun:
-            self._time_s += dwell_s
-        return phases
-
-    def flush(self) -> Phases:
-        """Come to rest; return all that is left."""
-        return self.stop()
-
-    def _plan(self, moves: Moves, begun: int, end: int, limits: Sequence[Limits]) -> Phases:
-        n = end - begun
-        if n == 0:
-            return _empty()
-        self._note_limits(limits)
-        if self._count + n > len(self._queue):
-            larger = np.empty((2 * (self._count + n), kernels.Q_SIZE))
-            larger[: self._count] = self._queue[: self._count]
-            self._queue = larger
+    def _append(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+    ) -> tuple[int, int]:
         self._count, problem, bad = kernels.append(
-            moves.start_mm[begun:end],
-            moves.end_mm[begun:end],
-            moves.speed_mm_s[begun:end],
-            moves.limits_id[begun:end],
+            start_mm,
+            end_mm,
+            speed_mm_s,
+            limits_id,
             self._limits,
             self._facts,
             self._moves,
             self._queue,
             self._count,
         )
-        if problem != kernels.OK:
-            raise self._error(problem, moves, begun + bad)
-        self._moves += n
-        self._begun = self._begun or self._count > 0
-        # A queue that settles nothing is not searched again before it has doubled.
-        return self._take(final=False) if self._count >= self._retry else _empty()
+        return problem, bad
 
     def _take(self, *, final: bool) -> Phases:
         settled = kernels.look_ahead(self._queue, self._count, final)
-        phases = _empty(settled)
+        phases = empty_phases(settled)
         times, speeds = np.empty((4, settled)), np.empty((4, settled))
         self._time_s = kernels.emit(
             self._queue,
@@ -165,21 +108,8 @@ class Planner:
             speeds[2],
             speeds[3],
             phases.move_index,
+            phases.s_curve,
         )
-
-    def _note_limits(self, limits: Sequence[Limits]) -> None:
-        if len(limits) != len(self._limits):
-            self._limits = np.array(
-                [
-                    (
-                        limit.velocity_mm_s,
-                        limit.accel_mm_s2,
-                        limit.square_corner_velocity_mm_s,
-                        limit.minimum_cruise_ratio,
-                    )
-                    for limit in limits
-                ]
-            )
 
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
         line = int(moves.line[row])
@@ -199,40 +129,3 @@ class Planner:
                 line=line,
             )
         return GcodeError("speed and acceleration of a move must be above 0", line=line)
-
-
-def plan_moves(moves: Moves, limits: Sequence[Limits], firmware: Klipper) -> Phases:
-    """Plan moves from rest to rest."""
-    planner = Planner(firmware)
-    return join_phases([planner.push_moves(moves, limits), planner.flush()])
-
-
-def join_phases(parts: Sequence[Phases]) -> Phases:
-    """Put phases one behind the other."""
-    parts = [part for part in parts if len(part)]
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        return _empty()
-    return Phases(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in Phases.__dataclass_fields__
-        )
-    )
-
-
-def _empty(n: int = 0) -> Phases:
-    return Phases(
-        t_s=np.empty(n),
-        accel_s=np.empty(n),
-        cruise_s=np.empty(n),
-        decel_s=np.empty(n),
-        start_mm=np.empty((n, 4)),
-        direction=np.empty((n, 4)),
-        start_mm_s=np.empty(n),
-        cruise_mm_s=np.empty(n),
-        end_mm_s=np.empty(n),
-        accel_mm_s2=np.empty(n),
-        move_index=np.empty(n, np.int64),
-    )

@@ -12,25 +12,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware.klipper._encoder_kernels import format_moves
-from gcode.firmware.klipper.encoder import Encoded
+from gcode.firmware._writing_kernels import format_moves
+from gcode.firmware.base import FirmwareKit
+from gcode.firmware.encoding import Encoded
 from gcode.pieces import Passage, Piece
 from gcode.types import EventKind, Limits, ModalState
-from models.machine import Machine
 
-__all__ = ["KlipperWriter"]
+__all__ = ["StreamWriter"]
 
-IN_STREAM_MARK_MM_S = 5e-7
-"""Added to the square corner velocity while the file's own moves run inside a stream."""
 _BYTES_PER_LINE = 96
-_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?G[01](?![0-9])", re.IGNORECASE)
+_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
+_FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G0*[0-35](?![\d.])", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
 _SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 _POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")
 _EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)")
 _E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)", re.IGNORECASE)
+_VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
+_SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
 _LEAST_GAP_MM = 1e-7
-_STOP = b"G4 P0 ; stand still\n"
+_FAR_MM = 10.0
+"""32-bit floats hold a micrometre up to here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,72 +46,87 @@ class _Modes:
         return self.states[int(np.searchsorted(self.first, move, "right")) - 1]
 
 
-class KlipperWriter:
+class StreamWriter:
     """Write passages and pieces in order.
 
     Parameters
     ----------
-    machine : Machine
-    limits : Limits
-        What the stream runs under.
+    firmware : FirmwareKit
     stamp : str
         Says who processed the file; one line in header and footer.
     """
 
-    def __init__(self, machine: Machine, limits: Limits, stamp: str) -> None:
-        self._shaper = machine.firmware.shaper
-        self._limits = limits
-        self._limits_now = limits
+    def __init__(self, firmware: FirmwareKit, stamp: str) -> None:
+        self._voice = firmware.voice()
+        self._extruder_alone_stops = firmware.extruder_alone_stops
+        self._limits_now: Limits | None = None
         """What the printer plans with, while streaming."""
         self._stamp = stamp
         self._streaming = False
         self._shaper_off = False
-        self._shaper_lines: list[bytes] = []
+        self._shaper_lines: dict[bytes, bytes] = {}
+        """The file's own lines, the last of each form."""
         self._at_rest = True
         self._modal: ModalState | None = None
         """What the printer's modes are now, where they may differ from the file's."""
+        self._far_mm: float | None = None
+        """What the printer's E reads, where it must be set to 0 before a stream goes on."""
+        self._zero_mm = 0.0
+        """The file's E where the printer's reads 0."""
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set behind the last piece."""
         self.shaper_unknown = False
 
     def header(self) -> bytes:
-        """First lines of the file."""
-        return (
-            f"; Processed by stillpath {self._stamp}\n"
-            "; stillpath: between 'stream on' and 'stream off' the acceleration limit is raised\n"
-            "; stillpath: and every move is timed: leave the speed slider at 100 %. PAUSE and\n"
-            "; stillpath: CANCEL_PRINT must restore the limits first: see stillpath.cfg.\n"
-        ).encode()
+        """Lines that say who processed the file, and what to mind."""
+        notes = "".join(f"; stillpath: {note}\n" for note in self._voice.notes)
+        return self.footer() + notes.encode()
 
-    def footer(self, ends_with_newline: bool) -> bytes:
-        """Last lines of the file."""
-        lead = b"" if ends_with_newline else b"\n"
-        return lead + self._end() + f"; Processed by stillpath {self._stamp}\n".encode()
+    def footer(self) -> bytes:
+        """Line that says who processed the file."""
+        return f"; Processed by stillpath {self._stamp}\n".encode()
 
-    def passage(self, passage: Passage) -> bytes:
-        """Text of lines that leave as they came."""
+    def end(self, ends_with_newline: bool, extruder_mm: float) -> bytes:
+        """Lines that give the printer back at the end of the file; often none."""
+        text = self._end(extruder_mm)
+        return text if ends_with_newline or not text else b"\n" + text
+
+    def passage(self, passage: Passage, extruder_mm: float) -> bytes:
+        """Text of lines that leave as they came.
+
+        Parameters
+        ----------
+        passage : Passage
+        extruder_mm : float
+            What the printer takes for E behind all that was written before.
+        """
         moves, events = passage.moves, passage.events
-        lead = self._off(passage)
+        lead = self._off(passage, extruder_mm)
         for row in np.flatnonzero(events.kind == EventKind.SHAPER):
             line = passage.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
-            self._shaper_lines = [*self._shaper_lines[-3:], line.rstrip() + b"\n"]
+            form = _VALUE.sub(b"", line.split(b";", 1)[0])
+            others = {k: text for k, text in self._shaper_lines.items() if k != form}
+            self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
+            self._shaper_off = False
         if len(moves):
             last_stop = events.move_index[events.kind >= EventKind.STOP]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
-            self._at_rest = stands or _extruder_only(passage, len(moves) - 1)
+            self._at_rest = stands or self._rests(passage, len(moves) - 1)
         elif np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)):
             self._at_rest = True
         return lead + passage.text
 
-    def piece(self, piece: Piece, encoded: Encoded) -> bytes:
-        """Text of a compensated piece."""
-        parts = [self._on(piece)]
+    def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
+        """Text of a compensated piece; `extruder_mm` is that of `passage`."""
+        self._reads(extruder_mm)
+        parts = [self._on(piece, encoded.limits)]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = self._modes(piece, index)
         text, line_end, extruded = self._format(encoded, modes, index, events.kind)
 
+        kinds = events.kind.tolist()
         rest_rows = np.flatnonzero(rows >= 0)
         stops: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
         stops += [(int(i), 1, int(rows[i])) for i in rest_rows]
@@ -118,16 +135,16 @@ class KlipperWriter:
         for at, kind, what in sorted(stops):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._ours(modes.at(at - 1)), text[done:upto]]
+                parts += [self._ours(encoded.limits, modes.at(at - 1)), text[done:upto]]
                 done = upto
+            written = float(extruded[at - 1] if at else piece.moves.start_mm[0, 3])
             if kind == 0:
-                written = extruded[at - 1] if at else float(piece.moves.start_mm[0, 3])
-                parts.append(self._event(piece, what, float(written)))
+                parts.append(self._event(piece, what, kinds[what], written))
             elif int(piece.moves.line[what]) != last_line:
                 last_line = int(piece.moves.line[what])
-                parts.append(self._rest_line(piece, what))
+                parts.append(self._rest_line(piece, what, written))
         if len(text) > done:
-            parts += [self._ours(modes.at(len(rows) - 1)), text[done:]]
+            parts += [self._ours(encoded.limits, modes.at(len(rows) - 1)), text[done:]]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
@@ -141,8 +158,10 @@ class KlipperWriter:
         place = np.searchsorted(encoded.start_s, planned - 1e-6)
         first[:-1] = np.minimum(place, len(encoded.row))
         rest = encoded.row >= 0
-        first[encoded.row[rest]] = np.flatnonzero(rest)
-        # An event never moves past a rest or back behind one.
+        rows, places = encoded.row[rest], np.flatnonzero(rest)
+        first[rows] = places
+        # An event never moves past a rest, not even one that takes no time, or back behind one.
+        first[rows + 1] = np.maximum(first[rows + 1], places + 1)
         first = np.maximum.accumulate(first)
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
@@ -182,111 +201,159 @@ class KlipperWriter:
         )
         return buffer[:size].tobytes(), line_end, extruded
 
-    def _event(self, piece: Piece, k: int, extruded_mm: float) -> bytes:
+    def _event(self, piece: Piece, k: int, kind: int, extruded_mm: float) -> bytes:
         """Text of event k of a piece; `extruded_mm` is where the extruder stands as written."""
         events = piece.events
         line = piece.line_text(int(events.byte_start[k]), int(events.byte_end[k]))
-        if events.kind[k] == EventKind.LIMITS:
+        if kind == EventKind.LIMITS:
             return _held_back(line)
-        if events.kind[k] != EventKind.MODE or self._modal is None:
+        if kind != EventKind.MODE or self._modal is None:
             return line
         state = piece.modal[int(events.modal_id[k])]
         code = line.split(b";", 1)[0].upper()
-        if _MOVE.match(code):
+        if self._is_move(code):
             # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
-            return _held_back(line) if re.search(rb"[XYZE]", code) else line
+            return _held_back(line) if re.search(rb"[XYZEIJK]", code) else line
         if _SET_POSITION.match(code) and state.absolute_e:
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
-            gap = (extruded_mm - planned) / state.extrude_factor
-            return self._file_modes(state) + _shifted_e(line, gap)
+            line = _shifted_e(line, (extruded_mm - planned) / state.extrude_factor)
+            self._set_by(line)
+            return self._file_modes(state) + line
+        if _SET_POSITION.match(code):
+            self._set_by(line)
         # Only what the line itself says changes: our own modes differ from the file's.
         if _POSITIONING.match(code):
             self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
+            if self._voice.positioning_sets_extruder:
+                self._modal = replace(self._modal, absolute_e=state.absolute_e)
         elif _EXTRUSION.match(code):
             self._modal = replace(self._modal, absolute_e=state.absolute_e)
         return line
 
-    def _rest_line(self, piece: Piece, row: int) -> bytes:
+    def _rest_line(self, piece: Piece, row: int, extruded_mm: float) -> bytes:
         moves = piece.moves
         line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
         code = line.split(b";", 1)[0]
         state = piece.modal[int(moves.modal_id[row])]
-        # The file's own moves run under its own limits; the mark tells stillpath.cfg that a PAUSE
-        # here is in mid stream, with the shaper off.
+        # The file's own moves run under its own limits.
         own = piece.limits[int(moves.limits_id[row])]
-        corner = own.square_corner_velocity_mm_s + IN_STREAM_MARK_MM_S
-        lead = self._limits_to(replace(own, square_corner_velocity_mm_s=corner))
+        lead = self._limits_to(self._voice.in_stream(own))
         lead += self._file_modes(state)
-        if _MOVE.match(code) and not _FEED.search(code):
+        word = _E_WORD.search(code) if state.absolute_e else None
+        if word is not None:
+            ends = float(word.group(1))
+            fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
+            lead += self._file_extruder(ends - fed)
+            self._reads(ends)
+        if self._is_move(code) and not _FEED.search(code):
             lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
         return lead + line
+
+    def _is_move(self, code: bytes) -> bool:
+        """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
+        further = not self._voice.one_command and _FURTHER_MOVE.search(code)
+        return bool(_MOVE.match(code) or further)
 
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:
             return b""
         self._limits_now = limits
-        return _limits_line(limits)
+        return self._voice.limits(limits)
 
-    def _ours(self, state: ModalState) -> bytes:
+    def _ours(self, limits: Limits, state: ModalState) -> bytes:
         """Lines after which ours run under the stream's limits, X Y Z absolute and E relative."""
-        assert self._modal is not None
-        text = self._limits_to(self._limits)
-        if not self._modal.absolute_xyz:
-            text += b"G90\n"
-        if self._modal.absolute_e:
-            text += b"M83\n"
-        self._modal = replace(state, absolute_xyz=True, absolute_e=False)
+        ours = replace(state, absolute_xyz=True, absolute_e=False)
+        text = self._limits_to(limits) + self._file_modes(ours)
+        self._modal = ours
+        if self._far_mm is not None:
+            self._zero_mm += self._far_mm
+            self._far_mm = None
+            text += b"G92 E0\n"
         return text
+
+    def _reads(self, extruder_mm: float) -> None:
+        """Take note of what the printer's E reads."""
+        far = self._voice.coarse_extruder and abs(extruder_mm) > _FAR_MM
+        self._far_mm = extruder_mm if far else None
+
+    def _set_by(self, line: bytes) -> None:
+        """Take note of a line that sets E to where the file counts from."""
+        word = _E_WORD.search(line.split(b";", 1)[0])
+        if word is not None:
+            self._zero_mm = 0.0
+            self._reads(float(word.group(1)))
+
+    def _file_extruder(self, file_mm: float) -> bytes:
+        """Line after which the printer's E reads what the file's does."""
+        if self._zero_mm == 0.0:
+            return b""
+        self._zero_mm = 0.0
+        return f"G92 E{file_mm:.5f}\n".encode()
 
     def _file_modes(self, state: ModalState) -> bytes:
         """Lines that make the printer read as the file expects (not the feedrate)."""
         assert self._modal is not None
+        now = self._modal
         text = b""
-        if self._modal.absolute_xyz != state.absolute_xyz:
+        absolute_e = now.absolute_e
+        if now.absolute_xyz != state.absolute_xyz:
             text += b"G90\n" if state.absolute_xyz else b"G91\n"
-        if self._modal.absolute_e != state.absolute_e:
+            if self._voice.positioning_sets_extruder:
+                absolute_e = state.absolute_xyz
+        if absolute_e != state.absolute_e:
             text += b"M82\n" if state.absolute_e else b"M83\n"
-        self._modal = replace(
-            self._modal, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e
-        )
+        self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
-    def _on(self, piece: Piece) -> bytes:
+    def _on(self, piece: Piece, limits: Limits) -> bytes:
         """Lines before the first segment of a piece."""
         parts: list[bytes] = []
         if not self._at_rest:
-            parts.append(_STOP)
+            parts.append(self._voice.stand_still)
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
-            if not self._shaper_off:
-                parts.append(b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n")
+            if not self._shaper_off and self._voice.shaper_off:
+                parts.append(self._voice.shaper_off)
                 self._shaper_off = True
-            parts.append(_limits_line(self._limits))
-            self._limits_now = self._limits
+            parts.append(self._voice.limits(limits))
+            self._limits_now = limits
             self._streaming = True
         if self._modal is None:
             self._modal = piece.modal_before
         return b"".join(parts)
 
-    def _off(self, passage: Passage) -> bytes:
+    def _off(self, passage: Passage, extruder_mm: float) -> bytes:
         """Lines that give the printer back to the file."""
         if not self._streaming:
             return self._shaper_before(passage)
-        stop = b"" if self._at_rest or _extruder_only(passage, 0) else _STOP
-        text = stop + self._stream_off(passage.limits_before, passage.modal_before)
+        stop = b"" if self._at_rest or self._rests(passage, 0) else self._voice.stand_still
+        text = stop + self._stream_off(passage.limits_before, passage.modal_before, extruder_mm)
         return text + self._shaper_before(passage)
 
-    def _end(self) -> bytes:
+    def _rests(self, passage: Passage, row: int) -> bool:
+        """Whether the machine stands at a move of the passage by itself, before and after it."""
+        moves, events = passage.moves, passage.events
+        stops = (events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)
+        if len(moves) == 0:
+            return bool(np.any(stops))
+        if row == 0 and np.any((events.move_index == 0) & stops):
+            return True
+        travel = moves.end_mm[row] - moves.start_mm[row]
+        return self._extruder_alone_stops and not np.any(travel[:3])
+
+    def _end(self, extruder_mm: float) -> bytes:
         """Lines that give the printer back at the end of the file."""
         text = b""
         if self._streaming and self._behind is not None:
-            text = (b"" if self._at_rest else _STOP) + self._stream_off(*self._behind)
+            text = b"" if self._at_rest else self._voice.stand_still
+            text += self._stream_off(*self._behind, extruder_mm)
         return text + self._shaper_on()
 
-    def _stream_off(self, limits: Limits, state: ModalState) -> bytes:
+    def _stream_off(self, limits: Limits, state: ModalState, extruder_mm: float) -> bytes:
         self._streaming = False
-        text = _limits_line(limits) + self._file_modes(state)
+        text = self._voice.limits(limits) + self._file_modes(state)
+        text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
         return text + _feed_line(self._file_feed_mm_min) + b"; stillpath: stream off\n"
 
@@ -294,26 +361,20 @@ class KlipperWriter:
         """Set the firmware's shaper again before lines that move X or Y on their own."""
         travel = passage.moves.end_mm - passage.moves.start_mm
         moves_xy = bool(np.any(travel[:, :2] != 0.0))
-        foreign = bool(np.any(passage.events.kind == EventKind.UNKNOWN))
+        # A line that sets a part of the shaper finds the other parts as they were.
+        foreign = bool(np.any(np.isin(passage.events.kind, _SHAPED)))
         return self._shaper_on() if moves_xy or foreign else b""
 
     def _shaper_on(self) -> bytes:
         if not self._shaper_off:
             return b""
         self._shaper_off = False
-        if self._shaper is None and not self._shaper_lines:
+        stated = self._voice.shaper_on
+        if stated is None and not self._shaper_lines:
             self.shaper_unknown = True
             self._shaper_off = True
             return b""
-        text = b""
-        if self._shaper is not None:
-            s = self._shaper
-            text = (
-                f"SET_INPUT_SHAPER SHAPER_TYPE_X={s.type_x} SHAPER_FREQ_X={s.freq_x_hz:g} "
-                f"DAMPING_RATIO_X={s.damping_x:g} SHAPER_TYPE_Y={s.type_y} "
-                f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
-            ).encode()
-        return text + b"".join(self._shaper_lines)
+        return (stated or b"") + b"".join(self._shaper_lines.values())
 
 
 def _held_back(line: bytes) -> bytes:
@@ -330,17 +391,6 @@ def _shifted_e(line: bytes, gap_mm: float) -> bytes:
     return code[: word.start()] + value + code[word.end() :] + mark + comment
 
 
-def _limits_line(limits: Limits) -> bytes:
-    # ACCEL_TO_DECEL is what Klipper before 2024-03 reads instead of MINIMUM_CRUISE_RATIO.
-    to_decel = limits.accel_mm_s2 * (1.0 - limits.minimum_cruise_ratio)
-    return (
-        f"SET_VELOCITY_LIMIT VELOCITY={limits.velocity_mm_s:.10g} ACCEL={limits.accel_mm_s2:.10g} "
-        f"ACCEL_TO_DECEL={to_decel:.10g} "
-        f"SQUARE_CORNER_VELOCITY={limits.square_corner_velocity_mm_s:.10g} "
-        f"MINIMUM_CRUISE_RATIO={limits.minimum_cruise_ratio:.10g}\n"
-    ).encode()
-
-
 def _feed_line(feedrate_mm_min: float) -> bytes:
     digits = f"{feedrate_mm_min:.5f}".rstrip("0").rstrip(".")
     return f"G1 F{digits}\n".encode()
@@ -348,18 +398,3 @@ def _feed_line(feedrate_mm_min: float) -> bytes:
 
 def _integer_origin(state: ModalState) -> NDArray[np.int64]:
     return np.round(np.array(state.origin_mm) * 1e6).astype(np.int64)
-
-
-def _extruder_only(passage: Passage, row: int) -> bool:
-    """Whether a move of the passage stops the machine before and after itself."""
-    moves, events = passage.moves, passage.events
-    if len(moves) == 0:
-        return bool(np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)))
-    if row == 0 and np.any(
-        (events.move_index == 0)
-        & (events.kind >= EventKind.STOP)
-        & (events.kind != EventKind.OBJECT)
-    ):
-        return True
-    travel = moves.end_mm[row] - moves.start_mm[row]
-    return bool(travel[0] == 0.0 and travel[1] == 0.0 and travel[2] == 0.0)

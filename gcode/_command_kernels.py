@@ -1,0 +1,166 @@
+"""Kernel of the classic commands: moves, dwells, modes, origins and factors."""
+
+from __future__ import annotations
+
+from math import fabs
+from typing import Any
+
+from gcode._arc_kernels import arc, curve
+from gcode._motion_kernels import move
+from gcode._slots import (
+    ERROR_INCHES,
+    ERROR_POSITIVE,
+    ERROR_RANGE,
+    F_BASE,
+    F_ERROR,
+    F_EXTRUDE_FACTOR,
+    F_LAST,
+    F_SPEED,
+    F_SPEED_FACTOR,
+    F_TOOL,
+    F_UNIT_E_MM,
+    F_UNIT_MM,
+    I_ABS_E,
+    I_ABS_XYZ,
+    I_DWELL_RULE,
+    I_E_RULE,
+    I_ERROR_AXIS,
+    I_EVENTS,
+    I_FACTOR_DEFAULT,
+    I_KNOWN,
+    I_ORIGIN_KNOWN,
+    I_ORIGIN_RULE,
+    I_PLANE,
+    MAX_VALUE,
+    MIN_VALUE,
+    OK,
+)
+from gcode._table_kernels import note_modal, put_event, settle
+from models.jit import kernel
+
+_HARMLESS, _MODE, _STOP, _UNKNOWN = 0, 1, 3, 4
+_X, _E, _P, _S = 23, 4, 15, 18
+_MARLIN_E = 1
+_P_ONLY, _OR_NOTHING = 0, 2
+_BARE_IS_ZERO, _OFFSET, _POSITION = 0, 1, 2
+
+
+@kernel
+def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
+    """Carry out one command of the kernel's table; write its move or event.
+
+    Parameters
+    ----------
+    action : int
+        An `Action`, or the `EventKind` of a line that only leaves its event.
+    w, mask : ndarray of 26 floats, int
+        Values of the words A to Z and which of them are present.
+    """
+    if action < 20:
+        if action == _UNKNOWN:
+            settle(f, i, rows)
+            i[I_KNOWN] = 0
+        put_event(i, rows, action)
+        return OK
+    if action == 20:
+        return move(w, mask, f, i, rows)
+    if action == 21 or action == 22:
+        return arc(action == 21, w, mask, f, i, rows)
+    if action == 36:
+        return curve(w, mask, f, i, rows)
+    if action == 23:
+        return _dwell(w, mask, f, i, rows)
+    settle(f, i, rows)
+    if 24 <= action <= 26:
+        i[I_PLANE] = action - 24
+    elif action == 27 or action == 33:
+        f[F_UNIT_MM] = 25.4 if action == 27 else 1.0
+        f[F_UNIT_E_MM] = f[F_UNIT_MM]
+    elif action == 28 or action == 29:
+        i[I_ABS_XYZ] = 1 if action == 28 else 0
+        if i[I_E_RULE] == _MARLIN_E:
+            i[I_ABS_E] = i[I_ABS_XYZ]
+    elif action == 31 or action == 32:
+        i[I_ABS_E] = 1 if action == 31 else 0
+    elif action == 30:
+        return _set_position(w, mask, f, i, rows, tables)
+    elif action == 34 or action == 35:
+        if mask & (1 << _S) or i[I_FACTOR_DEFAULT]:
+            percent = w[_S] if mask & (1 << _S) else 100.0
+            f[F_ERROR] = percent
+            if not MIN_VALUE <= percent <= MAX_VALUE:
+                return ERROR_POSITIVE
+            if action == 34:
+                factor = percent / (60.0 * 100.0)
+                f[F_SPEED] = f[F_SPEED] / f[F_SPEED_FACTOR] * factor
+                f[F_SPEED_FACTOR] = factor
+            else:
+                factor = percent / 100.0
+                e_value = (f[F_LAST + 3] - f[F_BASE + 3]) / f[F_EXTRUDE_FACTOR]
+                f[F_BASE + 3] = f[F_LAST + 3] - e_value * factor
+                f[F_EXTRUDE_FACTOR] = factor
+    else:
+        return ERROR_INCHES
+    note_modal(f, i, tables)
+    put_event(i, rows, _MODE)
+    return OK
+
+
+@kernel
+def _dwell(w: Any, mask: int, f: Any, i: Any, rows: Any) -> int:
+    """G4: every firmware comes to rest first."""
+    seconds = 0.0
+    given = False
+    if mask & (1 << _S) and i[I_DWELL_RULE] != _P_ONLY:
+        seconds = w[_S]
+        given = True
+    elif mask & (1 << _P):
+        seconds = w[_P] / 1000.0
+        given = True
+    if not 0.0 <= seconds <= MAX_VALUE:
+        f[F_ERROR] = seconds
+        return ERROR_POSITIVE
+    if i[I_DWELL_RULE] == _OR_NOTHING and not given:
+        put_event(i, rows, _HARMLESS)
+        return OK
+    settle(f, i, rows)
+    put_event(i, rows, _STOP)
+    settle(f, i, rows)
+    rows.real[9 * rows.whole.shape[1] + i[I_EVENTS] - 1] = seconds
+    return OK
+
+
+@kernel
+def _set_position(w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
+    """G92; the rows before it are settled."""
+    rule = i[I_ORIGIN_RULE]
+    any_axis = False
+    places = False
+    for k in range(4):
+        letter = _X + k if k < 3 else _E
+        if not mask & (1 << letter):
+            continue
+        any_axis = True
+        value = w[letter] * (f[F_UNIT_E_MM] * f[F_EXTRUDE_FACTOR] if k == 3 else f[F_UNIT_MM])
+        if not fabs(value) <= MAX_VALUE:
+            i[I_ERROR_AXIS] = k
+            f[F_ERROR] = w[letter]
+            f[F_ERROR + 1] = MAX_VALUE
+            return ERROR_RANGE
+        if rule == _POSITION and k < 3:
+            f[F_LAST + k] = f[F_TOOL + k] = value + f[F_BASE + k]
+            places = True
+            continue
+        f[F_BASE + k] = f[F_LAST + k] - value
+        # An origin set from a guessed position is a guess.
+        i[I_ORIGIN_KNOWN] &= ~(1 << k) | i[I_KNOWN]
+        i[I_ORIGIN_KNOWN] |= (1 << k) & i[I_KNOWN]
+    if not any_axis and rule == _BARE_IS_ZERO:
+        for k in range(4):
+            f[F_BASE + k] = f[F_LAST + k]
+        i[I_ORIGIN_KNOWN] = i[I_KNOWN]
+    if places:
+        settle(f, i, rows)
+    note_modal(f, i, tables)
+    put_event(i, rows, _STOP if places else _MODE)
+    return OK

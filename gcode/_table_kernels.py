@@ -1,0 +1,271 @@
+"""Kernels for what the interpreter writes down: lines to remember, limits, modes, moves, events.
+
+Rows are written in two steps. What differs from row to row is written at once; what stays the same
+over many rows (modes, limits, layer, feature, object, tool) is filled in by `settle` whenever it is
+about to change.
+"""
+
+from __future__ import annotations
+
+from math import floor
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode._slots import (
+    E_KIND,
+    E_LIMITS,
+    E_LINE,
+    E_MODAL,
+    E_MOVE,
+    E_START,
+    E_STOP,
+    F_BASE,
+    F_EXTRUDE_FACTOR,
+    F_LIMITS,
+    F_RUN,
+    F_SPEED_FACTOR,
+    F_TOOL,
+    F_UNIT_E_MM,
+    F_UNIT_MM,
+    I_ABS_E,
+    I_ABS_XYZ,
+    I_END,
+    I_EVENTS,
+    I_FEATURE,
+    I_FILLED_EVENTS,
+    I_FILLED_MOVES,
+    I_KEPT,
+    I_KNOWN,
+    I_LAYER,
+    I_LIMITS_ID,
+    I_LINE,
+    I_MODAL_ID,
+    I_MOVES,
+    I_N_LIMITS,
+    I_N_MODAL,
+    I_OBJECT,
+    I_OFFSET,
+    I_POS,
+    I_TOOL,
+    I_TOTAL_MOVES,
+    M_FEATURE,
+    M_KNOWN,
+    M_LAYER,
+    M_LIMITS,
+    M_MODAL,
+    M_OBJECT,
+    M_TOOL,
+)
+from models.jit import kernel
+
+
+class Rows(NamedTuple):
+    """The columns that one block of the program is written to, with room for the same number each.
+
+    There are few arrays because kernels hand them on, and every one of them costs time.
+    """
+
+    real: NDArray[np.float64]
+    """One after the other: start and end of the moves (4 numbers a row), speed, dwell of events."""
+    whole: NDArray[np.int64]
+    """Rows M_LINE, M_START, M_STOP, E_MOVE, E_LINE, E_START, E_STOP."""
+    small: NDArray[np.int32]
+    """Rows M_LIMITS, M_MODAL, M_LAYER, M_FEATURE, M_OBJECT, M_TOOL, E_LIMITS, E_MODAL."""
+    tiny: NDArray[np.uint8]
+    """Rows M_KNOWN, E_KIND."""
+
+    @classmethod
+    def empty(cls, count: int) -> Rows:
+        """Return room for so many moves and as many events."""
+        return cls(
+            np.empty(10 * count),
+            np.empty((7, count), np.int64),
+            np.empty((8, count), np.int32),
+            np.empty((2, count), np.uint8),
+        )
+
+    @property
+    def room(self) -> int:
+        """How many rows there are."""
+        return int(self.whole.shape[1])
+
+    @property
+    def start(self) -> NDArray[np.float64]:
+        """Start of the moves, shape (n, 4)."""
+        return self.real[: 4 * self.room].reshape(-1, 4)
+
+    @property
+    def end(self) -> NDArray[np.float64]:
+        """End of the moves, shape (n, 4)."""
+        return self.real[4 * self.room : 8 * self.room].reshape(-1, 4)
+
+    @property
+    def speed(self) -> NDArray[np.float64]:
+        """Speed of the moves, shape (n,)."""
+        return self.real[8 * self.room : 9 * self.room]
+
+    @property
+    def dwell(self) -> NDArray[np.float64]:
+        """Dwell of the events, shape (n,)."""
+        return self.real[9 * self.room :]
+
+
+class Tables(NamedTuple):
+    """What many rows refer to, and what many lines mean."""
+
+    limits: NDArray[np.float64]
+    limits_index: NDArray[np.int32]
+    modal: NDArray[np.float64]
+    modal_index: NDArray[np.int32]
+    memo_keys: NDArray[np.int64]
+    """Hashes of remembered lines; 0: free."""
+    memo_values: NDArray[np.int64]
+    memo_limits: NDArray[np.float64]
+    """Limits that remembered lines set; NaN: left alone."""
+    g_words: NDArray[np.int8]
+    """What G0 to G1023 are: an `EventKind`, an `Action` or -1."""
+    m_words: NDArray[np.int8]
+    layer_z: NDArray[np.float64]
+    """Height of each layer; NaN where no mark tells it."""
+
+
+_KEPT = 8
+_FNV_OFFSET = 1469598103934665603
+_FNV_PRIME = 1099511628211
+
+
+@kernel
+def line_hash(text: Any, start: int, stop: int) -> int:
+    """Hash the bytes (FNV-1a) to a positive int64."""
+    h = np.int64(_FNV_OFFSET)
+    for p in range(start, stop):
+        h = (h ^ np.int64(text[p])) * np.int64(_FNV_PRIME)
+    h = h & np.int64(0x7FFFFFFFFFFFFFFF)
+    return int(h) if h != 0 else 1
+
+
+@kernel
+def memo_slot(keys: Any, h: int) -> int:
+    """Find the slot of a remembered line, or the free slot where it belongs."""
+    mask = len(keys) - 1
+    slot = h & mask
+    while keys[slot] != 0 and keys[slot] != h:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@kernel
+def _same(rows: Any, one: int, other: int) -> bool:
+    same = True
+    for k in range(rows.shape[1]):
+        same = same and rows[one, k] == rows[other, k]
+    return same
+
+
+@kernel
+def intern_row(rows: Any, index: Any, count: int) -> int:
+    """Look row `count` up among those before it; its number is `count` if it is new."""
+    mask = len(index) - 1
+    h = np.int64(0)
+    for k in range(rows.shape[1]):
+        scaled = rows[count, k] * 1048576.0
+        whole = floor(scaled)
+        h = (h ^ np.int64(whole)) * np.int64(_FNV_PRIME)
+        h ^= np.int64((scaled - whole) * 1048576.0) << np.int64(17)
+    h ^= h >> np.int64(29)
+    slot = h & mask
+    while True:
+        number = int(index[slot])
+        if number < 0:
+            index[slot] = count
+            return count
+        if _same(rows, number, count):
+            return number
+        slot = (slot + 1) & mask
+
+
+@kernel
+def settle(f: Any, i: Any, rows: Any) -> None:
+    """Fill the slow columns of the rows written since the last time."""
+    a, b = i[I_FILLED_MOVES], i[I_MOVES]
+    small = rows.small
+    if a < b:
+        real, tiny = rows.real, rows.tiny
+        kept = i[I_KEPT]
+        if f[F_UNIT_MM] != 1.0 or f[F_UNIT_E_MM] != 1.0:
+            kept = _KEPT  # a stream in millimetres would not fit in
+        known = i[I_KNOWN] | kept
+        limits, modal, layer = i[I_LIMITS_ID], i[I_MODAL_ID], i[I_LAYER]
+        feature, thing, tool = i[I_FEATURE], i[I_OBJECT], i[I_TOOL]
+        ends = 4 * small.shape[1]
+        for k in range(4):
+            real[4 * a + k] = f[F_RUN + k]
+            f[F_RUN + k] = real[ends + 4 * (b - 1) + k]
+        for k in range(4 * (a + 1), 4 * b):
+            real[k] = real[ends + k - 4]
+        for n in range(a, b):
+            tiny[M_KNOWN, n] = known
+            small[M_LIMITS, n] = limits
+            small[M_MODAL, n] = modal
+            small[M_LAYER, n] = layer
+            small[M_FEATURE, n] = feature
+            small[M_OBJECT, n] = thing
+            small[M_TOOL, n] = tool
+        i[I_FILLED_MOVES] = b
+    else:
+        for k in range(4):
+            f[F_RUN + k] = f[F_TOOL + k]
+    a, b = i[I_FILLED_EVENTS], i[I_EVENTS]
+    if a < b:
+        dwells = 9 * small.shape[1]
+        limits, modal = i[I_LIMITS_ID], i[I_MODAL_ID]
+        for n in range(a, b):
+            small[E_LIMITS, n] = limits
+            small[E_MODAL, n] = modal
+            rows.real[dwells + n] = 0.0
+        i[I_FILLED_EVENTS] = b
+
+
+@kernel
+def note_modal(f: Any, i: Any, tables: Any) -> None:
+    """Enter the modal state in its table; the rows before it must be settled."""
+    rows, count = tables.modal, i[I_N_MODAL]
+    row = rows[count]
+    row[0] = i[I_ABS_XYZ]
+    row[1] = i[I_ABS_E]
+    row[2] = f[F_SPEED_FACTOR] * 60.0
+    row[3] = f[F_EXTRUDE_FACTOR]
+    for k in range(3):
+        row[4 + k] = f[F_BASE + k]
+    if count > 0 and _same(rows, i[I_MODAL_ID], count):
+        return
+    number = intern_row(rows, tables.modal_index, count)
+    i[I_N_MODAL] = max(count, number + 1)
+    i[I_MODAL_ID] = number
+
+
+@kernel
+def note_limits(f: Any, i: Any, tables: Any) -> None:
+    """Enter the planner's limits in their table; the rows before them must be settled."""
+    rows, count = tables.limits, i[I_N_LIMITS]
+    for k in range(rows.shape[1]):
+        rows[count, k] = f[F_LIMITS + k]
+    if count > 0 and _same(rows, i[I_LIMITS_ID], count):
+        return
+    number = intern_row(rows, tables.limits_index, count)
+    i[I_N_LIMITS] = max(count, number + 1)
+    i[I_LIMITS_ID] = number
+
+
+@kernel
+def put_event(i: Any, rows: Any, kind: int) -> None:
+    """Write the line in hand as an event."""
+    n = i[I_EVENTS]
+    rows.tiny[E_KIND, n] = kind
+    rows.whole[E_MOVE, n] = i[I_TOTAL_MOVES]
+    rows.whole[E_LINE, n] = i[I_LINE]
+    rows.whole[E_START, n] = i[I_OFFSET] + i[I_POS]
+    rows.whole[E_STOP, n] = i[I_OFFSET] + i[I_END]
+    i[I_EVENTS] = n + 1

@@ -1,0 +1,97 @@
+"""Commands that Python carries out and that several firmwares have."""
+
+from __future__ import annotations
+
+from gcode import _slots as at
+from gcode.lexer import Command
+from gcode.state import MachineState
+from gcode.types import EventKind
+
+__all__ = ["cancel_object", "home", "retract", "tool"]
+
+
+def home(state: MachineState, command: Command) -> int:
+    """G28."""
+    axes = sum(1 << k for k, axis in enumerate("XYZ") if axis in command.words) or 0b111
+    state.home(axes, state.firmware.home_mm)
+    known = int(state.i[at.I_KNOWN])
+    status = state.event(EventKind.UNKNOWN)
+    state.settle()
+    state.i[at.I_KNOWN] = known
+    return status
+
+
+def retract(state: MachineState, command: Command) -> int:
+    """G10 and G11: a move of E, and a hop of Z, that the G-code's coordinates do not see.
+
+    RepRapFirmware has them as M103 and M101 too. Repeated ones are passed over. Z is lifted behind
+    the retraction and lowered before filament comes back (Marlin fwretract.cpp 2.0.x;
+    RepRapFirmware GCodes.cpp RetractFilament 3.5).
+    """
+    facts = state.retraction
+    if facts is None:
+        return state.event(state.dialect.otherwise(command.name))
+    retracting = command.name in ("G10", "M103")
+    if retracting == state.retracted:
+        return state.event(EventKind.MODE)
+    f = state.f
+    scaled = state.dialect.retraction_scaled
+    factor = f[at.F_EXTRUDE_FACTOR] if scaled else 1.0
+    if retracting:
+        length, speed = -facts.length_mm, facts.speed_mm_s
+    else:
+        length, speed = facts.length_mm + facts.extra_mm, facts.return_speed_mm_s
+    steps = [(3, round(length, 5) * factor, speed)]
+    if state.dialect.extended_commands:
+        speed_mm_s = max(1, int(speed * 60)) / 60.0
+        steps = [(3, steps[0][1], speed_mm_s)]
+    hop = facts.hop_mm if retracting else -state.hop_mm
+    if hop:
+        steps.insert(len(steps) if retracting else 0, (2, hop, state.firmware.fastest_z_mm_s))
+    speed_before = f[at.F_SPEED]
+    status = at.DONE
+    state.settle()
+    for axis, distance, speed in steps:
+        f[at.F_SPEED] = speed * (f[at.F_SPEED_FACTOR] * 60.0 if scaled else 1.0)
+        f[at.F_LAST + axis] += distance
+        step_status = state.travel()
+        if step_status > at.DONE:
+            return step_status
+        status = min(status, step_status)
+        f[at.F_BASE + axis] += distance
+    f[at.F_SPEED] = speed_before
+    if hop:
+        state.hop_mm = max(0.0, state.hop_mm + hop)
+        # A shifted origin of Z: the G-code's Z stays what it was.
+        state.note_modal()
+    state.retracted = retracting
+    return state.moved(status)
+
+
+def cancel_object(state: MachineState, command: Command) -> int:
+    """M486: S opens an object, S-1 closes it."""
+    if "S" in command.words:
+        number = command.words["S"]
+        closing = number.startswith("-") or not number
+        state.settle()
+        state.i[at.I_OBJECT] = -1 if closing else state.objects.number(number)
+    return state.event(EventKind.OBJECT)
+
+
+def tool(state: MachineState, command: Command) -> int:
+    """T: another tool, or the one that is in use already."""
+    digits = command.name[1:]
+    if not digits.isdigit():
+        if not digits and state.dialect.expressions and not command.words:
+            return state.event(EventKind.HARMLESS)  # T alone reports
+        state.tool_known = False
+        return state.event(EventKind.UNKNOWN)
+    number = int(digits)
+    same = state.tool_known and number == int(state.i[at.I_TOOL])
+    if same and not state.dialect.extended_commands:
+        return state.event(EventKind.STOP)
+    state.settle()
+    if number < 100:  # larger ones are words of the printer, not tools
+        state.i[at.I_TOOL] = number
+        state.tool_known = True
+    return state.event(EventKind.UNKNOWN)

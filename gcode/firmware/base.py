@@ -1,0 +1,164 @@
+"""What one firmware offers to the road: how it plans, and how it is made to execute a stream.
+
+`FirmwareKit` is the seam. The road asks `gcode.firmware.registry.kit` for the kit of a machine and
+knows no firmware by name; whatever differs between firmwares is behind these protocols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.types import Limits, Moves, Phases, ProgramBlock
+
+if TYPE_CHECKING:
+    from gcode.firmware.encoding import Encoded
+    from gcode.pieces import Piece
+    from gcode.segments import Segments
+    from gcode.timeline import Group, Timeline
+
+__all__ = ["Encoder", "FirmwareKit", "Planner", "Voice"]
+
+
+class Planner(Protocol):
+    """Plans a stream of moves as the firmware does.
+
+    There is one row of `Phases` per move, in order, and `move_index` names it; a move without any
+    displacement may have none. A move that the firmware swallows has no duration.
+    """
+
+    @property
+    def time_s(self) -> float:
+        """When the last planned move or dwell ends."""
+
+    def push(self, block: ProgramBlock) -> Phases:
+        """Plan the moves of a block, with the stops that its events bring.
+
+        Raises
+        ------
+        GcodeError
+            For a move that the firmware refuses.
+        """
+
+    def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
+        """Plan moves that follow the last ones without a stop; return what is settled by now."""
+
+    def stop(self, dwell_s: float = 0.0) -> Phases:
+        """Come to rest after the last move and stand for `dwell_s`."""
+
+    def flush(self) -> Phases:
+        """Come to rest; return all that is left."""
+
+
+class Encoder(Protocol):
+    """Turns the segments of a piece into moves that the firmware executes on time."""
+
+    @property
+    def grid_mm(self) -> float:
+        """Grid of the X and Y that it writes; the segments are fitted on it."""
+
+    def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
+        """First guess of how long each rest takes between stretches of the stream."""
+
+    def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
+        """Choose rounded positions and feedrates.
+
+        Raises
+        ------
+        GcodeError
+            When the firmware would refuse a move.
+        """
+
+
+class Voice(Protocol):
+    """The words of one firmware that the writer of the stream needs."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines of the header that tell a person what to mind."""
+
+    @property
+    def stand_still(self) -> bytes:
+        """A line that waits until all motion has ended and changes nothing."""
+
+    @property
+    def positioning_sets_extruder(self) -> bool:
+        """G90 and G91 set the extruder's mode as well (Marlin)."""
+
+    @property
+    def one_command(self) -> bool:
+        """A second G or M in a line is no command of its own (not so in RepRapFirmware)."""
+
+    @property
+    def coarse_extruder(self) -> bool:
+        """Relative E adds up in 32-bit floats: far from 0 small moves lose digits (Marlin)."""
+
+    @property
+    def shaper_off(self) -> bytes:
+        """Lines that switch the firmware's own input shaper off; empty: it has none."""
+
+    @property
+    def shaper_on(self) -> bytes | None:
+        """Lines that set it to what the machine states; None: the machine does not say."""
+
+    def limits(self, limits: Limits) -> bytes:
+        """Lines that set the planner's limits."""
+
+    def acceleration(self, accel_mm_s2: float) -> bytes:
+        """Lines that limit the acceleration of X and Y and leave all other limits alone."""
+
+    def in_stream(self, limits: Limits) -> Limits:
+        """Return the file's own limits, marked as being in the middle of a stream.
+
+        PAUSE macros may read the mark; a firmware without macros returns them as they are.
+        """
+
+
+class FirmwareKit(Protocol):
+    """What one firmware offers for one machine."""
+
+    @property
+    def refusal(self) -> str | None:
+        """Why no stream can be made for this machine, and what to do instead; None: it can."""
+
+    @property
+    def step_mm(self) -> tuple[float, float, float, float]:
+        """Largest distance of a place x y z e that is asked for from where the machine stops.
+
+        0 for a firmware that keeps places to the last digit of the file, one step otherwise.
+        """
+
+    @property
+    def extruder_alone_stops(self) -> bool:
+        """X, Y and Z always come to rest before a move of the extruder alone, and behind it."""
+
+    def initial_limits(self) -> Limits:
+        """Limits before the first line of a file."""
+
+    def stream_limits(self, own: Limits) -> Limits:
+        """Return what a stream runs under where the file has set `own`.
+
+        What a file sets and a stream must keep (pressure advance, say) is copied. A piece ends
+        where these limits change.
+        """
+
+    def planner(self) -> Planner:
+        """Return a planner at rest."""
+
+    def encoder(self) -> Encoder:
+        """Return an encoder of the stream."""
+
+    def voice(self) -> Voice:
+        """Return the words of the firmware."""
+
+    def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which moves climb so much that a stream could not keep their times.
+
+        Parameters
+        ----------
+        travel_mm : ndarray, shape (n, 4)
+            x y z e; moves that do not climb in the file may still climb along a bed mesh.
+        """

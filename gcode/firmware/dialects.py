@@ -1,0 +1,25 @@
+"""The dialect of a machine's firmware."""
+
+from __future__ import annotations
+
+from gcode.dialect import Dialect
+from models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
+
+__all__ = ["dialect_of"]
+
+
+def dialect_of(firmware: FirmwareFacts) -> Dialect:
+    """Return how the firmware of a machine reads G-code."""
+    if isinstance(firmware, Klipper):
+        from gcode.firmware.klipper.dialect import klipper
+
+        return klipper(firmware)
+    if isinstance(firmware, Marlin):
+        from gcode.firmware.marlin.dialect import marlin
+
+        return marlin(firmware)
+    if isinstance(firmware, RepRapFirmware):
+        from gcode.firmware.reprapfirmware.dialect import reprapfirmware
+
+        return reprapfirmware(firmware)
+    raise TypeError(f"{type(firmware).__name__} has no dialect")

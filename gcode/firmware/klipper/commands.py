@@ -1,0 +1,189 @@
+"""Klipper's commands that Python carries out.
+
+Sources: klippy/extras/gcode_move.py, firmware_retraction.py, exclude_object.py, klippy/toolhead.py
+(cmd_M204, cmd_SET_VELOCITY_LIMIT), 2026-08.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gcode import _slots as at
+from gcode.lexer import Command
+from gcode.state import MachineState, Saved
+from gcode.types import EventKind
+
+__all__ = [
+    "acceleration",
+    "activate_extruder",
+    "exclude_object",
+    "gcode_offset",
+    "restore_state",
+    "save_state",
+    "set_retraction",
+    "tool",
+    "velocity_limit",
+]
+
+_LIMITS = {
+    "VELOCITY": "velocity_mm_s",
+    "ACCEL": "accel_mm_s2",
+    "SQUARE_CORNER_VELOCITY": "square_corner_velocity_mm_s",
+    "MINIMUM_CRUISE_RATIO": "minimum_cruise_ratio",
+}
+
+
+def velocity_limit(state: MachineState, command: Command) -> int:
+    """SET_VELOCITY_LIMIT."""
+    given = state.extended(command)
+    values = {}
+    for k, (key, field) in enumerate(_LIMITS.items()):
+        if key not in given:
+            continue
+        value = state.number(given[key], key, command)
+        low = "above 0" if k < 2 else "at least 0" if k == 2 else "at least 0 and below 1"
+        if value < 0 or (k < 2 and value == 0) or (k == 3 and value >= 1):
+            raise state.problem(f"{key}={given[key]} must be {low}", command)
+        values[field] = value
+    return state.set_limits(command, values)
+
+
+def acceleration(state: MachineState, command: Command) -> int:
+    """M204: S, or else the smaller of P and T; P or T alone are passed over."""
+    given = state.numbers(command, "SPT")
+    accel = given.get("S")
+    if accel is None and "P" in given and "T" in given:
+        accel = min(given["P"], given["T"])
+    if accel is None:
+        return state.set_limits(command, {})
+    if not at.MIN_VALUE <= accel <= at.MAX_VALUE:
+        raise state.problem(f"the value {accel:g} is out of range; it must be above 0", command)
+    return state.set_limits(command, {"accel_mm_s2": accel})
+
+
+def set_retraction(state: MachineState, command: Command) -> int:
+    """SET_RETRACTION."""
+    if state.retraction is None:
+        return state.event(state.dialect.otherwise(command.name))
+    given = state.extended(command)
+    changed = {}
+    for key, field in (("RETRACT_LENGTH", "length_mm"), ("UNRETRACT_EXTRA_LENGTH", "extra_mm")):
+        if key in given:
+            changed[field] = state.at_least(given[key], key, 0.0, command)
+    for key, field in (("RETRACT_SPEED", "speed_mm_s"), ("UNRETRACT_SPEED", "return_speed_mm_s")):
+        if key in given:
+            changed[field] = state.at_least(given[key], key, 1.0, command)
+    state.change_retraction(**changed)
+    state.retracted = False
+    return state.event(EventKind.MODE)
+
+
+def gcode_offset(state: MachineState, command: Command) -> int:
+    """SET_GCODE_OFFSET."""
+    given = state.extended(command)
+    f = state.f
+    delta = np.zeros(4)
+    state.settle()
+    for k, axis in enumerate("XYZE"):
+        if axis in given:
+            offset = state.number(given[axis], axis, command)
+        elif f"{axis}_ADJUST" in given:
+            offset = state.number(given[f"{axis}_ADJUST"], f"{axis}_ADJUST", command)
+            offset += f[at.F_HOMING + k]
+        else:
+            continue
+        delta[k] = offset - f[at.F_HOMING + k]
+        f[at.F_BASE + k] += delta[k]
+        f[at.F_HOMING + k] = offset
+    state.note_modal()
+    if not _flag(state, given, command):
+        return state.event(EventKind.MODE)
+    f[at.F_LAST : at.F_LAST + 4] += delta
+    return _travel_at(state, given, command)
+
+
+def save_state(state: MachineState, command: Command) -> int:
+    """SAVE_GCODE_STATE."""
+    key = state.extended(command).get("NAME", "default")
+    state.saved[key] = Saved(state.f.copy(), state.i.copy())
+    return state.event(EventKind.MODE)
+
+
+def restore_state(state: MachineState, command: Command) -> int:
+    """RESTORE_GCODE_STATE."""
+    given = state.extended(command)
+    key = given.get("NAME", "default")
+    if key not in state.saved:
+        raise state.problem(f"no state {key!r} was saved; SAVE_GCODE_STATE it first", command)
+    saved = state.saved[key]
+    f, i = state.f, state.i
+    state.settle()
+    for slot in (at.I_ABS_XYZ, at.I_ABS_E, at.I_ORIGIN_KNOWN):
+        i[slot] = saved.i[slot]
+    for first, count in (
+        (at.F_BASE, 4),
+        (at.F_HOMING, 4),
+        (at.F_SPEED, 3),  # speed, its factor, extrude factor
+    ):
+        f[first : first + count] = saved.f[first : first + count]
+    f[at.F_BASE + 3] += f[at.F_LAST + 3] - saved.f[at.F_LAST + 3]
+    state.note_modal()
+    if not _flag(state, given, command):
+        return state.event(EventKind.MODE)
+    f[at.F_LAST : at.F_LAST + 3] = saved.f[at.F_LAST : at.F_LAST + 3]
+    return _travel_at(state, given, command)
+
+
+def exclude_object(state: MachineState, command: Command) -> int:
+    """EXCLUDE_OBJECT_START and EXCLUDE_OBJECT_END."""
+    number = -1
+    if command.name == "EXCLUDE_OBJECT_START":
+        number = state.objects.number(state.extended(command).get("NAME", "").upper())
+    state.settle()
+    state.i[at.I_OBJECT] = number
+    state.remember(command, at.MEMO_MARKED, number + 1)
+    return state.event(EventKind.OBJECT)
+
+
+def tool(state: MachineState, command: Command) -> int:
+    """T: a macro, if there is any."""
+    if command.name[1:].isdigit() and int(command.name[1:]) < 100:
+        state.settle()
+        state.i[at.I_TOOL] = int(command.name[1:])
+    return state.event(state.dialect.otherwise(command.name))
+
+
+def activate_extruder(state: MachineState, command: Command) -> int:
+    """ACTIVATE_EXTRUDER: E counts from 0 again, at 100 %."""
+    name = state.extended(command).get("EXTRUDER", "").lower().removeprefix("extruder")
+    f = state.f
+    state.settle()
+    if not name or (name.isdigit() and int(name) < 100):
+        state.i[at.I_TOOL] = int(name or 0)
+    f[at.F_EXTRUDE_FACTOR] = 1.0
+    f[at.F_BASE + 3] = f[at.F_LAST + 3]
+    state.note_modal()
+    return state.event(EventKind.UNKNOWN)
+
+
+def _travel_at(state: MachineState, given: Mapping[str, str], command: Command) -> int:
+    """MOVE=1: go to F_LAST at MOVE_SPEED."""
+    f = state.f
+    speed_before = f[at.F_SPEED]
+    if "MOVE_SPEED" in given:
+        speed = state.number(given["MOVE_SPEED"], "MOVE_SPEED", command)
+        if speed <= 0:
+            raise state.problem(f"MOVE_SPEED={given['MOVE_SPEED']} must be above 0", command)
+        f[at.F_SPEED] = speed
+    status = state.travel()
+    f[at.F_SPEED] = speed_before
+    return state.moved(status)
+
+
+def _flag(state: MachineState, given: Mapping[str, str], command: Command) -> bool:
+    try:
+        return bool(int(given.get("MOVE", "0")))
+    except ValueError:
+        raise state.problem(f"MOVE={given['MOVE']} must be 0 or 1", command) from None

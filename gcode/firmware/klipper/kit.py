@@ -1,0 +1,81 @@
+"""What Klipper offers to the road."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.klipper.encoder import KlipperEncoder, stream_limits
+from gcode.firmware.klipper.limits import KlipperLimits
+from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.klipper.voice import KlipperVoice
+from gcode.types import Limits
+from models.firmware import Klipper
+from models.machine import Machine
+
+__all__ = ["MIN_STREAM_ACCEL_MM_S2", "KlipperKit"]
+
+MIN_STREAM_ACCEL_MM_S2 = 30_000.0
+"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+
+
+class KlipperKit:
+    """Kit of a Klipper machine; see `gcode.firmware.base.FirmwareKit`."""
+
+    step_mm = (0.0, 0.0, 0.0, 0.0)
+    extruder_alone_stops = True
+
+    def __init__(self, machine: Machine, firmware: Klipper) -> None:
+        self._machine = machine
+        self._firmware = firmware
+        self._stream = stream_limits(firmware, machine.command.velocity_mm_s, machine.mesh_slope)
+
+    @property
+    def refusal(self) -> str | None:
+        """The bed is too crooked for the machine's Z, or None."""
+        left = self._stream.accel_mm_s2
+        if left >= MIN_STREAM_ACCEL_MM_S2:
+            return None
+        least = MIN_STREAM_ACCEL_MM_S2 * self._machine.mesh_slope
+        return (
+            f"the bed mesh rises by up to {self._machine.mesh_slope:g} mm per mm (mesh_slope), and "
+            f"Z, which follows it, leaves X and Y an acceleration of {left:.0f} mm/s2 "
+            f"(firmware.planner.max_z_accel_mm_s2 = "
+            f"{self._firmware.planner.max_z_accel_mm_s2:g}); a stream needs "
+            f"{MIN_STREAM_ACCEL_MM_S2:.0f}: level the bed, or raise max_z_accel in printer.cfg and "
+            f"here to {least:.0f}. The firmware's own shaper works as it is."
+        )
+
+    def initial_limits(self) -> KlipperLimits:
+        """Limits of printer.cfg."""
+        planner = self._firmware.planner
+        return KlipperLimits(
+            velocity_mm_s=planner.max_velocity_mm_s,
+            accel_mm_s2=planner.max_accel_mm_s2,
+            square_corner_velocity_mm_s=planner.square_corner_velocity_mm_s,
+            minimum_cruise_ratio=planner.minimum_cruise_ratio,
+        )
+
+    def stream_limits(self, own: Limits) -> KlipperLimits:  # noqa: ARG002
+        """Return the raised limits; nothing of the file's is kept."""
+        return self._stream
+
+    def planner(self) -> Planner:
+        """Return a planner at rest."""
+        return Planner(self._firmware)
+
+    def encoder(self) -> KlipperEncoder:
+        """Return an encoder of the stream."""
+        return KlipperEncoder(self._firmware, self._stream)
+
+    def voice(self) -> KlipperVoice:
+        """Return Klipper's words."""
+        return KlipperVoice(self._firmware)
+
+    def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which moves climb so much that Z's limit leaves too little acceleration."""
+        length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
+        flat = np.hypot(travel_mm[:, 0], travel_mm[:, 1])
+        climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * flat
+        least = self._firmware.planner.max_z_accel_mm_s2
+        return np.asarray(climb * MIN_STREAM_ACCEL_MM_S2 > length * least)

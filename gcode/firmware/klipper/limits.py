@@ -1,0 +1,19 @@
+"""Klipper's planner limits that G-code can change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gcode.types import Limits
+
+__all__ = ["KlipperLimits"]
+
+
+@dataclass(frozen=True, slots=True)
+class KlipperLimits(Limits):
+    """What SET_VELOCITY_LIMIT and M204 set."""
+
+    velocity_mm_s: float
+    accel_mm_s2: float
+    square_corner_velocity_mm_s: float
+    minimum_cruise_ratio: float

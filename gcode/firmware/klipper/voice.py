@@ -1,0 +1,68 @@
+"""Klipper's words around a stream."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+from gcode.firmware.klipper.limits import KlipperLimits
+from gcode.types import Limits
+from models.firmware import Klipper
+
+__all__ = ["IN_STREAM_MARK_MM_S", "KlipperVoice"]
+
+IN_STREAM_MARK_MM_S = 5e-7
+"""Added to the square corner velocity while the file's own moves run inside a stream: it tells
+stillpath.cfg that a PAUSE here is in mid stream, with the shaper off."""
+
+
+class KlipperVoice:
+    """Lines that Klipper understands; see `gcode.firmware.base.Voice`."""
+
+    notes = (
+        "between 'stream on' and 'stream off' the acceleration limit is raised",
+        "and every move is timed: leave the speed slider at 100 %. PAUSE and",
+        "CANCEL_PRINT must restore the limits first: see stillpath.cfg.",
+    )
+    stand_still = b"G4 P0 ; stand still\n"
+    positioning_sets_extruder = False
+    coarse_extruder = False
+    one_command = True
+    shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"
+
+    def __init__(self, firmware: Klipper) -> None:
+        self._shaper = firmware.shaper
+
+    @property
+    def shaper_on(self) -> bytes | None:
+        """Lines that set the shaper of printer.cfg, if the machine states it."""
+        s = self._shaper
+        if s is None:
+            return None
+        return (
+            f"SET_INPUT_SHAPER SHAPER_TYPE_X={s.type_x} SHAPER_FREQ_X={s.freq_x_hz:g} "
+            f"DAMPING_RATIO_X={s.damping_x:g} SHAPER_TYPE_Y={s.type_y} "
+            f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
+        ).encode()
+
+    def limits(self, limits: Limits) -> bytes:
+        """Return the line that sets the planner's limits."""
+        own = cast(KlipperLimits, limits)
+        # ACCEL_TO_DECEL is what Klipper before 2024-03 reads instead of MINIMUM_CRUISE_RATIO.
+        to_decel = own.accel_mm_s2 * (1.0 - own.minimum_cruise_ratio)
+        return (
+            f"SET_VELOCITY_LIMIT VELOCITY={own.velocity_mm_s:.10g} ACCEL={own.accel_mm_s2:.10g} "
+            f"ACCEL_TO_DECEL={to_decel:.10g} "
+            f"SQUARE_CORNER_VELOCITY={own.square_corner_velocity_mm_s:.10g} "
+            f"MINIMUM_CRUISE_RATIO={own.minimum_cruise_ratio:.10g}\n"
+        ).encode()
+
+    def acceleration(self, accel_mm_s2: float) -> bytes:
+        """Return the line that sets the acceleration."""
+        return f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:g}\n".encode()
+
+    def in_stream(self, limits: Limits) -> Limits:
+        """Mark the file's own limits as being in the middle of a stream."""
+        own = cast(KlipperLimits, limits)
+        corner = own.square_corner_velocity_mm_s + IN_STREAM_MARK_MM_S
+        return replace(own, square_corner_velocity_mm_s=corner)

@@ -1,0 +1,1 @@
+"""Marlin and its relatives: limits, planner, encoder."""

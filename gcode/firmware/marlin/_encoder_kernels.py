@@ -1,0 +1,244 @@
+"""Loops of the Marlin encoder: vertices on whole steps, and step rates that land on time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gcode.firmware._writing_kernels import printed_feedrate
+from models.jit import kernel
+
+__all__ = ["assign_rates", "bend_reversals", "thin"]
+
+RUSH, RUSH_MM_S = 1.25, 10.0
+"""No segment is hurried beyond this much of its planned speed and this much more: what is lost at
+one step is made up for over the next segments, not by a jerk."""
+_NEARLY_BACK = 0.9999
+
+
+@kernel
+def thin(
+    steps: Any,
+    begin: Any,
+    end_s: Any,
+    start_s: Any,
+    group: Any,
+    least: int,
+    rate: float,
+    burst: float,
+    corexy: bool,
+    keep: Any,
+) -> None:
+    """Choose the vertices that the firmware executes: `least` steps apart, no more than come in.
+
+    Lines come in at `rate` a second; while the motion waits for them it lives on `burst` blocks of
+    the queue, which fills again when there are fewer.
+
+    Parameters
+    ----------
+    steps : ndarray of int64, shape (n, 3)
+        X Y Z of the vertices in whole steps.
+    begin : ndarray of int64, shape (groups, 3)
+        Where each group starts.
+    end_s, group : ndarray, shape (n,)
+    start_s : ndarray, shape (groups,)
+        When each group starts.
+    keep : ndarray of bool, shape (n,)
+        Filled. A vertex that is left out gives its time and filament to the next; the last of a
+        stretch is always kept, and the ones before it go where it would be too near.
+    """
+    count = len(end_s)
+    stock = burst
+    i = 0
+    while i < count:
+        g = group[i]
+        stop = i
+        while stop < count and group[stop] == g:
+            stop += 1
+        last = -1
+        for k in range(i, stop - 1):
+            before_s = end_s[k - 1] if k > i else start_s[g]
+            stock = min(stock + rate * (end_s[k] - before_s), burst)
+            far = _hop(steps[k], steps[last] if last >= 0 else begin[g], corexy) >= least
+            keep[k] = far and stock >= 1.0
+            if keep[k]:
+                stock -= 1.0
+                last = k
+        end = stop - 1
+        keep[end] = True
+        while last >= i:
+            if _hop(steps[end], steps[last], corexy) >= least:
+                break
+            keep[last] = False
+            last -= 1
+            while last >= i and not keep[last]:
+                last -= 1
+        i = stop
+
+
+@kernel
+def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any) -> None:
+    """Make no vertex an exact turn back: by junction deviation the releases would stop there.
+
+    They begin at 120 steps/s behind it, which takes 1/120 s for the first step. A step to the side
+    at the next vertex, towards where it was meant to be, is angle enough.
+
+    Parameters
+    ----------
+    steps : ndarray of int64, shape (n, 3)
+        Vertices in whole steps; X and Y are edited in place.
+    begin : ndarray of int64, shape (groups, 3)
+    group : ndarray of int64, shape (n,)
+    wish : ndarray, shape (n, 2)
+        Where the vertices were meant to be, X Y in steps.
+    """
+    count = len(group)
+    # The last two different places before vertex k; a vertex where nothing moves is no block.
+    far_x, far_y, near_x, near_y, near = 0, 0, 0, 0, -1
+    known = 0
+    for k in range(count):
+        if k == 0 or group[k] != group[k - 1]:
+            near_x, near_y, near, known = begin[group[k], 0], begin[group[k], 1], -1, 1
+        final = k + 1 == count or group[k + 1] != group[k]
+        for _ in range(2):
+            bx, by = float(steps[k, 0] - near_x), float(steps[k, 1] - near_y)
+            ax, ay = float(near_x - far_x), float(near_y - far_y)
+            size = np.sqrt((ax * ax + ay * ay) * (bx * bx + by * by))
+            if known < 2 or size == 0.0 or ax * bx + ay * by > -_NEARLY_BACK * size:
+                break
+            at = near if final and near >= 0 else k
+            axis = 1 if abs(bx) >= abs(by) else 0
+            steps[at, axis] += 1 if wish[at, axis] >= steps[at, axis] else -1
+            near_x, near_y = (steps[at, 0], steps[at, 1]) if at == near else (near_x, near_y)
+        if steps[k, 0] != near_x or steps[k, 1] != near_y:
+            far_x, far_y = near_x, near_y
+            near_x, near_y, near = steps[k, 0], steps[k, 1], k
+            known += 1
+
+
+@kernel
+def _hop(a: Any, b: Any, corexy: bool) -> int:
+    """Count the steps of the motor that makes the most of them."""
+    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    if corexy:
+        dx, dy = dx + dy, dx - dy
+    return int(max(abs(dx), abs(dy), abs(dz)))
+
+
+@kernel(inline=True)
+def _last_rate(rate: float, per_mm: float, v_next: float, accel: float) -> float:
+    """Rate of a block's last step in bugfix: braked for half a step, not below the next speed."""
+    return max(rate - 0.5 * accel * per_mm / rate, min(v_next * per_mm, rate))
+
+
+@kernel
+def assign_rates(
+    ours: Any,
+    steps: Any,
+    path_mm: Any,
+    end_s: Any,
+    planned_s: Any,
+    fastest_mm_s: Any,
+    foreign_s: Any,
+    correction_s: Any,
+    floor_mm_s: Any,
+    accel_mm_s2: float,
+    bugfix: bool,
+    instant: bool,
+    timer_hz: float,
+    start_s: float,
+    feedrate: Any,
+    predicted_s: Any,
+) -> None:
+    """Feedrates (mm/min, as they will be printed) that reach every end at its time.
+
+    The firmware rounds the step rate up and the time of a step down to ticks; a block that starts
+    at the slower speed of the one before (releases with junction deviation) or ends at that of
+    the next (bugfix) loses part of a step. What is lost or won is carried to the next segment.
+
+    Parameters
+    ----------
+    steps, path_mm : ndarray, shape (n,)
+        Step events and length of every block; 0 steps: the firmware swallows the move.
+    foreign_s : ndarray, shape (n,)
+        How long moves that are not ours take.
+    correction_s : ndarray, shape (n,)
+        What a block takes longer than this law says.
+    floor_mm_s : ndarray, shape (n,)
+        Speed from which bugfix starts and stops at once.
+    instant : bool
+        Every block starts at its own speed (classic jerk of the releases).
+    """
+    now = start_s
+    before = 0.0
+    before_steps_per_mm = 1.0
+    late = 0.0
+    for i in range(len(steps)):
+        if not ours[i]:
+            predicted_s[i] = foreign_s[i]
+            now += foreign_s[i]
+            before = 0.0
+            continue
+        if i == 0 or not ours[i - 1]:
+            # The stretch starts when its rest is over, whenever that is.
+            late = now + planned_s[i] - end_s[i]
+        if steps[i] == 0.0:
+            feedrate[i] = printed_feedrate(60.0 * fastest_mm_s[i])
+            predicted_s[i] = 0.0
+            continue
+        n, path = steps[i], path_mm[i]
+        per_mm = n / path
+        # Where it cannot keep up it may run behind for a while, but must not fall to pieces.
+        wanted = end_s[i] + late - now - correction_s[i]
+        if i == 0:
+            # From rest the releases take 1/120 s for the first step: the stretch begins behind it.
+            wanted = planned_s[i]
+        hurried = RUSH * path / planned_s[i] + RUSH_MM_S
+        least = path / min(fastest_mm_s[i], hurried)
+        available = max(wanted, least)
+        # The next one may begin (releases) or this one end (bugfix) at the slower of both speeds:
+        # the share of a step that this takes is time that the rest of this block does not have.
+        slow_steps, slow_s = 0.0, 0.0
+        if not instant and i + 1 < len(steps) and ours[i + 1] and steps[i + 1] > 0.0:
+            v_next = path_mm[i + 1] / planned_s[i + 1]
+            next_per_mm = steps[i + 1] / path_mm[i + 1]
+            if bugfix:
+                slowest = _last_rate(n / available, per_mm, v_next, accel_mm_s2)
+                if slowest * available < n and n > 1.0:
+                    slow_steps, slow_s = -1.0, -1.0 / slowest
+            elif v_next * available > path:
+                slow_steps, slow_s = per_mm / next_per_mm, 1.0 / (v_next * next_per_mm)
+        rate = n / available
+        ticks = 0.0
+        lost = 0.0
+        for _ in range(3):
+            free = max(available - lost, least)
+            if slow_s != 0.0:
+                free = max((free + slow_s) / (1.0 + slow_steps / n), 0.5 * free)
+            ticks = max(np.round(timer_hz * free / n), 1.0)
+            # A rate that gives these ticks, as near as can be to the one that is meant.
+            lowest, highest = np.floor(timer_hz / (ticks + 1.0)) + 1.0, np.floor(timer_hz / ticks)
+            rate = min(max(np.ceil(n / free), lowest), highest)
+            lost = 0.0
+            entry = min(before, rate / per_mm)
+            if bugfix:
+                entry = max(entry, min(floor_mm_s[i], rate / per_mm))
+            if not instant and entry > 0.0 and entry * per_mm < rate - 1.0:
+                lost = np.floor(timer_hz / np.ceil(entry * per_mm)) / timer_hz - ticks / timer_hz
+        # Half a step per second below: the firmware rounds up.
+        feedrate[i] = printed_feedrate(60.0 * max(rate - 0.5, 0.5 * rate) / per_mm)
+        rate = np.ceil(feedrate[i] / 60.0 * per_mm - 1e-6)
+        ticks = np.floor(timer_hz / rate)
+        predicted_s[i] = n * ticks / timer_hz + lost + correction_s[i]
+        now += predicted_s[i]
+        if i == 0:
+            late += predicted_s[i] - planned_s[i]
+        v = rate / per_mm
+        if bugfix and i > 0 and ours[i - 1] and steps[i - 1] > 1.0 and before > v:
+            was = before * before_steps_per_mm
+            slowest = _last_rate(was, before_steps_per_mm, v, accel_mm_s2)
+            predicted_s[i - 1] += 1.0 / slowest - 1.0 / was
+            now += 1.0 / slowest - 1.0 / was
+        before = v
+        before_steps_per_mm = per_mm

@@ -1,0 +1,251 @@
+"""Marlin's commands that Python carries out.
+
+Sources: Marlin/src/gcode: config/M200-M205.cpp (2.0.x, 2.1.x), config/M220.cpp, config/M221.cpp,
+geometry/G92.cpp (2.0.x, 2.1.x), feature/advance/M900.cpp (2.1.x); the others by Marlin's
+documentation, see docs/dialects.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from gcode import _slots as at
+from gcode.dialect import Handler
+from gcode.lexer import Command
+from gcode.state import MachineState
+from gcode.types import EventKind
+from models.firmware import Marlin
+
+__all__ = [
+    "axis_limits",
+    "end_motion_mode",
+    "extrude_factor",
+    "filament_area",
+    "linear_advance",
+    "motion_limits",
+    "park_tool",
+    "reset_limits",
+    "reset_origin",
+    "retract_settings",
+    "speed_factor",
+    "unheeded",
+]
+
+_M205 = {
+    "B": "min_segment_time_us",
+    "S": "min_feedrate_mm_s",
+    "T": "min_travel_feedrate_mm_s",
+    "J": "junction_deviation_mm",
+    "X": "jerk_x_mm_s",
+    "Y": "jerk_y_mm_s",
+    "Z": "jerk_z_mm_s",
+    "E": "jerk_e_mm_s",
+}
+_M204 = {"P": "print_accel_mm_s2", "R": "retract_accel_mm_s2", "T": "travel_accel_mm_s2"}
+
+
+def axis_limits(fields: str, unit: float = 1.0) -> Handler:
+    """M201 and M203: one limit per axis.
+
+    Parameters
+    ----------
+    fields : str
+        Name of the limit with ``{axis}`` for x, y, z, e.
+    unit : float
+        What the firmware's unit is in mm and s.
+    """
+
+    def handle(state: MachineState, command: Command) -> int:
+        given = state.numbers(command, "XYZE")
+        values = {}
+        for letter, value in given.items():
+            scaled = value * unit * float(state.f[at.F_UNIT_MM])
+            if scaled <= 0.0:
+                state.warn(f"{command.name} {letter}{value:g} is not above 0 and is passed over")
+                continue
+            values[fields.format(axis=letter.lower())] = scaled
+        return state.set_limits(command, values)
+
+    return handle
+
+
+def motion_limits(state: MachineState, command: Command) -> int:
+    """M204, and M205 with J or X Y Z E, whichever the firmware is built for."""
+    unit = float(state.f[at.F_UNIT_MM])
+    values: dict[str, float] = {}
+    if command.name == "M204":
+        given = state.numbers(command, "SPRT")
+        for letter, value in given.items():
+            if value <= 0.0:
+                state.warn(f"M204 {letter}{value:g} is not above 0 and is passed over")
+            elif letter == "S":
+                values[_M204["P"]] = values[_M204["T"]] = value * unit
+            else:
+                values[_M204[letter]] = value * unit
+        return state.set_limits(command, values)
+    firmware = state.machine.firmware
+    classic = isinstance(firmware, Marlin) and firmware.junction == "classic_jerk"
+    for letter, value in state.numbers(command, "BSTXYZE" if classic else "BSTJ").items():
+        if letter == "J" and not 0.01 <= value <= 0.3:
+            state.warn(f"M205 J{value:g} is not between 0.01 and 0.3, and is passed over")
+        elif value < 0.0:
+            state.warn(f"M205 {letter}{value:g} is below 0 and is passed over")
+        else:
+            values[_M205[letter]] = float(int(value)) if letter == "B" else value * unit
+    return state.set_limits(command, values)
+
+
+def linear_advance(state: MachineState, command: Command) -> int:
+    """M900: K from 0 to 10. The firmware waits for standstill where it changes."""
+    given = state.numbers(command, "KT")
+    k = given.get("K")
+    if {"L", "S"} & command.words.keys():
+        # A second K to change over to (ADVANCE_K_EXTRA).
+        state.warn("M900 with L or S: which K is in force is not known")
+        return state.event(EventKind.UNKNOWN)
+    if k is None or _other_tool(state, given):
+        return state.event(EventKind.HARMLESS)
+    if not 0.0 <= k <= 10.0:
+        state.warn(f"M900 K{k:g} is not between 0 and 10, and is passed over")
+        return state.event(EventKind.HARMLESS)
+    if k == state.limit("linear_advance_k_s"):
+        return state.event(EventKind.HARMLESS)
+    return state.set_limits(command, {"linear_advance_k_s": k}, remember=False, kind=EventKind.STOP)
+
+
+def speed_factor(state: MachineState, command: Command) -> int:
+    """M220: S sets whole per cent, B remembers them and R brings them back."""
+    f = state.f
+    percent = f[at.F_SPEED_FACTOR] * 6000.0
+    if "B" in command.words:
+        state.factors["M220"] = percent
+    if "R" in command.words:
+        percent = state.factors.get("M220", 100.0)
+    percent = _whole(state, command).get("S", percent)
+    if percent <= 0.0:
+        raise state.problem("a speed of 0 % stops the print for good; leave M220 S0 out", command)
+    state.settle()
+    factor = percent / 6000.0
+    f[at.F_SPEED] = f[at.F_SPEED] / f[at.F_SPEED_FACTOR] * factor
+    f[at.F_SPEED_FACTOR] = factor
+    state.note_modal()
+    return state.event(EventKind.MODE)
+
+
+def extrude_factor(state: MachineState, command: Command) -> int:
+    """M221: S sets whole per cent; without a number nothing (Bambu's M221 S, M221 X0 Y0 Z0)."""
+    percent = _whole(state, command).get("S")
+    if percent is None or _other_tool(state, state.numbers(command, "T")):
+        return state.event(EventKind.HARMLESS)
+    if percent <= 0.0:
+        raise state.problem("a flow of 0 % cannot be followed; leave M221 S0 out", command)
+    f = state.f
+    state.settle()
+    factor = percent / 100.0
+    e_value = (f[at.F_LAST + 3] - f[at.F_BASE + 3]) / f[at.F_EXTRUDE_FACTOR]
+    f[at.F_BASE + 3] = f[at.F_LAST + 3] - e_value * factor
+    f[at.F_EXTRUDE_FACTOR] = factor
+    state.note_modal()
+    return state.event(EventKind.MODE)
+
+
+def filament_area(state: MachineState, command: Command) -> int:
+    """M200: E in cubic mm of a filament of diameter D; D0 or S0: in mm again."""
+    given = state.numbers(command, "DS")
+    if "D" not in given and "S" not in given:
+        return state.event(EventKind.HARMLESS)
+    diameter = given.get("D", state.firmware.hotend.filament_diameter_mm)
+    on = given.get("S", diameter) != 0.0 and diameter > 0.0
+    state.settle()
+    area = math.pi * diameter**2 / 4.0 if on else 1.0
+    f = state.f
+    f[at.F_UNIT_E_MM] = (f[at.F_UNIT_MM] ** 3 if on else f[at.F_UNIT_MM]) / area
+    if on:
+        state.warn("E is in cubic millimetres (M200); such moves stay as they are")
+    return state.event(EventKind.MODE)
+
+
+def retract_settings(state: MachineState, command: Command) -> int:
+    """M207 (S length, F feedrate, Z hop) and M208 (S extra length, F feedrate)."""
+    if state.retraction is None:
+        return state.event(state.dialect.otherwise(command.name))
+    unit = float(state.f[at.F_UNIT_MM])
+    given = {letter: value * unit for letter, value in state.numbers(command, "SFZ").items()}
+    names: Mapping[str, str] = {"S": "length_mm", "F": "speed_mm_s", "Z": "hop_mm"}
+    if command.name == "M208":
+        names = {"S": "extra_mm", "F": "return_speed_mm_s"}
+    changes = {}
+    for letter, name in names.items():
+        if letter in given and (letter != "F" or given[letter] > 0.0):
+            changes[name] = abs(given[letter]) / (60.0 if letter == "F" else 1.0)
+    state.change_retraction(**changes)
+    return state.event(EventKind.MODE)
+
+
+def reset_origin(state: MachineState, _command: Command) -> int:
+    """G92.1: the machine's own coordinates."""
+    f = state.f
+    state.settle()
+    f[at.F_BASE : at.F_BASE + 3] = f[at.F_HOMING : at.F_HOMING + 3]
+    state.i[at.I_ORIGIN_KNOWN] = 0b111
+    state.note_modal()
+    return state.event(EventKind.MODE)
+
+
+def reset_limits(state: MachineState, command: Command) -> int:
+    """M501 and M502: the settings that are stored, or the build's own.
+
+    Those stored are what the machine's document says of power-on; of the build's nobody knows.
+    """
+    if command.name == "M502":
+        state.warn("M502: the build's own limits are not known; those of the machine are taken")
+    row = state.initial_limits
+    state.settle()
+    state.f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
+    state.note_limits()
+    state.warn(f"{command.name}: from here on the position is not known until the printer homes")
+    state.forget(origin=True)
+    return state.event(EventKind.UNKNOWN)
+
+
+def end_motion_mode(state: MachineState, _command: Command) -> int:
+    """G80: lines without a G are passed over until the next one."""
+    state.i[at.I_MOTION] = -1
+    return state.event(EventKind.HARMLESS)
+
+
+def park_tool(state: MachineState, _command: Command) -> int:
+    """P0 of a Prusa with a tool changer: no tool is in use, and the next T fetches one."""
+    state.tool_known = False
+    return state.event(EventKind.UNKNOWN)
+
+
+def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
+    """Return a handler for commands whose effect nobody here can follow.
+
+    Parameters
+    ----------
+    kind : EventKind
+    why : str
+        What a person is told.
+    origin : bool
+        For UNKNOWN: coordinates may count from somewhere else, so that they tell no place either.
+    """
+
+    def handle(state: MachineState, command: Command) -> int:
+        state.warn(f"{command.name}: {why}")
+        if kind == EventKind.UNKNOWN:
+            state.forget(origin=origin)
+        return state.event(kind)
+
+    return handle
+
+
+def _other_tool(state: MachineState, given: Mapping[str, float]) -> bool:
+    """Tell whether a command names a tool that is not the one in use."""
+    return "T" in given and int(given["T"]) != int(state.i[at.I_TOOL])
+
+
+def _whole(state: MachineState, command: Command) -> dict[str, float]:
+    return {key: float(int(value)) for key, value in state.numbers(command, "S").items()}

@@ -1,0 +1,258 @@
+"""From a compensated command to the G1 lines that make Marlin execute it.
+
+Marlin moves in whole steps and times them in whole ticks. The vertices lie on whole steps, so that
+its rounding changes nothing, and far enough apart that it executes each; the feedrates are those of
+step rates that it can produce, and what a segment gains or loses is carried to the next. What the
+law misses is measured with the firmware's own planner and corrected (docs/marlin.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.errors import GcodeError
+from gcode.firmware.encoding import (
+    UNITS_PER_MM,
+    Encoded,
+    Interleaved,
+    as_moves,
+    encoded_piece,
+    group_durations,
+    interleave,
+    limits_in_force,
+    to_units,
+)
+from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
+from gcode.firmware.marlin.limits import MarlinLimits
+from gcode.firmware.marlin.planner import Planner
+from gcode.firmware.planning import join_phases
+from gcode.pieces import Piece
+from gcode.segments import Segments
+from gcode.timeline import Group, Timeline
+from gcode.types import Limits, Phases
+from models.firmware import Marlin
+
+__all__ = ["MarlinEncoder", "stream_limits"]
+
+STREAM_ACCEL_MM_S2 = 300_000.0
+"""High enough for ramps to be parts of a step, low enough that a command of somebody else that
+slips in is no disaster, and within the 32 bits of Marlin's acceleration_rate."""
+STREAM_Z_ACCEL_MM_S2 = 20_000.0
+STREAM_DEVIATION_MM = 0.3
+"""The largest that M205 J takes."""
+STREAM_JERK_MM_S = 500.0
+STREAM_E_JERK_MM_S = 100.0
+STREAM_Z_JERK_MM_S = 10.0
+
+_PASSES = 10
+_TIME_TOLERANCE_S = 5e-5
+_BYTES_PER_LINE = 32.0
+"""Of a line of ours with its line number, checksum and the host's share of the acknowledgement."""
+
+
+def stream_limits(own: MarlinLimits, velocity_mm_s: float) -> MarlinLimits:
+    """Return what a stream runs under where the file has set `own`.
+
+    Retractions are not ours, so their acceleration stays; so does linear advance.
+    """
+    return replace(
+        own,
+        accel_x_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_y_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_z_mm_s2=max(own.accel_z_mm_s2, STREAM_Z_ACCEL_MM_S2),
+        accel_e_mm_s2=STREAM_ACCEL_MM_S2,
+        feedrate_x_mm_s=max(own.feedrate_x_mm_s, velocity_mm_s),
+        feedrate_y_mm_s=max(own.feedrate_y_mm_s, velocity_mm_s),
+        feedrate_e_mm_s=2.0 * own.feedrate_e_mm_s,
+        print_accel_mm_s2=STREAM_ACCEL_MM_S2,
+        travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
+        jerk_x_mm_s=STREAM_JERK_MM_S,
+        jerk_y_mm_s=STREAM_JERK_MM_S,
+        jerk_z_mm_s=max(own.jerk_z_mm_s, STREAM_Z_JERK_MM_S),
+        jerk_e_mm_s=max(own.jerk_e_mm_s, STREAM_E_JERK_MM_S),
+        junction_deviation_mm=max(own.junction_deviation_mm, STREAM_DEVIATION_MM),
+        min_segment_time_us=0.0,
+        min_feedrate_mm_s=0.0,
+        min_travel_feedrate_mm_s=0.0,
+    )
+
+
+class MarlinEncoder:
+    """Encode pieces for one machine.
+
+    Parameters
+    ----------
+    firmware : Marlin
+    velocity_mm_s : float
+        Highest speed of the command.
+    corexy : bool
+    """
+
+    def __init__(self, firmware: Marlin, velocity_mm_s: float, *, corexy: bool) -> None:
+        self._firmware = firmware
+        self._velocity = velocity_mm_s
+        self._corexy = corexy
+        self._releases = firmware.variant in ("2.0", "2.1")
+        scale = firmware.steps_per_mm
+        self._scale = np.array([scale.x, scale.y, scale.z, scale.e])
+        rate = firmware.max_segments_per_s
+        if firmware.link == "serial":
+            rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
+        self._rate = rate
+        self._burst = 0.5 * firmware.block_buffer_size
+
+    @property
+    def grid_mm(self) -> float:
+        """A step of X; where Y has others, its vertices are rounded to them afterwards."""
+        return 1.0 / float(self._scale[0])
+
+    def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
+        """First guess of the rests' durations: those of the original plan."""
+        return group_durations(piece.phases, groups)
+
+    def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
+        """Choose vertices on whole steps, and feedrates.
+
+        Raises
+        ------
+        GcodeError
+            Where linear advance would cap the stream's accelerations.
+        """
+        own = cast(MarlinLimits, piece.limits_before)
+        if self._firmware.linear_advance is not False and own.linear_advance_k_s > 0.0:
+            raise GcodeError(
+                f"linear advance is on (M900 K{own.linear_advance_k_s:g}): Marlin would lower the "
+                "stream's accelerations and send the extruder a burst of steps at each of its "
+                "corners; print with M900 K0, or use the firmware's own shaper (M593). For a "
+                "firmware without it say linear_advance false",
+                line=int(piece.moves.line[0]),
+            )
+        limits = stream_limits(own, self._velocity)
+        moves = interleave(piece, timeline, self._on_steps(timeline, segments), 1)
+        moves = self._where_the_file_says(piece, timeline, moves)
+        rows = moves.row
+        start = np.concatenate([moves.begin[None], moves.position[:-1]])
+        start_mm, end_mm = start / UNITS_PER_MM, moves.position / UNITS_PER_MM
+        ours = rows < 0
+        limits_id, table = limits_in_force(piece, rows, limits)
+        speed = np.where(ours, self._velocity, piece.moves.speed_mm_s[rows])
+        steps, path = self._blocks(start_mm, end_mm)
+
+        phases = self._plan(start_mm, end_mm, speed, limits_id, table)
+        actual = phases.accel_s + phases.cruise_s + phases.decel_s
+        correction, feedrate, predicted = (np.zeros(len(rows)) for _ in range(3))
+        floor_mm_s = np.sqrt(0.5 * STREAM_ACCEL_MM_S2 * path / np.maximum(steps, 1.0))
+        for attempt in range(_PASSES):
+            assign_rates(
+                ours,
+                steps,
+                path,
+                moves.end_s,
+                moves.planned_s,
+                speed,
+                actual,
+                correction,
+                floor_mm_s,
+                STREAM_ACCEL_MM_S2,
+                self._firmware.variant == "bugfix",
+                self._releases and self._firmware.junction == "classic_jerk",
+                self._firmware.step_timer_hz,
+                float(timeline.start_s[0]),
+                feedrate,
+                predicted,
+            )
+            chosen = np.where(ours, feedrate / 60.0, speed)
+            phases = self._plan(start_mm, end_mm, chosen, limits_id, table)
+            actual = phases.accel_s + phases.cruise_s + phases.decel_s
+            miss = actual - predicted
+            if np.max(np.abs(np.cumsum(miss))) < _TIME_TOLERANCE_S:
+                break
+            # Rates have steps: a full correction would swing to and fro.
+            correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
+        encoded = encoded_piece(timeline, moves, limits, feedrate, phases)
+        if not ours[0]:
+            return encoded
+        # What the first step from rest takes too long, the stretch begins later.
+        delay_s = float(actual[0] - moves.planned_s[0])
+        group_start_s, row_start_s = encoded.group_start_s.copy(), encoded.row_start_s.copy()
+        group_start_s[0] += delay_s
+        row_start_s[: timeline.groups[0].last] += delay_s
+        return replace(encoded, group_start_s=group_start_s, row_start_s=row_start_s)
+
+    def _where_the_file_says(
+        self, piece: Piece, timeline: Timeline, moves: Interleaved
+    ) -> Interleaved:
+        """Let stretches begin and end, and rests go, where the file says and not on steps.
+
+        The firmware comes to the same steps, and filament adds up to the last digit.
+        """
+        own = piece.moves.end_mm
+        position = moves.position.copy()
+        rests = moves.row >= 0
+        position[rests] = to_units(own[moves.row[rests]])
+        last = np.append(moves.group[1:] != moves.group[:-1], True) & ~rests
+        ends = own[[timeline.groups[g].last - 1 for g in moves.group[last]]]
+        meant = position[last] / UNITS_PER_MM
+        same = np.round(ends * self._scale) == np.round(meant * self._scale)
+        same[:, 3] = True
+        position[last] = np.where(same, to_units(ends), position[last])
+        return replace(moves, position=position, begin=to_units(piece.moves.start_mm[0]))
+
+    def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
+        """Put the vertices on whole steps, and leave out those that would be swallowed."""
+        scale = self._scale[:3]
+        steps = np.round(segments.end_mm[:3].T * scale).astype(np.int64)
+        begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
+        keep = np.ones(len(segments), np.bool_)
+        thin(
+            steps,
+            begin,
+            segments.end_s,
+            timeline.start_s,
+            segments.group,
+            self._firmware.min_steps_per_segment,
+            self._rate,
+            self._burst,
+            self._corexy,
+            keep,
+        )
+        steps, group, end_mm = steps[keep], segments.group[keep], segments.end_mm[:, keep]
+        if self._releases and self._firmware.junction == "deviation":
+            bend_reversals(steps, begin, group, (end_mm[:2].T * scale[:2]))
+        last = np.append(group[1:] != group[:-1], True)
+        end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
+        return Segments(segments.end_s[keep], end_mm, group)
+
+    def _blocks(
+        self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Step events and length of the block of every move, as the planner makes it."""
+        travel = np.round(end_mm * self._scale) - np.round(start_mm * self._scale)
+        x_mm, y_mm, z_mm, e_mm = (travel / self._scale).T
+        motors = np.abs(travel)
+        if self._corexy:
+            motors[:, 0] = np.abs(travel[:, 0] + travel[:, 1])
+            motors[:, 1] = np.abs(travel[:, 0] - travel[:, 1])
+        least = self._firmware.min_steps_per_segment
+        path = np.sqrt(x_mm**2 + y_mm**2 + z_mm**2)
+        path = np.where(np.max(motors[:, :3], axis=1) >= least, path, np.abs(e_mm))
+        steps = np.max(motors, axis=1)
+        steps = np.where((steps >= least) & (path > 0.0), steps, 0.0)
+        return steps, np.where(path > 0.0, path, 1.0)
+
+    def _plan(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
+    ) -> Phases:
+        planner = Planner(self._firmware, corexy=self._corexy)
+        moves = as_moves(start_mm, end_mm, speed_mm_s, limits_id)
+        return join_phases([planner.push_moves(moves, limits), planner.flush()])

@@ -1,0 +1,123 @@
+"""What Marlin offers to the road."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.marlin.encoder import STREAM_Z_ACCEL_MM_S2, MarlinEncoder, stream_limits
+from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
+from gcode.firmware.marlin.planner import Planner
+from gcode.firmware.marlin.voice import MarlinVoice
+from gcode.types import Limits
+from models.firmware import Marlin
+from models.machine import Machine
+
+__all__ = ["LONGEST_LEAST_MM", "MIN_STREAM_ACCEL_MM_S2", "MarlinKit"]
+
+MIN_STREAM_ACCEL_MM_S2 = 30_000.0
+"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+
+LONGEST_LEAST_MM = 0.02
+"""Longest of the shortest moves that a firmware may execute: where a command turns back within
+20 mm/s and 1 ms, vertices lie that near."""
+
+JUNCTION_DEVIATION_MM = (0.01, 0.3)
+"""What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
+
+_ALTERNATIVE = "use the firmware's own input shaper (`stillpath simulate` names its best setting)"
+
+
+class MarlinKit:
+    """Kit of a Marlin machine; see `gcode.firmware.base.FirmwareKit`."""
+
+    extruder_alone_stops = False
+
+    def __init__(self, machine: Machine, firmware: Marlin) -> None:
+        self._firmware = firmware
+        self._corexy = machine.kinematics == "corexy"
+        self._velocity = machine.command.velocity_mm_s
+        self._mesh_slope = machine.mesh_slope
+        scale = firmware.steps_per_mm
+        self.step_mm = (1.0 / scale.x, 1.0 / scale.y, 1.0 / scale.z, 1.0 / scale.e)
+
+    @property
+    def refusal(self) -> str | None:
+        """Why no stream can be made for this machine, and what to do instead."""
+        firmware = self._firmware
+        if firmware.variant == "bambu":
+            return (
+                "Bambu's firmware is closed: how it plans a stream is not known; "
+                "it compensates itself (M975 S1)"
+            )
+        if firmware.variant == "prusa":
+            return (
+                "Prusa's firmware holds accelerations and jerk to fixed limits "
+                "(HWLIMIT_NORMAL_MAX_ACCELERATION), too low for a stream; " + _ALTERNATIVE
+            )
+        if firmware.variant == "bugfix":
+            return (
+                "bugfix-2.1.x brakes within the last step of every block, and a dense stream runs "
+                "too late by that; install release 2.1.2 and say so in `variant`, or "
+                + _ALTERNATIVE
+            )
+        if firmware.board == "avr":
+            return (
+                "an 8-bit board computes step rates in 16 bits and takes some hundred segments a "
+                "second at most; print from a 32-bit board, or lower the file's acceleration"
+            )
+        if firmware.s_curve:
+            return (
+                "S_CURVE_ACCELERATION rounds off every change of speed within a step's time in a "
+                "way that is not modelled; build without it, or " + _ALTERNATIVE
+            )
+        deviation_mm = firmware.planner.junction_deviation_mm
+        low, high = JUNCTION_DEVIATION_MM
+        if firmware.junction == "deviation" and not low <= deviation_mm <= high:
+            return (
+                f"M205 J takes {low:g} to {high:g} mm, so the machine's junction deviation of "
+                f"{deviation_mm:g} mm could not be put back behind a stream; build with a "
+                "JUNCTION_DEVIATION_MM in that range and say so in planner.junction_deviation_mm"
+            )
+        least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
+        if firmware.min_steps_per_segment > 1 and least_mm > LONGEST_LEAST_MM:
+            return (
+                f"it swallows moves below {firmware.min_steps_per_segment} steps "
+                f"({1e3 * least_mm:.0f} um), and a stream has such: build it with "
+                "MIN_STEPS_PER_SEGMENT 1 (Configuration_adv.h) and say so in "
+                "min_steps_per_segment, or " + _ALTERNATIVE
+            )
+        slope = self._mesh_slope
+        if slope > 0.0 and slope * MIN_STREAM_ACCEL_MM_S2 > STREAM_Z_ACCEL_MM_S2:
+            return f"the bed mesh is too steep ({slope:g}): level the bed"
+        return None
+
+    def initial_limits(self) -> MarlinLimits:
+        """Limits at power-on."""
+        return initial_limits(self._firmware)
+
+    def stream_limits(self, own: Limits) -> MarlinLimits:
+        """Return what a stream runs under where the file has set `own`."""
+        return stream_limits(cast(MarlinLimits, own), self._velocity)
+
+    def planner(self) -> Planner:
+        """Return a planner at rest."""
+        return Planner(self._firmware, corexy=self._corexy)
+
+    def encoder(self) -> MarlinEncoder:
+        """Return an encoder of the stream."""
+        return MarlinEncoder(self._firmware, self._velocity, corexy=self._corexy)
+
+    def voice(self) -> MarlinVoice:
+        """Return Marlin's words."""
+        return MarlinVoice(self._firmware)
+
+    def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which moves climb so much that Z leaves too little acceleration."""
+        length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
+        climb = np.abs(travel_mm[:, 2])
+        steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * STREAM_Z_ACCEL_MM_S2
+        fast = self._firmware.planner.max_feedrate_mm_s.z * length
+        return np.asarray(steep | (climb * self._velocity > fast))

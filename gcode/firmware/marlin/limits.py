@@ -1,0 +1,75 @@
+"""The planner limits that G-code can change on a Marlin machine: M201, M203, M204, M205, M900."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gcode.types import Limits
+from models.firmware import Marlin
+
+__all__ = ["MarlinLimits", "initial_limits"]
+
+
+@dataclass(frozen=True, slots=True)
+class MarlinLimits(Limits):
+    """Limits in force; the order of the fields is that of a row of the interpreter's table."""
+
+    accel_x_mm_s2: float
+    accel_y_mm_s2: float
+    accel_z_mm_s2: float
+    accel_e_mm_s2: float
+    """M201 X Y Z E."""
+    feedrate_x_mm_s: float
+    feedrate_y_mm_s: float
+    feedrate_z_mm_s: float
+    feedrate_e_mm_s: float
+    """M203 X Y Z E."""
+    print_accel_mm_s2: float
+    """M204 P."""
+    retract_accel_mm_s2: float
+    """M204 R."""
+    travel_accel_mm_s2: float
+    """M204 T."""
+    jerk_x_mm_s: float
+    jerk_y_mm_s: float
+    jerk_z_mm_s: float
+    jerk_e_mm_s: float
+    """M205 X Y Z E, where classic jerk is configured."""
+    junction_deviation_mm: float
+    """M205 J, where it is not."""
+    min_segment_time_us: float
+    """M205 B."""
+    min_feedrate_mm_s: float
+    """M205 S."""
+    min_travel_feedrate_mm_s: float
+    """M205 T."""
+    linear_advance_k_s: float
+    """M900 K."""
+
+
+def initial_limits(firmware: Marlin) -> MarlinLimits:
+    """Return the limits at power-on."""
+    planner = firmware.planner
+    accel, feedrate, jerk = planner.max_accel_mm_s2, planner.max_feedrate_mm_s, planner.jerk_mm_s
+    return MarlinLimits(
+        accel_x_mm_s2=accel.x,
+        accel_y_mm_s2=accel.y,
+        accel_z_mm_s2=accel.z,
+        accel_e_mm_s2=accel.e,
+        feedrate_x_mm_s=feedrate.x,
+        feedrate_y_mm_s=feedrate.y,
+        feedrate_z_mm_s=feedrate.z,
+        feedrate_e_mm_s=feedrate.e,
+        print_accel_mm_s2=planner.accel_mm_s2,
+        retract_accel_mm_s2=planner.retract_accel_mm_s2,
+        travel_accel_mm_s2=planner.travel_accel_mm_s2,
+        jerk_x_mm_s=jerk.x,
+        jerk_y_mm_s=jerk.y,
+        jerk_z_mm_s=jerk.z,
+        jerk_e_mm_s=jerk.e,
+        junction_deviation_mm=planner.junction_deviation_mm,
+        min_segment_time_us=planner.min_segment_time_us,
+        min_feedrate_mm_s=planner.min_feedrate_mm_s,
+        min_travel_feedrate_mm_s=planner.min_travel_feedrate_mm_s,
+        linear_advance_k_s=firmware.linear_advance_k_s,
+    )

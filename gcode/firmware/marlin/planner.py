@@ -1,0 +1,145 @@
+"""Marlin's planner: from moves to blocks of whole steps and their trapezoids.
+
+`Planner` gives the same for any cutting of the stream. It takes the file to be read faster than
+it is executed, so the firmware's queue is full but for the first blocks after a stop. Rules and
+sources: docs/marlin.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.errors import GcodeError
+from gcode.firmware.marlin import _block_kernels as blocks
+from gcode.firmware.marlin import _planner_kernels as kernels
+from gcode.firmware.planning import empty_phases
+from gcode.firmware.queueing import QueuePlanner
+from gcode.types import Moves, Phases
+from models.firmware import Marlin
+
+__all__ = ["Planner", "planner_facts"]
+
+_FAMILY = {
+    "2.0": blocks.RELEASE,
+    "2.1": blocks.RELEASE,
+    "bugfix": blocks.BUGFIX,
+    "prusa": blocks.PRUSA,
+    "bambu": blocks.PRUSA,
+}
+_RELEASE_MIN_RATE_HZ = 120.0
+"""MINIMAL_STEP_RATE of 2.0 and 2.1; bugfix has what the timer can hold."""
+
+
+class Planner(QueuePlanner):
+    """Plan a stream of moves.
+
+    Parameters
+    ----------
+    firmware : Marlin
+        Limits that G-code can change come with the moves.
+    corexy : bool
+        Steps and caps are those of the motors A = X + Y and B = X - Y.
+
+    Notes
+    -----
+    There is one row for every move. A move of fewer steps than `min_steps_per_segment` has no
+    duration, and the next row starts where the machine stands.
+    """
+
+    def __init__(self, firmware: Marlin, *, corexy: bool = False) -> None:
+        super().__init__(blocks.Q_SIZE)
+        self._facts = planner_facts(firmware, corexy=corexy)
+        self._s_curve = firmware.s_curve
+        self._state = np.zeros(blocks.S_SIZE)
+        self._state[blocks.S_ENTRY2] = -1.0
+
+    def stop(self, dwell_s: float = 0.0) -> Phases:
+        """Come to rest after the last move and stand for `dwell_s`."""
+        phases = super().stop(dwell_s)
+        self._state[blocks.S_BLOCKS] = 0.0
+        self._state[blocks.S_ENTRY2] = -1.0
+        return phases
+
+    def _append(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+    ) -> tuple[int, int]:
+        self._count, problem, bad = blocks.append(
+            start_mm,
+            end_mm,
+            speed_mm_s,
+            limits_id,
+            self._limits,
+            self._facts,
+            self._moves,
+            self._state,
+            self._queue,
+            self._count,
+        )
+        return problem, bad
+
+    def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:  # noqa: ARG002
+        line = int(moves.line[row])
+        return GcodeError("the speed of a move must be above 0; give it an F", line=line)
+
+    def _take(self, *, final: bool) -> Phases:
+        settled = kernels.settle(self._queue, self._count, self._facts, final)
+        phases = empty_phases(settled)
+        times, speeds = np.empty((4, settled)), np.empty((4, settled))
+        self._time_s = kernels.emit(
+            self._queue,
+            settled,
+            self._count,
+            self._facts,
+            self._state,
+            self._time_s,
+            times,
+            phases.start_mm,
+            phases.direction,
+            speeds,
+            phases.move_index,
+        )
+        kernels.drop(self._queue, settled, self._count)
+        self._count -= settled
+        return Phases(
+            times[0],
+            times[1],
+            times[2],
+            times[3],
+            phases.start_mm,
+            phases.direction,
+            speeds[0],
+            speeds[1],
+            speeds[2],
+            speeds[3],
+            phases.move_index,
+            np.full(settled, self._s_curve),
+        )
+
+
+def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:
+    """Return the machine's facts as the kernels take them (``C_`` entries)."""
+    facts = np.zeros(blocks.C_SIZE)
+    scale = firmware.steps_per_mm
+    facts[blocks.C_STEPS_PER_MM : blocks.C_STEPS_PER_MM + 4] = scale.x, scale.y, scale.z, scale.e
+    family = _FAMILY[firmware.variant]
+    facts[blocks.C_FAMILY] = family
+    facts[blocks.C_CORE] = corexy
+    facts[blocks.C_CLASSIC_JERK] = firmware.junction == "classic_jerk"
+    facts[blocks.C_SMALL_SEGMENTS] = firmware.small_segment_junctions
+    facts[blocks.C_MIN_STEPS] = firmware.min_steps_per_segment
+    facts[blocks.C_QUEUE] = firmware.block_buffer_size
+    facts[blocks.C_SLOWDOWN] = firmware.slowdown
+    facts[blocks.C_MIN_SPEED] = firmware.minimum_planner_speed_mm_s
+    facts[blocks.C_ADVANCE] = bool(firmware.linear_advance)
+    facts[blocks.C_TIMER_HZ] = firmware.step_timer_hz
+    facts[blocks.C_SMOOTHING_HZ] = firmware.step_smoothing_hz
+    facts[blocks.C_MIN_RATE] = _RELEASE_MIN_RATE_HZ
+    if family == blocks.BUGFIX:
+        facts[blocks.C_MIN_RATE] = 31.0 if firmware.board == "avr" else 1.0
+    facts[blocks.C_S_CURVE] = firmware.s_curve
+    return facts

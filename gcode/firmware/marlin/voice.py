@@ -1,0 +1,82 @@
+"""Marlin's words around a stream."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from gcode.firmware.marlin.limits import MarlinLimits
+from gcode.types import Limits
+from models.firmware import Marlin
+
+__all__ = ["MarlinVoice"]
+
+
+class MarlinVoice:
+    """Lines that Marlin understands; see `gcode.firmware.base.Voice`.
+
+    Sources: Marlin/src/gcode/config/M200-M205.cpp, gcode/feature/input_shaping/M593.cpp,
+    gcode/geometry/G92.cpp and parser.cpp, release 2.1.2 (2023-01).
+    """
+
+    notes = (
+        "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",
+        "are raised and every move is timed: leave the speed at 100 %. To stop in there,",
+        "stop at once (M112) or let the print end: a pause would park at raised limits.",
+    )
+    stand_still = b"M400 ; stand still\n"
+    positioning_sets_extruder = True
+    coarse_extruder = True
+    one_command = True
+
+    def __init__(self, firmware: Marlin) -> None:
+        self._shaper = firmware.shaper
+        self._has_shaper = firmware.variant != "2.0"
+        if firmware.shaper is not None:
+            self._has_shaper = firmware.shaper.freq_x_hz + firmware.shaper.freq_y_hz > 0.0
+        self._classic_jerk = firmware.junction == "classic_jerk"
+
+    @property
+    def shaper_off(self) -> bytes:
+        """Line that sets both axes to 0 Hz; a build without a shaper passes it over."""
+        return b"M593 F0\n" if self._has_shaper else b""
+
+    @property
+    def shaper_on(self) -> bytes | None:
+        """Lines that set the shaper that the machine states; None: it does not say."""
+        s = self._shaper
+        if not self._has_shaper:
+            return b""
+        if s is None:
+            return None
+        return (
+            f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\nM593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
+        ).encode()
+
+    def limits(self, limits: Limits) -> bytes:
+        """Return the lines that set the planner's limits."""
+        own = cast(MarlinLimits, limits)
+        if self._classic_jerk:
+            corner = (
+                f"X{own.jerk_x_mm_s:.8g} Y{own.jerk_y_mm_s:.8g} "
+                f"Z{own.jerk_z_mm_s:.8g} E{own.jerk_e_mm_s:.8g}"
+            )
+        else:
+            corner = f"J{own.junction_deviation_mm:.8g}"
+        return (
+            f"M201 X{own.accel_x_mm_s2:.8g} Y{own.accel_y_mm_s2:.8g} "
+            f"Z{own.accel_z_mm_s2:.8g} E{own.accel_e_mm_s2:.8g}\n"
+            f"M203 X{own.feedrate_x_mm_s:.8g} Y{own.feedrate_y_mm_s:.8g} "
+            f"Z{own.feedrate_z_mm_s:.8g} E{own.feedrate_e_mm_s:.8g}\n"
+            f"M204 P{own.print_accel_mm_s2:.8g} R{own.retract_accel_mm_s2:.8g} "
+            f"T{own.travel_accel_mm_s2:.8g}\n"
+            f"M205 B{own.min_segment_time_us:.8g} S{own.min_feedrate_mm_s:.8g} "
+            f"T{own.min_travel_feedrate_mm_s:.8g} {corner}\n"
+        ).encode()
+
+    def acceleration(self, accel_mm_s2: float) -> bytes:
+        """Return the line that sets the acceleration of moves with and without filament."""
+        return f"M204 P{accel_mm_s2:g} T{accel_mm_s2:g}\n".encode()
+
+    def in_stream(self, limits: Limits) -> Limits:
+        """Return the limits as they are: Marlin has no macros that could read a mark."""
+        return limits

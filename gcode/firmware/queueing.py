@@ -1,0 +1,131 @@
+"""What the planners of all firmwares share: moves wait in a queue until they are settled."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.errors import GcodeError
+from gcode.firmware.planning import between_stops, empty_phases, join_phases
+from gcode.types import Limits, Moves, Phases, ProgramBlock
+
+__all__ = ["QueuePlanner"]
+
+_ROWS = 1024
+
+
+class QueuePlanner(ABC):
+    """Base of the planners; see `gcode.firmware.base.Planner`.
+
+    Parameters
+    ----------
+    columns : int
+        Numbers that the firmware's kernels keep of each waiting move.
+    """
+
+    def __init__(self, columns: int) -> None:
+        self._queue = np.empty((_ROWS, columns))
+        self._count = 0
+        """Rows of the queue in use."""
+        self._moves = 0
+        """Index of the next move in the whole file."""
+        self._begun = False
+        self._time_s = 0.0
+        self._limits = np.empty((0, 0))
+
+    @property
+    def time_s(self) -> float:
+        """When the last planned move or dwell ends."""
+        return self._time_s
+
+    def push(self, block: ProgramBlock) -> Phases:
+        """Plan the moves of a block, with the stops that its events bring.
+
+        Raises
+        ------
+        GcodeError
+            For a move that the firmware refuses.
+        """
+        self._moves = block.first_move
+        parts = []
+        for begun, end, dwell_s in between_stops(block):
+            parts.append(self._plan(block.moves, begun, end, block.limits))
+            if dwell_s is not None:
+                parts.append(self.stop(dwell_s))
+        return join_phases(parts)
+
+    def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
+        """Plan moves that follow the last ones without a stop; return what is settled by now.
+
+        Parameters
+        ----------
+        limits : sequence of Limits
+            The table of `Moves.limits_id`; it may only grow.
+        """
+        return self._plan(moves, 0, len(moves), limits)
+
+    def queue_moves(self, moves: Moves, limits: Sequence[Limits]) -> None:
+        """Take moves like `push_moves`, to be planned all at once by `flush`."""
+        self._enter(moves, 0, len(moves), limits)
+
+    def stop(self, dwell_s: float = 0.0) -> Phases:
+        """Come to rest after the last move and stand for `dwell_s`."""
+        phases = self._take(final=True)
+        if self._begun:
+            self._time_s += dwell_s
+        return phases
+
+    def flush(self) -> Phases:
+        """Come to rest; return all that is left."""
+        return self.stop()
+
+    def _plan(self, moves: Moves, begun: int, end: int, limits: Sequence[Limits]) -> Phases:
+        self._enter(moves, begun, end, limits)
+        return self._take(final=False) if end > begun and self._due() else empty_phases()
+
+    def _enter(self, moves: Moves, begun: int, end: int, limits: Sequence[Limits]) -> None:
+        n = end - begun
+        if n == 0:
+            return
+        if len(limits) != len(self._limits):
+            self._limits = np.array([limit.as_row() for limit in limits])
+        if self._count + n > len(self._queue):
+            larger = np.empty((2 * (self._count + n), self._queue.shape[1]))
+            larger[: self._count] = self._queue[: self._count]
+            self._queue = larger
+        rows = slice(begun, end)
+        problem, bad = self._append(
+            moves.start_mm[rows],
+            moves.end_mm[rows],
+            moves.speed_mm_s[rows],
+            moves.limits_id[rows],
+        )
+        if problem >= 0:
+            raise self._error(problem, moves, begun + bad)
+        self._moves += n
+        self._begun = self._begun or self._count > 0
+
+    def _due(self) -> bool:
+        """Whether it is worth while to look for settled moves."""
+        return True
+
+    @abstractmethod
+    def _append(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+    ) -> tuple[int, int]:
+        """Enter moves behind the rows in use; return a problem (or -1) and the move's row."""
+
+    @abstractmethod
+    def _take(self, *, final: bool) -> Phases:
+        """Remove what is settled from the queue; with `final` everything."""
+
+    @abstractmethod
+    def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
+        """Say what is wrong with a move."""

@@ -1,0 +1,1 @@
+"""RepRapFirmware 3 (Duet)."""

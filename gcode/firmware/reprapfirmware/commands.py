@@ -1,0 +1,264 @@
+"""RepRapFirmware's commands that Python carries out.
+
+Sources: RepRapFirmware src/GCodes/GCodes.cpp, GCodes2.cpp, GCodes3.cpp and
+src/Movement/Move2.cpp, 3.5 and 3.6.0-beta.2 (2024-11).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gcode import _slots as at
+from gcode._motion_kernels import set_feed
+from gcode.commands import retract
+from gcode.lexer import Command
+from gcode.state import MachineState, Saved
+from gcode.types import EventKind
+from gcode.workspaces import set_workspace
+
+__all__ = [
+    "acceleration",
+    "accelerations",
+    "define_tool",
+    "extrude_factor",
+    "heat_and_wait",
+    "jerk",
+    "machine_mode",
+    "pop_state",
+    "pressure_advance",
+    "push_state",
+    "retract_or_offsets",
+    "retract_settings",
+    "select_plane",
+    "special_move",
+    "speeds",
+]
+
+_MODES = (at.I_ABS_XYZ, at.I_ABS_E)
+_MOST_PUSHED = 10
+
+
+def accelerations(state: MachineState, command: Command) -> int:
+    """M201, in mm/s2."""
+    given = state.numbers(command, "XYZE")
+    return state.set_limits(
+        command, {f"accel_{k.lower()}_mm_s2": v for k, v in given.items() if v > 0.0}
+    )
+
+
+def speeds(state: MachineState, command: Command) -> int:
+    """M203, in mm/min, with S1 in mm/s; I is the slowest that a move may be."""
+    given = state.numbers(command, "XYZEIS")
+    unit = 1.0 if given.pop("S", 0.0) == 1.0 else 1.0 / 60.0
+    values = {f"speed_{k.lower()}_mm_s": v * unit for k, v in given.items() if k != "I" and v > 0.0}
+    if given.get("I", 0.0) > 0.0:
+        values["min_speed_mm_s"] = given["I"] * unit
+    return state.set_limits(command, values)
+
+
+def acceleration(state: MachineState, command: Command) -> int:
+    """M204: P of printing moves, T of others, S of both."""
+    given = state.numbers(command, "SPT")
+    values = {}
+    for letter, names in (
+        ("S", ("print_accel_mm_s2", "travel_accel_mm_s2")),
+        ("P", ("print_accel_mm_s2",)),
+        ("T", ("travel_accel_mm_s2",)),
+    ):
+        if given.get(letter, 0.0) > 0.0:
+            values.update(dict.fromkeys(names, given[letter]))
+    return state.set_limits(command, values)
+
+
+def jerk(state: MachineState, command: Command) -> int:
+    """M566 sets jerk and its ceiling in mm/min, M205 the jerk below the ceiling in mm/s."""
+    given = state.numbers(command, "XYZEP")
+    values = {}
+    for letter, value in given.items():
+        if letter == "P":
+            if command.name == "M566":
+                values["jerk_policy"] = float(int(value))
+            continue
+        axis = letter.lower()
+        if command.name == "M566":
+            speed = max(value / 60.0, 0.1)
+            values[f"jerk_{axis}_mm_s"] = values[f"max_jerk_{axis}_mm_s"] = speed
+        else:
+            ceiling = state.limit(f"max_jerk_{axis}_mm_s")
+            values[f"jerk_{axis}_mm_s"] = min(max(value, 0.1), ceiling)
+    # What M205 does depends on the ceiling, so it is not remembered.
+    return state.set_limits(command, values, remember=command.name == "M566")
+
+
+def pressure_advance(state: MachineState, command: Command) -> int:
+    """M572: S in seconds, D which extruders.
+
+    It waits for standstill, and a stream has it off like the shaper.
+    """
+    given = state.numbers(command, "S")
+    if given.get("S", -1.0) < 0.0:
+        return state.event(EventKind.HARMLESS)
+    drives = command.words.get("D")
+    if drives is not None and str(state.i[at.I_TOOL]) not in drives.strip("{}").split(":"):
+        return state.event(EventKind.SHAPER)
+    values = {"pressure_advance_s": given["S"]}
+    return state.set_limits(command, values, remember=False, kind=EventKind.SHAPER)
+
+
+def extrude_factor(state: MachineState, command: Command) -> int:
+    """M221: S in per cent, of the extruder D or of the tool in use."""
+    given = state.numbers(command, "SD")
+    if "S" not in given or given.get("D", float(state.i[at.I_TOOL])) != float(state.i[at.I_TOOL]):
+        return state.event(EventKind.HARMLESS)
+    if not at.MIN_VALUE <= given["S"] <= at.MAX_VALUE:
+        raise state.problem(
+            f"the value {given['S']:g} is out of range; it must be above 0", command
+        )
+    f = state.f
+    state.settle()
+    factor = given["S"] / 100.0
+    e_value = (f[at.F_LAST + 3] - f[at.F_BASE + 3]) / f[at.F_EXTRUDE_FACTOR]
+    f[at.F_BASE + 3] = f[at.F_LAST + 3] - e_value * factor
+    f[at.F_EXTRUDE_FACTOR] = factor
+    state.note_modal()
+    return state.event(EventKind.MODE)
+
+
+def retract_or_offsets(state: MachineState, command: Command) -> int:
+    """G10: alone a retraction; with words the offsets and temperatures of a tool or workspace."""
+    words = command.words
+    if "L" in words and state.numbers(command, "L").get("L") != 1.0:
+        return _workspace(state, command)
+    if any(axis in words for axis in "XYZUVWABCD"):
+        state.warn("G10 changes a tool's offsets; the position is not known until homing")
+        state.forget(origin=True)
+        return state.event(EventKind.UNKNOWN)
+    if any(letter in words for letter in "LPRS"):
+        return state.event(EventKind.HARMLESS)
+    return retract(state, command)
+
+
+def _workspace(state: MachineState, command: Command) -> int:
+    """G10 L2 (origin in machine coordinates) and L20 (the tool is at these coordinates)."""
+    given = state.numbers(command, "LPXYZ")
+    kind = int(given.get("L", 0.0))
+    number = int(given.get("P", state.workspace + 1.0)) - 1
+    if kind not in (2, 20) or not 0 <= number <= 8:
+        raise state.problem("G10 L must be 1, 2 or 20, and P from 1 to 9", command)
+    f = state.f
+    place = {}
+    for k, axis in enumerate("XYZ"):
+        if axis in given:
+            value = given[axis] * float(f[at.F_UNIT_MM])
+            place[k] = value if kind == 2 else float(f[at.F_LAST + k]) - value
+            if kind == 20 and not state.i[at.I_KNOWN] >> k & 1:
+                state.i[at.I_ORIGIN_KNOWN] &= ~(1 << k)
+    set_workspace(state, number, place)
+    return state.event(EventKind.MODE)
+
+
+def retract_settings(state: MachineState, command: Command) -> int:
+    """M207: S length, R extra on return, F and T feedrates of both ways, Z hop."""
+    if state.retraction is None:
+        return state.event(state.dialect.otherwise(command.name))
+    given = state.numbers(command, "SRFTZP")
+    if given.get("P", float(state.i[at.I_TOOL])) != float(state.i[at.I_TOOL]):
+        return state.event(EventKind.HARMLESS)
+    changes = {}
+    if "S" in given:
+        changes["length_mm"] = max(given["S"], 0.0)
+    if "R" in given:
+        changes["extra_mm"] = max(given["R"], -state.retraction.length_mm)
+    if "F" in given:
+        # One speed for both unless T follows; 60 mm/min is the least.
+        changes["speed_mm_s"] = changes["return_speed_mm_s"] = max(given["F"], 60.0) / 60.0
+    if "T" in given:
+        changes["return_speed_mm_s"] = max(given["T"], 60.0) / 60.0
+    if "Z" in given:
+        changes["hop_mm"] = max(given["Z"], 0.0)
+    state.change_retraction(**changes)
+    return state.event(EventKind.MODE)
+
+
+def special_move(state: MachineState, command: Command) -> int:
+    """G0 and G1 with H (endstops, single motors) or R (from a saved place)."""
+    if state.numbers(command, "H").get("H", 0.0) != 0.0:
+        state.forget()
+        return state.event(EventKind.UNKNOWN)
+    if "R" not in command.words:
+        return -1
+    given = state.numbers(command, "RXYZF")
+    saved = state.saved.get(f"G60 {int(given['R'])}")
+    if saved is None or "E" in command.words:
+        # Where the printer paused or changed tools last.
+        state.forget()
+        return state.event(EventKind.UNKNOWN)
+    f = state.f
+    for k, axis in enumerate("XYZ"):
+        if axis in given:
+            f[at.F_LAST + k] = saved.f[at.F_LAST + k] + given[axis] * f[at.F_UNIT_MM]
+    if "F" in given:
+        status = set_feed(f, state.i, given["F"])
+        if status != at.OK:
+            return int(status)
+    return state.moved(state.travel())
+
+
+def select_plane(state: MachineState, command: Command) -> int:
+    """G17, G18 and G19 wait for standstill."""
+    state.settle()
+    state.i[at.I_PLANE] = int(command.name[1:]) - 17
+    return state.event(EventKind.STOP)
+
+
+def heat_and_wait(state: MachineState, _command: Command) -> int:
+    """M109 fetches a tool where none is in use."""
+    return state.event(EventKind.STOP if state.tool_known else EventKind.UNKNOWN)
+
+
+def define_tool(state: MachineState, _command: Command) -> int:
+    """M563 may take away the tool that is in use."""
+    state.tool_known = False
+    return state.event(EventKind.UNKNOWN)
+
+
+def machine_mode(state: MachineState, command: Command) -> int:
+    """M451 printer, M452 laser, M453 CNC: the latter two leave out the G of repeated moves."""
+    state.dialect = replace(
+        state.dialect,
+        modal_words=command.name != "M451",
+        paren_comments=command.name == "M453",
+    )
+    state.dialect.set_rules(state.i)
+    return state.event(EventKind.STOP)
+
+
+def push_state(state: MachineState, command: Command) -> int:
+    """M120."""
+    depth = int(state.factors.get("pushed", 0.0))
+    if depth >= _MOST_PUSHED:
+        raise state.problem("M120 without M121; the firmware's stack overflows", command)
+    state.saved[f"M120 {depth}"] = Saved(state.f.copy(), state.i.copy())
+    state.factors["pushed"] = depth + 1.0
+    return state.event(EventKind.HARMLESS)
+
+
+def pop_state(state: MachineState, _command: Command) -> int:
+    """M121: the modes, the units and F of the matching M120."""
+    depth = int(state.factors.get("pushed", 0.0)) - 1
+    if depth < 0:
+        state.warn("M121 without M120 is passed over")
+        return state.event(EventKind.HARMLESS)
+    saved = state.saved[f"M120 {depth}"]
+    state.factors["pushed"] = float(depth)
+    state.settle()
+    for slot in _MODES:
+        state.i[slot] = saved.i[slot]
+    f = state.f
+    scale = f[at.F_SPEED_FACTOR] / saved.f[at.F_SPEED_FACTOR]
+    f[at.F_SPEED] = saved.f[at.F_SPEED] * scale
+    f[[at.F_UNIT_MM, at.F_UNIT_E_MM]] = saved.f[np.array([at.F_UNIT_MM, at.F_UNIT_E_MM])]
+    state.note_modal()
+    return state.event(EventKind.MODE)

@@ -1,0 +1,290 @@
+"""From a compensated command to the G1 lines that make RepRapFirmware execute it.
+
+The speed along the path is continuous in this firmware: a step of it costs time, a step of
+direction costs none within the jerk limits. Under limits far above the motion's own the losses are
+small, and foreseen to the clock. Places are whole motor steps, reached when the command is nearest
+to them. Pressure advance is written into the filament (docs/reprapfirmware.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.errors import GcodeError
+from gcode.firmware.encoding import (
+    UNITS_PER_MM,
+    Encoded,
+    as_moves,
+    encoded_piece,
+    group_durations,
+    interleave,
+    limits_in_force,
+)
+from gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
+from gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
+from gcode.firmware.reprapfirmware.limits import RepRapLimits
+from gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from gcode.pieces import Piece
+from gcode.segments import Segments
+from gcode.timeline import Group, Timeline
+from gcode.types import Limits, Phases
+from models.firmware import RepRapFirmware
+from models.machine import CommandLimits
+
+__all__ = ["RepRapEncoder", "stream_limits"]
+
+STREAM_ACCEL_MM_S2 = 60_000.0
+"""Several times what a command asks for. A peak of speed that this reaches in less than ten clocks
+is cut off (0.8 mm/s), and the cut costs the more time the higher the acceleration is."""
+LEAST_SPEED_MM_S = 0.01
+"""The least that the firmware can be set to; slower moves are hurried."""
+_JERK_SHARE = 2.0
+"""Of `command.speed_step_mm_s`, and of the extruder's own jerk: between acceleration and
+deceleration the firmware's own pressure advance steps by twice the jerk."""
+_DIAGONAL = 1.5
+"""A CoreXY motor may run so much faster than the path, and Z's direction change so much more."""
+_PASSES = 2
+_POLL_S = 2e-3
+"""The firmware looks every 2 ms whether moves are to be frozen."""
+_SHIFT = 0.3
+"""The end of a segment is moved in time by at most so much of its neighbours."""
+_SPARSE = 1.3
+"""Half a ring is made to last so much longer than it must."""
+
+
+def stream_limits(
+    firmware: RepRapFirmware, command: CommandLimits, mesh_slope: float = 0.0
+) -> RepRapLimits:
+    """Return what the stream runs under.
+
+    X, Y and the filament of printing moves are free; what Z and the extruder may do by themselves
+    stays, because a rest's own move runs on into the stream. Z follows a bed mesh, though, and its
+    speed steps by the slope times what X and Y do.
+    """
+    own = RepRapLimits.of(firmware, 0.0)
+    jerk = _JERK_SHARE * command.speed_step_mm_s
+    extruder = _JERK_SHARE * own.jerk_e_mm_s
+    climb = max(own.jerk_z_mm_s, _DIAGONAL * mesh_slope * jerk)
+    return replace(
+        own,
+        accel_x_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_y_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_z_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_e_mm_s2=STREAM_ACCEL_MM_S2,
+        speed_x_mm_s=_DIAGONAL * command.velocity_mm_s,
+        speed_y_mm_s=_DIAGONAL * command.velocity_mm_s,
+        min_speed_mm_s=LEAST_SPEED_MM_S,
+        print_accel_mm_s2=STREAM_ACCEL_MM_S2,
+        travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
+        jerk_x_mm_s=jerk,
+        jerk_y_mm_s=jerk,
+        jerk_z_mm_s=climb,
+        jerk_e_mm_s=extruder,
+        max_jerk_x_mm_s=jerk,
+        max_jerk_y_mm_s=jerk,
+        max_jerk_z_mm_s=climb,
+        max_jerk_e_mm_s=extruder,
+        jerk_policy=1.0,
+    )
+
+
+class RepRapEncoder:
+    """Encode pieces for one machine.
+
+    Parameters
+    ----------
+    firmware : RepRapFirmware
+    kinematics : {"cartesian", "corexy"}
+    limits : RepRapLimits
+        What the stream runs under.
+    """
+
+    grid_mm = 1e-3
+
+    def __init__(self, firmware: RepRapFirmware, kinematics: str, limits: RepRapLimits) -> None:
+        self._firmware = firmware
+        self._kinematics = kinematics
+        self._half_ring = firmware.ring_length // 2 - 1
+        self._half_ring_s = firmware.prepare_least_s + _POLL_S
+        """What so many moves must last, or the firmware freezes the next one too late."""
+        self._limits = limits
+
+    def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
+        """First guess of the rests' durations: those of the original plan."""
+        return group_durations(piece.phases, groups)
+
+    def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
+        """Choose places, filament and feedrates for the segments of a piece.
+
+        Raises
+        ------
+        GcodeError
+            When the segments come faster than the firmware's queue can take them.
+        """
+        segments = self._advanced(piece, timeline, self._sparse(timeline, segments))
+        segments = self._on_steps(timeline, segments)
+        moves = interleave(piece, timeline, segments, 1)
+        rows, position = moves.row, moves.position
+        start = np.concatenate([moves.begin[None], position[:-1]])
+        start_mm, end_mm = start / UNITS_PER_MM, position / UNITS_PER_MM
+        ours = rows < 0
+        limits_id, limits = limits_in_force(piece, rows, self._limits)
+        length, accel, limit, junction = self._motion(start_mm, end_mm, limits_id, limits)
+        speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
+
+        foreseen = (length, moves.end_s, moves.planned_s, speed, accel, junction)
+        begin_s, short_s = float(timeline.start_s[0]), SHORT_CLOCKS / self._firmware.step_clock_hz
+        feedrate, predicted, missed = (np.zeros(len(rows)) for _ in range(3))
+        for _ in range(_PASSES):
+            assign_speeds(ours, *foreseen, missed, begin_s, short_s, feedrate, predicted)
+            chosen = np.where(ours, feedrate / 60.0, speed)
+            phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
+            # Only rests, whose moves brake for what comes later, are foreseen a little wrong.
+            missed += phases.accel_s + phases.cruise_s + phases.decel_s - predicted
+        self._check_rate(phases, piece)
+        return encoded_piece(timeline, moves, self._limits, feedrate, phases)
+
+    def _sparse(self, timeline: Timeline, segments: Segments) -> Segments:
+        """Leave out ends where segments come faster than the firmware's queue can take them."""
+        half = self._half_ring
+        if len(segments) < half:
+            return segments
+        begin_s = timeline.start_s[segments.group]
+        final = _final(segments)
+        before_s = np.append(0.0, segments.end_s[:-1])
+        fresh = np.append(True, final[:-1])
+        lasts = segments.end_s - np.where(fresh, begin_s, before_s)
+        total = np.cumsum(np.append(0.0, lasts))
+        wanted_s = _SPARSE * self._half_ring_s
+        late = np.append(total[half:] - total[:-half] < wanted_s, np.zeros(half - 1, bool))
+        crowded = np.convolve(late[: len(segments)], np.ones(half))[: len(segments)] > 0.0
+        if not np.any(crowded):
+            return segments
+        keep = np.ones(len(segments), np.bool_)
+        keep_apart(segments.end_s, crowded, final, begin_s, wanted_s / half, keep)
+        return Segments(segments.end_s[keep], segments.end_mm[:, keep], segments.group[keep])
+
+    def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
+        """Segments with pressure advance in their filament."""
+        final = _final(segments)
+        end_mm = segments.end_mm.copy()
+        rows = np.searchsorted(timeline.row_start_s, segments.end_s, "right") - 1
+        rows = np.maximum(rows, 0)
+        advance_s = np.array([x.pressure_advance_s for x in cast(list[RepRapLimits], piece.limits)])
+        phases = piece.phases
+        speed = _speed_at(phases, rows, segments.end_s - timeline.row_start_s[rows])
+        direction = phases.direction[rows]
+        prints = (direction[:, 3] > 0.0) & np.any(direction[:, :2] != 0.0, axis=1)
+        fed = np.where(prints & ~final, direction[:, 3] * speed, 0.0)
+        end_mm[3] += advance_s[piece.moves.limits_id[rows]] * fed
+        return replace(segments, end_mm=end_mm)
+
+    def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
+        """Segments that end on steps, each when the command is nearest to there."""
+        end_mm, end_s = segments.end_mm.copy(), segments.end_s.copy()
+        if len(end_s) == 0:
+            return segments
+        final = _final(segments)
+        end_mm[:3] = on_steps(end_mm[:3].T, self._firmware, self._kinematics).T
+        end_mm[:, final] = segments.end_mm[:, final]
+        fresh = np.append(True, final[:-1])
+        start_mm = np.roll(segments.end_mm[:2], 1, axis=1)
+        start_mm[:, fresh] = timeline.group_start_mm[segments.group[fresh], :2].T
+        start_s = np.where(fresh, timeline.start_s[segments.group], np.roll(end_s, 1))
+        # The command's velocity where two segments meet.
+        way = np.roll(segments.end_mm[:2], -1, axis=1) - start_mm
+        lasts = np.roll(end_s, -1) - start_s
+        velocity = way[:, ~final] / lasts[~final]
+        off = (end_mm - segments.end_mm)[:2, ~final]
+        speed2 = np.sum(velocity**2, axis=0)
+        later = np.sum(off * velocity, axis=0) / np.maximum(speed2, 1e-9)
+        room = _SHIFT * np.minimum(end_s - start_s, np.roll(end_s, -1) - end_s)[~final]
+        end_s[~final] += np.clip(later, -room, room)
+        return Segments(end_s, end_mm, segments.group)
+
+    def _motion(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Length, acceleration, speed and junction limit of every move.
+
+        Rules: those of the planner.
+        """
+        own = np.array([x.as_row() for x in limits])[limits_id]
+        travel = end_mm - start_mm
+        length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
+        length = np.where(length > 0.0, length, np.abs(travel[:, 3]))
+        direction = travel / np.where(length > 0.0, length, 1.0)[:, None]
+        share = np.abs(direction)
+        if self._kinematics == "corexy":
+            # The motors' speeds are limited as well as those of the axes.
+            motors = np.abs(share[:, :1] + share[:, 1:2] * np.array([1.0, -1.0]))
+            share[:, :2] = np.maximum(share[:, :2], motors)
+        xy = np.any(travel[:, :2] != 0.0, axis=1)
+        prints = xy & (travel[:, 3] > 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            accel = np.min(np.where(share > 0.0, own[:, 0:4] / share, np.inf), axis=1)
+            limit = np.min(np.where(share > 0.0, own[:, 4:8] / share, np.inf), axis=1)
+            step = np.abs(np.diff(direction, axis=0))
+            allowed = np.where(step > 0.0, own[1:, 11:15] / step, np.inf)
+        accel = np.where(xy, np.minimum(accel, np.where(prints, own[:, 9], own[:, 10])), accel)
+        junction = np.append(0.0, np.min(allowed, axis=1))
+        # Under policy 0 nothing runs on between moves of different kind.
+        kind = xy + 2 * prints + 4 * ((travel[:, 3] != 0.0) & ~prints)
+        meets = np.append(False, kind[1:] != kind[:-1])
+        junction[meets & (own[:, 19] == 0.0)] = 0.0
+        return length, accel, limit, junction
+
+    def _check_rate(self, phases: Phases, piece: Piece) -> None:
+        """Refuse what the firmware's queue could not keep up with."""
+        half, least = self._half_ring, self._half_ring_s
+        lasts = phases.accel_s + phases.cruise_s + phases.decel_s
+        if len(lasts) <= half:
+            return
+        total = np.cumsum(np.append(0.0, lasts))
+        spans = total[half:] - total[:-half]
+        if spans.min() < least:
+            raise GcodeError(
+                f"{half} segments would last {1e3 * spans.min():.0f} ms, less than the "
+                f"{1e3 * least:.0f} ms that the queue of {self._firmware.ring_length} moves needs; "
+                "a longer queue (M595 P, firmware.ring_length) or a larger tolerance would do",
+                line=int(piece.moves.line[0]),
+            )
+
+    def _plan(
+        self,
+        start_mm: NDArray[np.float64],
+        end_mm: NDArray[np.float64],
+        speed_mm_s: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
+    ) -> Phases:
+        planner = RepRapPlanner(self._firmware, self._kinematics)
+        planner.queue_moves(as_moves(start_mm, end_mm, speed_mm_s, limits_id), limits)
+        return planner.flush()
+
+
+def _final(segments: Segments) -> NDArray[np.bool_]:
+    """Which segments end their stretch."""
+    return np.append(segments.group[1:] != segments.group[:-1], True)
+
+
+def _speed_at(
+    phases: Phases, rows: NDArray[np.int64], after_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Speed along the path of each row, so long after its start."""
+    up = np.minimum(after_s, phases.accel_s[rows])
+    down = np.clip(
+        after_s - phases.accel_s[rows] - phases.cruise_s[rows], 0.0, phases.decel_s[rows]
+    )
+    ends = after_s > phases.accel_s[rows] + phases.cruise_s[rows] + phases.decel_s[rows] + 1e-9
+    speed = phases.start_mm_s[rows] + phases.accel_mm_s2[rows] * (up - down)
+    return np.where(ends, 0.0, np.maximum(speed, 0.0))

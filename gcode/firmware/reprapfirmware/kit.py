@@ -1,0 +1,72 @@
+"""What RepRapFirmware offers to the road."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.reprapfirmware.encoder import RepRapEncoder, stream_limits
+from gcode.firmware.reprapfirmware.limits import RepRapLimits
+from gcode.firmware.reprapfirmware.planner import RepRapPlanner
+from gcode.firmware.reprapfirmware.voice import RepRapVoice
+from gcode.types import Limits
+from models.firmware import RepRapFirmware
+from models.machine import Machine
+
+__all__ = ["RepRapKit"]
+
+STEEPEST = 0.1
+"""Z is driven with the stream's acceleration times the slope; steeper moves stay as they are."""
+
+
+class RepRapKit:
+    """Kit of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareKit`."""
+
+    extruder_alone_stops = False
+
+    def __init__(self, machine: Machine, firmware: RepRapFirmware) -> None:
+        self._machine = machine
+        self._firmware = firmware
+        self._stream = stream_limits(firmware, machine.command, machine.mesh_slope)
+        x, y, z, _ = (1.0 / drive.steps_per_mm for drive in firmware.drives)
+        if machine.kinematics == "corexy":
+            x = y = 0.5 * (x + y)
+        self.step_mm = (x, y, z, 0.0)
+
+    @property
+    def refusal(self) -> str | None:
+        """Why no stream can be made."""
+        slope = self._machine.mesh_slope
+        if slope <= STEEPEST:
+            return None
+        return (
+            f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z can follow a "
+            f"stream up to {STEEPEST:g}: tram the bed"
+        )
+
+    def initial_limits(self) -> RepRapLimits:
+        """Limits of config.g."""
+        return RepRapLimits.of(self._firmware, self._machine.pressure_advance_s)
+
+    def stream_limits(self, own: Limits) -> RepRapLimits:  # noqa: ARG002
+        """Return the raised limits; nothing of the file's is kept."""
+        return self._stream
+
+    def planner(self) -> RepRapPlanner:
+        """Return a planner at rest."""
+        return RepRapPlanner(self._firmware, self._machine.kinematics)
+
+    def encoder(self) -> RepRapEncoder:
+        """Return an encoder of the stream."""
+        machine = self._machine
+        return RepRapEncoder(self._firmware, machine.kinematics, self._stream)
+
+    def voice(self) -> RepRapVoice:
+        """Return RepRapFirmware's words."""
+        return RepRapVoice(self._firmware, self._machine.pressure_advance_s)
+
+    def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Tell which moves climb more than Z can follow a stream, the bed mesh included."""
+        way = np.sqrt(np.sum(travel_mm[:, :2] ** 2, axis=1))
+        climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * way
+        return np.asarray(climb > STEEPEST * way)

@@ -1,0 +1,92 @@
+"""RepRapFirmware's words around a stream."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from gcode.firmware.reprapfirmware.limits import RepRapLimits
+from gcode.types import Limits
+from models.firmware import RepRapFirmware
+
+__all__ = ["RepRapVoice"]
+
+_AXES = ("x", "y", "z", "e")
+_FENCE = "G1"
+"""Limits hold as soon as they are read, also for the move before them while it waits for room in
+the ring and is not planned yet. A G1 without words waits until that is planned, and is no move
+itself (RepRapFirmware src/GCodes/GCodes2.cpp, cases 1, 201, 203, 204 and 566; GCodes.cpp,
+DoStraightMove; 3.5)."""
+
+
+class RepRapVoice:
+    """Lines that RepRapFirmware understands; see `gcode.firmware.base.Voice`.
+
+    Parameters
+    ----------
+    firmware : RepRapFirmware
+    pressure_advance_s : float
+        The machine's M572 S: the stream's filament holds it already, so the firmware's is off
+        together with the shaper.
+    """
+
+    notes = (
+        "between 'stream on' and 'stream off' M201, M203, M204 and M566 are raised, M593 and",
+        "M572 are off, and every move is timed: leave the speed slider at 100 %. pause.g and",
+        "cancel.g must put your own values back first: see Stillpath's docs/safety.md.",
+    )
+    stand_still = b"M400\n"
+    positioning_sets_extruder = False
+    coarse_extruder = False
+    one_command = False
+
+    def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:
+        shaper = firmware.shaper
+        self.shaper_off = b'M593 P"none"\n' + _advance(0.0)
+        restored = 'M593 P"none"\n'
+        if shaper.type != "none":
+            restored = f'M593 P"{shaper.type}" F{shaper.freq_hz:g} S{shaper.damping:g}\n'
+        self.shaper_on: bytes | None = restored.encode() + _advance(pressure_advance_s)
+
+    def limits(self, limits: Limits) -> bytes:
+        """Lines that set the planner's limits for the moves behind them, M572 left out."""
+        own = cast(RepRapLimits, limits)
+        lines = [
+            _FENCE,
+            "M201" + _words(own, "accel_{}_mm_s2", 1.0),
+            "M203" + _words(own, "speed_{}_mm_s", 60.0) + f" I{_number(60.0 * own.min_speed_mm_s)}",
+            f"M204 P{_number(own.print_accel_mm_s2)} T{_number(own.travel_accel_mm_s2)}",
+            "M566" + _words(own, "max_jerk_{}_mm_s", 60.0) + f" P{own.jerk_policy:.0f}",
+        ]
+        jerks = [
+            axis
+            for axis in _AXES
+            if getattr(own, f"jerk_{axis}_mm_s") != getattr(own, f"max_jerk_{axis}_mm_s")
+        ]
+        if jerks:
+            lines.append("M205" + _words(own, "jerk_{}_mm_s", 1.0, jerks))
+        return "".join(f"{line}\n" for line in lines).encode()
+
+    def acceleration(self, accel_mm_s2: float) -> bytes:
+        """Return the line that limits the acceleration of X and Y."""
+        accel = _number(accel_mm_s2)
+        return f"{_FENCE}\nM201 X{accel} Y{accel}\nM204 P{accel} T{accel}\n".encode()
+
+    def in_stream(self, limits: Limits) -> Limits:
+        """Return the file's own limits."""
+        return limits
+
+
+def _advance(seconds: float) -> bytes:
+    return f"M572 S{_number(seconds)}\n".encode()
+
+
+def _words(
+    limits: RepRapLimits, field: str, scale: float, axes: tuple[str, ...] | list[str] = _AXES
+) -> str:
+    values = [(axis.upper(), scale * getattr(limits, field.format(axis))) for axis in axes]
+    return "".join(f" {letter}{_number(value)}" for letter, value in values)
+
+
+def _number(value: float) -> str:
+    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    return text or "0"

@@ -1,0 +1,66 @@
+"""RepRapFirmware's meta commands: nobody knows before the print what they decide.
+
+Lines of a block behind ``if`` or ``while`` may be carried out once, often or never. Those that do
+not touch the motion are read as ever; any other stays a barrier behind which the place is unknown.
+Source: RepRapFirmware src/GCodes/GCodeBuffer/StringParser.cpp, 3.5.
+"""
+
+from __future__ import annotations
+
+from gcode import _slots as at
+from gcode.dialect import Action
+from gcode.lexer import Command
+from gcode.state import MachineState
+from gcode.types import EventKind
+
+__all__ = ["META_WORDS", "held_back", "meta_command"]
+
+_OPENING = ("if", "elif", "else", "while")
+_HARMLESS = ("var", "global", "set", "echo", "skip")
+META_WORDS = frozenset({*_OPENING, *_HARMLESS, "break", "continue", "abort"})
+
+
+def meta_command(state: MachineState, command: Command) -> int:
+    """Carry out ``if``, ``while``, ``var``, ``echo`` and the like as far as a reader can."""
+    if command.name in _HARMLESS:
+        return state.event(EventKind.HARMLESS)
+    state.warn(
+        "the file has conditional G-code; what it moves is not known before the print, and stays "
+        "as it is"
+    )
+    if command.name in _OPENING:
+        state.conditional_indent = _indent(command.text)
+        state.i[at.I_HOLD] = 1
+    return state.event(EventKind.UNKNOWN)
+
+
+def held_back(state: MachineState, command: Command) -> int | None:
+    """Pass by a line of a conditional block; None: the block has ended or there is none."""
+    if state.conditional_indent < 0:
+        return None
+    if _indent(command.text) <= state.conditional_indent:
+        state.conditional_indent = -1
+        state.i[at.I_HOLD] = 0
+        return None
+    if command.name in META_WORDS:
+        harmless = command.name in _HARMLESS
+        return state.event(EventKind.HARMLESS if harmless else EventKind.UNKNOWN)
+    word = state.dialect.word(command.name)
+    if word == EventKind.HARMLESS:
+        return state.event(EventKind.HARMLESS)
+    moves = isinstance(word, Action) and word <= Action.DWELL
+    state.forget(origin=not moves)
+    return state.event(EventKind.UNKNOWN)
+
+
+def _indent(text: str) -> int:
+    """Measure the indentation: a tab goes on to the next multiple of 4."""
+    width = 0
+    for c in text:
+        if c == " ":
+            width += 1
+        elif c == "\t":
+            width = (width + 4) & ~3
+        else:
+            break
+    return width

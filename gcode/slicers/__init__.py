@@ -1,0 +1,1 @@
+"""What slicers write beside the commands: marks, their own estimates, settings."""

@@ -1,0 +1,254 @@
+"""Tell the times of the new motion in the lines where the slicer told its own.
+
+The slicer counts what we do not plan (heating, homing, changes of filament), and its planner is its
+own. So its times stay, and only what the motion of the written file takes longer is added: at every
+place the delay that has come up so far. A shift of the last second changes no line.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gcode.pieces import Passage
+from gcode.slicers.marks import MarkKind, read_mark
+from gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
+
+__all__ = ["Retiming", "retimed"]
+
+_COPIED_BYTES = 1 << 20
+_COMMENTS = re.compile(rb"(?:\xef\xbb\xbf)?(?:[ \t\r]*(?:;[^\n]*)?\n)*")
+_COMMAND = re.compile(rb"^[ \t\r\f\v]*(?:[^\s;]|; stillpath)[^\n]*\n?", re.MULTILINE)
+_LOOKED_THROUGH_BYTES = 1 << 16
+_STOPS = (MarkKind.COLOR_CHANGE, MarkKind.PAUSE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A line of the written text that tells times."""
+
+    offset: int
+    line: bytes
+    delay_s: float
+
+
+class Retiming:
+    """Take note of a text while it is written, then copy it with new times.
+
+    Parameters
+    ----------
+    head, tail : bytes
+        Lines of ours to stand before the first command and behind the last one. The comments
+        around stay at the very ends of the file: slicers and hosts know it by them.
+    keep_times : bool
+        Change no time.
+    """
+
+    def __init__(self, head: bytes = b"", tail: bytes = b"", *, keep_times: bool = False) -> None:
+        self._head, self._tail = head, tail
+        self._keeps = keep_times
+        self._places: list[_Place] = []
+        self._stops: list[tuple[int, float]] = []
+        self._size = 0
+        self._head_end: int | None = None
+        self._tail_start = 0
+        self._tail_lead = b""
+        self._layer_delay_s: float | None = None
+        """Delay where the second layer begins."""
+
+    def push(self, text: bytes, item: Passage | None = None, delay_s: ArrayLike = 0.0) -> None:
+        """Take the next part of the written text.
+
+        Parameters
+        ----------
+        text : bytes
+        item : Passage, optional
+            The lines that came, whose times are looked for in the text.
+        delay_s : float or array_like, shape (n + 1,)
+            How much later than in the original each move of the item begins, and the item ends.
+        """
+        if self._head_end is None:
+            leading = _COMMENTS.match(text)
+            end = leading.end() if leading is not None else 0
+            if end < len(text):
+                self._head_end = self._size + end
+        if end := _behind_last_command(text):
+            self._tail_start = self._size + end
+            self._tail_lead = b"" if text[end - 1 : end] == b"\n" else b"\n"
+        if item is not None and not self._keeps:
+            self._note(text, item, np.broadcast_to(delay_s, (len(item.moves) + 1,)))
+        self._size += len(text)
+
+    def copy(self, source: BinaryIO, target: BinaryIO, delay_s: float) -> int:
+        """Copy the text, with the new times in it.
+
+        Parameters
+        ----------
+        source : BinaryIO
+            What was pushed, at its beginning.
+        target : BinaryIO
+        delay_s : float
+            How much later the print ends.
+
+        Returns
+        -------
+        int
+            Bytes written.
+        """
+        layer_delay_s = delay_s if self._layer_delay_s is None else self._layer_delay_s
+        times = _Times(self._places, self._stops, layer_delay_s, delay_s)
+        edits = [(place.offset, len(place.line), times.line(place)) for place in self._places]
+        edits.append((self._size if self._head_end is None else self._head_end, 0, self._head))
+        edits.append((self._tail_start, 0, self._tail_lead + self._tail if self._tail else b""))
+        done = written = 0
+        for offset, length, line in sorted(edits, key=lambda edit: edit[:2]):
+            written += _copy(source, target, offset - done) + target.write(line)
+            source.seek(offset + length)
+            done = offset + length
+        return written + _copy(source, target, self._size - done)
+
+    def _note(self, text: bytes, item: Passage, delay_s: NDArray[np.float64]) -> None:
+        if self._layer_delay_s is None:
+            second = np.flatnonzero(item.moves.layer >= 1)
+            if len(second):
+                self._layer_delay_s = float(delay_s[second[0]])
+        at = 0
+        for row in _candidates(item):
+            line = item.line_text(int(item.events.byte_start[row]), int(item.events.byte_end[row]))
+            fields = read_times(line) if may_tell_time(line) else []
+            mark = None if fields or line[:1] != b";" else read_mark(line.decode("latin-1"))
+            if not fields and (mark is None or mark.kind not in _STOPS):
+                continue
+            found = _find_line(text, line, at)
+            if found < 0:
+                continue
+            at = found + len(line)
+            place = _Place(
+                self._size + found, line, float(delay_s[int(item.events.move_index[row])])
+            )
+            if fields:
+                self._places.append(place)
+            else:
+                self._stops.append((place.offset, place.delay_s))
+
+
+class _Times:
+    """New times for the lines of one file."""
+
+    def __init__(
+        self,
+        places: list[_Place],
+        stops: list[tuple[int, float]],
+        second_layer_delay_s: float | None,
+        delay_s: float,
+    ) -> None:
+        self._stop_offsets = [offset for offset, _ in stops]
+        self._stop_delays = [delay for _, delay in stops]
+        self._delay_s = delay_s
+        self._first_layer_delay_s = (
+            delay_s if second_layer_delay_s is None else second_layer_delay_s
+        )
+        fields = [field for place in places for field in read_times(place.line)]
+        self._total_s = {silent: _total(fields, silent=silent) for silent in (False, True)}
+
+    def line(self, place: _Place) -> bytes:
+        line, done = b"", 0
+        for field in read_times(place.line):
+            line += place.line[done : field.start] + field.written(self._time(field, place))
+            done = field.end
+        return line + place.line[done:]
+
+    def _time(self, field: TimeField, place: _Place) -> float:
+        match field.kind:
+            case TimeKind.TOTAL:
+                return field.seconds + self._delay_s
+            case TimeKind.FIRST_LAYER:
+                return field.seconds + self._first_layer_delay_s
+            case TimeKind.ELAPSED:
+                return field.seconds + place.delay_s
+            case TimeKind.REMAINING:
+                return field.seconds + self._delay_s - place.delay_s
+            case TimeKind.UNTIL_STOP:
+                stop = int(np.searchsorted(self._stop_offsets, place.offset))
+                if stop == len(self._stop_delays):
+                    return field.seconds
+                return field.seconds + self._stop_delays[stop] - place.delay_s
+        total_s = self._total_s[field.silent] or self._total_s[not field.silent]
+        if not total_s or total_s + self._delay_s <= 0.0:
+            return field.seconds
+        elapsed_s = 0.01 * field.seconds * total_s + place.delay_s
+        return min(100.0 * elapsed_s / (total_s + self._delay_s), 100.0)
+
+
+def retimed(text: bytes, delay_s: float) -> bytes:
+    """Return metadata, lines that tell times of the whole print, for one that takes longer."""
+    lines = []
+    for line in text.splitlines(keepends=True):
+        told = [field for field in read_times(line) if field.kind is TimeKind.TOTAL]
+        done = 0
+        for field in told:
+            lines += [line[done : field.start], field.written(field.seconds + delay_s)]
+            done = field.end
+        lines.append(line[done:])
+    return b"".join(lines)
+
+
+def _total(fields: list[TimeField], *, silent: bool) -> float:
+    """Return how long the slicer thinks the print takes; 0 where it says nothing."""
+    for wanted in (TimeKind.TOTAL, TimeKind.ELAPSED, TimeKind.REMAINING):
+        found = [f.seconds for f in fields if f.kind is wanted and f.silent == silent]
+        if found:
+            return max(found)
+    return 0.0
+
+
+def _candidates(item: Passage) -> NDArray[np.int64]:
+    """Rows of the events whose lines may be worth reading."""
+    events = item.events
+    if len(events) == 0 or not item.text:
+        return np.zeros(0, np.int64)
+    text = np.frombuffer(item.text, np.uint8)
+    start = events.byte_start - item.text_offset
+    last = len(text) - 1
+    first, second, third = (text[np.minimum(start + k, last)] for k in range(3))
+    letter = np.where(second == ord(" "), third, second)
+    comment = (first == ord(";")) & np.isin(letter, list(b"TPRemCE-"))
+    progress = (first == ord("M")) & (second == ord("7")) & (third == ord("3"))
+    return np.flatnonzero(comment | progress | (first == ord(" ")) | (first == ord("\t")))
+
+
+def _behind_last_command(text: bytes) -> int:
+    """Return where the last line ends that is no comment of others; 0 if there is none."""
+    end, width = len(text), 128
+    while end > 0:
+        # Most often it is one of the last lines; thumbnails and settings have thousands.
+        start = text.rfind(b"\n", 0, max(end - width, 0)) + 1
+        ends = [line.end() for line in _COMMAND.finditer(text, start, end)]
+        if ends:
+            return ends[-1]
+        end, width = start, min(2 * width, _LOOKED_THROUGH_BYTES)
+    return 0
+
+
+def _find_line(text: bytes, line: bytes, at: int) -> int:
+    """Return where a whole line stands in a text from `at` on, or -1."""
+    while True:
+        found = text.find(line, at)
+        if found <= 0 or text[found - 1 : found] == b"\n":
+            return found
+        at = found + 1
+
+
+def _copy(source: BinaryIO, target: BinaryIO, count: int) -> int:
+    left = count
+    while left > 0:
+        data = source.read(min(left, _COPIED_BYTES))
+        if not data:
+            break
+        target.write(data)
+        left -= len(data)
+    return count - left

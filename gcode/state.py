@@ -1,0 +1,374 @@
+"""What the firmware knows while it reads: the state that commands change.
+
+Kernels and Python share it; the numbers are in two arrays (see `gcode._slots`). Commands that the
+kernel does not know are functions of this state, one module of them per firmware.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode import _slots as at
+from gcode._motion_kernels import travel
+from gcode._table_kernels import (
+    Rows,
+    Tables,
+    intern_row,
+    line_hash,
+    memo_slot,
+    note_limits,
+    note_modal,
+    put_event,
+    settle,
+)
+from gcode.dialect import Dialect
+from gcode.errors import GcodeError
+from gcode.lexer import Command, extended_parameters
+from gcode.types import EventKind, Limits
+from models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
+from models.machine import Machine
+
+__all__ = ["MachineState", "Names", "Retraction", "Saved"]
+
+_MEMOS = 8192
+_LAYERS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Retraction:
+    """What G10 and G11 do at the moment."""
+
+    length_mm: float
+    speed_mm_s: float
+    extra_mm: float
+    return_speed_mm_s: float
+    hop_mm: float = 0.0
+
+    @classmethod
+    def of(cls, facts: FirmwareRetraction) -> Retraction:
+        """Return what the machine's document says."""
+        return cls(
+            facts.retract_length_mm,
+            facts.retract_speed_mm_s,
+            facts.unretract_extra_length_mm,
+            facts.unretract_speed_mm_s,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Saved:
+    """A state or a place that the file has saved."""
+
+    f: NDArray[np.float64]
+    i: NDArray[np.int64]
+
+
+class MachineState:
+    """The firmware's state, and the rows that are being written.
+
+    Attributes
+    ----------
+    f, i : ndarray
+        Numbers; slots in `gcode._slots`.
+    buffer, span : ndarray, (int, int)
+        The text that is being read, and where the line in hand begins (behind blanks and its
+        number) and ends in it.
+    carry_out : function
+        Carries out another command of the same line (the interpreter's).
+    warnings : dict of str to int
+        What the firmware passes over or what cannot be known, and the line where it came first.
+    """
+
+    def __init__(self, machine: Machine, dialect: Dialect, limits: Limits, *, strict: bool) -> None:
+        self.machine = machine
+        self.firmware: FirmwareFacts = machine.firmware
+        self.dialect = dialect
+        self.limits_type = type(limits)
+        self.limits_names = tuple(limits.__dataclass_fields__)
+        self.features = Names()
+        self.objects = Names()
+        self.saved: dict[str, Saved] = {}
+        self.workspaces: dict[int, tuple[float, float, float]] = {}
+        self.workspace = 0 if dialect.expressions else -1
+        facts = self.firmware.retraction
+        self.retraction = None if facts is None else Retraction.of(facts)
+        self.retracted = False
+        self.hop_mm = 0.0
+        self.factors: dict[str, float] = {}
+        self.tool_known = dialect.tool_at_start
+        self.conditional_indent = -1
+        self.warnings: dict[str, int] = {}
+        self.carry_out: Callable[[Command], int] = _nobody
+        self.buffer = np.zeros(0, np.uint8)
+        self.span = (0, 0)
+        self.memos = 0
+        self.memo_limits = 0
+
+        self.f = f = np.zeros(at.F_SIZE)
+        self.i = i = np.zeros(at.I_SIZE, np.int64)
+        self.w = np.zeros(26)
+        self.initial_limits = row = limits.as_row()
+        if len(row) > at.MAX_LIMITS:
+            raise ValueError(f"{len(row)} limits, more than {at.MAX_LIMITS}")
+        self.rows = Rows.empty(0)
+        self.tables = Tables(
+            *_new_table(len(row), 256),
+            *_new_table(at.MODAL_SIZE, 256),
+            np.zeros(_MEMOS, np.int64),
+            np.zeros(_MEMOS, np.int64),
+            np.full((_MEMOS // 2, len(row)), np.nan),
+            dialect.table("G"),
+            dialect.table("M"),
+            np.full(_LAYERS, np.nan),
+        )
+        f[at.F_SPEED] = dialect.start_speed_mm_s
+        f[at.F_SPEED_FACTOR] = 1.0 / 60.0
+        f[at.F_EXTRUDE_FACTOR] = f[at.F_UNIT_MM] = f[at.F_UNIT_E_MM] = 1.0
+        f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
+        f[at.F_ARC_MM] = self.firmware.arc_resolution_mm
+        if isinstance(self.firmware, Marlin):
+            f[at.F_ARC_LEAST_MM] = self.firmware.min_arc_segment_mm
+            f[at.F_ARC_PER_CIRCLE] = self.firmware.min_circle_segments
+        elif isinstance(self.firmware, RepRapFirmware):
+            f[at.F_ARC_LEAST_MM] = self.firmware.arc_least_mm
+            f[at.F_ARC_PER_S] = self.firmware.arc_segments_per_s
+            f[at.F_ARC_DEVIATION_MM] = self.firmware.arc_deviation_mm
+        for k, axis in enumerate("xyz"):
+            f[at.F_LOW + k] = machine.travel[axis].min_mm  # type: ignore[index]
+            f[at.F_HIGH + k] = machine.travel[axis].max_mm  # type: ignore[index]
+        dialect.set_rules(i)
+        i[at.I_LINE] = 1
+        i[at.I_ABS_XYZ] = i[at.I_ABS_E] = i[at.I_PLAIN] = 1
+        i[at.I_STRICT] = int(strict)
+        i[at.I_ORIGIN_KNOWN] = 0b111
+        i[at.I_LAYER] = i[at.I_FEATURE] = i[at.I_OBJECT] = i[at.I_MOTION] = -1
+        if self.firmware.homed_at_start:
+            self.home(0b111, self.firmware.home_mm or (0.0, 0.0, 0.0))
+        self.note_modal()
+        self.note_limits()
+
+    def snapshot(self) -> MachineState:
+        """Return a state that goes on from here, whatever becomes of this one."""
+        other = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray | dict):
+                setattr(other, name, value.copy())
+            elif isinstance(value, Names):
+                setattr(other, name, copy.deepcopy(value))
+        other.rows = Rows.empty(0)
+        copies = {name: table.copy() for name, table in self.tables._asdict().items()}
+        other.tables = Tables(**copies)
+        return other
+
+    # What a line does
+
+    def event(self, kind: EventKind, dwell_s: float = 0.0) -> int:
+        """Write the line in hand as an event."""
+        if kind == EventKind.UNKNOWN:
+            self.forget()
+        put_event(self.i, self.rows, int(kind))
+        if dwell_s:
+            self.settle()
+            self.rows.dwell[int(self.i[at.I_EVENTS]) - 1] = dwell_s
+        return at.OK
+
+    def forget(self, axes: int = 0b111, *, origin: bool = False) -> None:
+        """Take the place of axes for unknown, and where their coordinates count from."""
+        self.settle()
+        self.i[at.I_KNOWN] &= ~axes
+        if origin:
+            self.i[at.I_ORIGIN_KNOWN] &= ~axes
+
+    def travel(self, *, named: int = 0, trusted: bool = False) -> int:
+        """Go to F_LAST. Without `trusted` the line is more than a plain move, and stays."""
+        return travel(self.f, self.i, named, trusted, self.rows)
+
+    def moved(self, status: int) -> int:
+        """Turn the status of `travel` into that of a line: without a move there is an event."""
+        return self.event(EventKind.MODE) if status == at.DONE else status
+
+    def home(self, axes: int, home_mm: tuple[float, float, float] | None) -> None:
+        """Give axes their G-code origin back and, if the machine says it, their place."""
+        f, i = self.f, self.i
+        self.settle()
+        f[at.F_LAST : at.F_LAST + 4] = f[at.F_TOOL : at.F_TOOL + 4]
+        for k in range(3):
+            if axes >> k & 1:
+                f[at.F_BASE + k] = f[at.F_HOMING + k]
+                if home_mm is not None:
+                    f[at.F_LAST + k] = f[at.F_TOOL + k] = home_mm[k]
+        i[at.I_ORIGIN_KNOWN] |= axes
+        # Homing an axis may move the others too (safe_z_home).
+        i[at.I_KNOWN] = 0 if home_mm is None else i[at.I_KNOWN] | axes
+        self.settle()
+        self.note_modal()
+
+    def settle(self) -> None:
+        """Fill the rows before something changes that many rows share."""
+        settle(self.f, self.i, self.rows)
+
+    def note_modal(self) -> None:
+        """Enter the modes that have changed."""
+        self.settle()
+        note_modal(self.f, self.i, self.tables)
+
+    def note_limits(self) -> None:
+        """Enter the limits that have changed."""
+        self.settle()
+        note_limits(self.f, self.i, self.tables)
+
+    def limit(self, name: str) -> float:
+        """Return a limit in force."""
+        return float(self.f[at.F_LIMITS + self.limits_names.index(name)])
+
+    def set_limits(
+        self,
+        command: Command,
+        values: Mapping[str, float],
+        *,
+        remember: bool = True,
+        kind: EventKind = EventKind.LIMITS,
+    ) -> int:
+        """Set limits by name, and remember that this line does."""
+        row = np.full(len(self.limits_names), np.nan)
+        for name, value in values.items():
+            row[self.limits_names.index(name)] = value
+        limits = self.f[at.F_LIMITS : at.F_LIMITS + len(row)]
+        if remember and self.memo_limits < len(self.tables.memo_limits):
+            self.tables.memo_limits[self.memo_limits] = row
+            if self.remember(command, at.MEMO_LIMITS, self.memo_limits):
+                self.memo_limits += 1
+        self.settle()
+        limits[:] = np.where(np.isnan(row), limits, row)
+        note_limits(self.f, self.i, self.tables)
+        return self.event(kind)
+
+    def remember(self, command: Command, what: int, value: int) -> bool:
+        """Have the kernel do the same whenever the line comes again."""
+        if self.memos >= _MEMOS // 2 or self.conditional_indent >= 0 or command.dropped:
+            return False
+        key = line_hash(self.buffer, *self.span)
+        slot = memo_slot(self.tables.memo_keys, key)
+        if self.tables.memo_keys[slot] != 0:
+            return False
+        self.tables.memo_keys[slot] = key
+        self.tables.memo_values[slot] = what * at.MEMO_STRIDE + value
+        self.memos += 1
+        return True
+
+    # Reading values
+
+    def extended(self, command: Command) -> Mapping[str, str]:
+        """Return the ``KEY=VALUE`` pairs of a line."""
+        return extended_parameters(command.text, command.name, line=int(self.i[at.I_LINE]))
+
+    def number(self, value: str, key: str, command: Command) -> float:
+        """Read a number.
+
+        Raises
+        ------
+        GcodeError
+            It is none, or beyond all reason.
+        """
+        try:
+            number = float(value)
+        except ValueError:
+            raise self.problem(f"{key}{value!r} is not a number; correct it", command) from None
+        if not abs(number) <= at.MAX_VALUE:
+            raise self.problem(f"{key} {value} is out of range; correct it", command)
+        return number
+
+    def numbers(self, command: Command, letters: str) -> dict[str, float]:
+        """Read the words of a classic command that are among `letters`.
+
+        A word without a number is left out or refused, as the dialect does.
+        """
+        found = {}
+        for letter in letters:
+            if letter not in command.words:
+                continue
+            value = command.words[letter]
+            if self.dialect.bad_words_pass and not value:
+                continue
+            # A list of numbers stands for several extruders; the first is the one in use.
+            found[letter] = self.number(value.split(":", 1)[0], letter, command)
+        return found
+
+    def at_least(self, value: str, key: str, low: float, command: Command) -> float:
+        """Read a number that must not be below `low`."""
+        number = self.number(value, key, command)
+        if number < low:
+            raise self.problem(f"{key}={value} must be at least {low:g}", command)
+        return number
+
+    def problem(self, message: str, command: Command) -> GcodeError:
+        """Return an error at the line in hand."""
+        return GcodeError(message, line=int(self.i[at.I_LINE]), text=command.text)
+
+    def warn(self, message: str) -> None:
+        """Note what a person should know; the first line of each message counts."""
+        if len(self.warnings) < 100:
+            self.warnings.setdefault(message, int(self.i[at.I_LINE]))
+
+    def change_retraction(self, **changes: float) -> None:
+        """Change what G10 and G11 do."""
+        assert self.retraction is not None
+        self.retraction = replace(self.retraction, **changes)
+
+    # Room
+
+    def allocate(self, count: int) -> None:
+        """Make room for the next rows; those before belong to somebody else."""
+        self.rows = Rows.empty(count)
+        i = self.i
+        i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0
+
+    def grow_tables(self) -> None:
+        """Make the tables larger that are full."""
+        i, tables = self.i, self.tables
+        if i[at.I_N_MODAL] + 2 > len(tables.modal):
+            rows, index = _grown(tables.modal, int(i[at.I_N_MODAL]))
+            tables = tables._replace(modal=rows, modal_index=index)
+        if i[at.I_N_LIMITS] + 2 > len(tables.limits):
+            rows, index = _grown(tables.limits, int(i[at.I_N_LIMITS]))
+            tables = tables._replace(limits=rows, limits_index=index)
+        if i[at.I_LAYER] + 2 > len(tables.layer_z):
+            more = np.full(len(tables.layer_z), np.nan)
+            tables = tables._replace(layer_z=np.concatenate([tables.layer_z, more]))
+        self.tables = tables
+
+
+class Names:
+    """Names numbered as they come."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self._numbers: dict[str, int] = {"": -1}
+
+    def number(self, name: str) -> int:
+        """Return the number of a name, entered if it is new; -1 for the empty name."""
+        number = self._numbers.setdefault(name, len(self.names))
+        if number == len(self.names):
+            self.names.append(name)
+        return number
+
+
+def _nobody(command: Command) -> int:
+    raise RuntimeError(f"nobody carries out {command.name}")
+
+
+def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    return np.zeros((rows, columns)), np.full(4 * rows, -1, np.int32)
+
+
+def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    larger, index = _new_table(rows.shape[1], 2 * len(rows))
+    for number in range(count):
+        larger[number] = rows[number]
+        intern_row(larger, index, number)
+    return larger, index

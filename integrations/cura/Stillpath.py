@@ -1,0 +1,613 @@
+"""Stillpath as a post-processing script of Cura.
+
+Copy this file into the folder ``scripts`` of Cura's configuration folder (*Help, Show
+configuration folder*) and start Cura anew; *Extensions, Post processing, Modify G-code* then offers
+it. Cura's own Python runs it, so it needs nothing but the standard library: the work is done by the
+program `stillpath-post`, or by a server. Set-up: docs/slicer-setup.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.error import HTTPError
+from urllib.parse import quote, urlencode, urlsplit
+from urllib.request import (
+    HTTPHandler,
+    HTTPRedirectHandler,
+    HTTPSHandler,
+    ProxyHandler,
+    Request,
+    build_opener,
+)
+
+from UM.Application import Application
+from UM.Logger import Logger
+from UM.Message import Message
+
+from ..Script import Script  # Cura's
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from typing import BinaryIO
+
+_PATIENCE_S = 30.0
+_MARK = ";STILLPATH_ITEM:"
+_MARK_LINE = re.compile(rf"^{_MARK}(\d+)\n", re.MULTILINE)
+
+_SETTINGS: dict[str, dict[str, Any]] = {
+    "where": {
+        "label": "Work",
+        "description": "Who does it: the program stillpath-post on this computer, or a server.",
+        "type": "enum",
+        "options": {"command": "on this computer", "server": "on a server"},
+        "default_value": "command",
+    },
+    "command": {
+        "label": "Program",
+        "description": "Path of stillpath-post; `stillpath-post --setup` shows it.",
+        "type": "str",
+        "default_value": "stillpath-post",
+        "enabled": "where == 'command'",
+    },
+    "server": {
+        "label": "Server",
+        "description": "Address of the server.",
+        "type": "str",
+        "default_value": "http://127.0.0.1:8000",
+        "enabled": "where == 'server'",
+    },
+    "key": {
+        "label": "Key",
+        "description": "Key of the server, if it wants one. Cura stores it readably.",
+        "type": "str",
+        "default_value": "",
+        "enabled": "where == 'server'",
+    },
+    "machine": {
+        "label": "Machine",
+        "description": "Machine of Stillpath. Empty, with the program: found by the printer's name "
+        "in Cura, as its settings say.",
+        "type": "str",
+        "default_value": "",
+    },
+    "method": {
+        "label": "Method",
+        "description": "fbf compensates; a shaper does in the file what firmware shapers do.",
+        "type": "enum",
+        "options": {
+            "fbf": "fbf",
+            "zpetc": "zpetc",
+            "zmetc": "zmetc",
+            "ebzpetc": "ebzpetc",
+            "npz-ignore": "npz-ignore",
+            "ts": "ts",
+            "shaper:zv": "shaper: zv",
+            "shaper:mzv": "shaper: mzv",
+            "shaper:ei": "shaper: ei",
+            "shaper:2hump_ei": "shaper: 2hump_ei",
+            "shaper:3hump_ei": "shaper: 3hump_ei",
+            "none": "none",
+        },
+        "default_value": "fbf",
+    },
+    "robust": {
+        "label": "Robust",
+        "description": "What fbf is designed for: the nominal plant, or the set of plants.",
+        "type": "enum",
+        "options": {"off": "nominal", "ensemble": "set", "minimax": "worst of the set"},
+        "default_value": "off",
+        "enabled": "method == 'fbf'",
+    },
+    "tolerance_um": {
+        "label": "Tolerance",
+        "description": "How far the written path may be from the computed one.",
+        "unit": "\u00b5m",
+        "type": "float",
+        "default_value": 2.0,
+        "minimum_value": "0.5",
+        "maximum_value": "50",
+    },
+    "reports": {
+        "label": "Folder of reports",
+        "description": "A page with figures for every print is written there. Empty: none.",
+        "type": "str",
+        "default_value": "",
+    },
+}
+
+
+class Stillpath(Script):
+    """Compensates the G-code when Cura saves or sends it."""
+
+    def getSettingDataString(self) -> str:
+        """Return the settings panel as Cura's JSON."""
+        panel = {
+            "name": "Stillpath",
+            "key": "Stillpath",
+            "metadata": {},
+            "version": 2,
+            "settings": _SETTINGS,
+        }
+        return json.dumps(panel)
+
+    def execute(self, data: list[str]) -> list[str]:
+        """Return the layers compensated; after a failure, which is shown, as they came.
+
+        Parameters
+        ----------
+        data : list of str
+            Header, start, one item per layer, end; each holds many lines.
+        """
+        try:
+            with tempfile.TemporaryDirectory(prefix="stillpath-") as folder:
+                made = self._compensated(data, Path(folder))
+        except Exception as error:  # Cura would only log it and print what was sliced
+            Logger.log("e", "Stillpath: %s", error)
+            _show(
+                f"The print is NOT compensated: {error}\n\nCura takes the G-code as processed: "
+                "slice anew to try again.",
+                "ERROR",
+            )
+            return data
+        return made
+
+    def _compensated(self, data: list[str], folder: Path) -> list[str]:
+        if not any(item.strip() for item in data):
+            raise Failure("there is no G-code")
+        began = time.monotonic()
+        source, target = folder / "print.gcode", folder / "print.stillpath.gcode"
+        text, marks = _joined(data)
+        source.write_bytes(text.encode("utf-8", "surrogateescape"))
+        name = _job_name()
+        try:
+            if self._value("where") == "server":
+                page = self._on_server(source, target, name)
+                report = self._write_report(page, name)
+            else:
+                report = self._by_program(source, name)
+                target = source
+        except Failure as failure:
+            raise Failure(_with_lines_of(str(failure), text)) from None
+        written = target.read_bytes().decode("utf-8", "surrogateescape")
+        made = _parted(written, marks, len(data))
+        seconds = (
+            f"Compensated in {time.monotonic() - began:.0f} s; the preview shows the original."
+        )
+        _show(seconds + (f"\n\nReport: {report}" if report else ""), "POSITIVE")
+        return made
+
+    def _on_server(self, source: Path, target: Path, name: str) -> bytes:
+        if not self._value("machine"):
+            raise Failure("no machine is chosen; the server needs its name")
+        try:
+            client = Service(self._value("server"), self._value("key"), timeout_s=_PATIENCE_S)
+            options = {"machine": self._value("machine"), **self._options()}
+            return client.compensate(source, target, name, options)
+        except ServiceError as error:
+            raise Failure(error) from None
+
+    def _write_report(self, page: bytes, name: str) -> str:
+        if not self._value("reports"):
+            return ""
+        folder = Path(self._value("reports")).expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+        target = folder / f"{Path(name).stem}.stillpath.html"
+        target.write_bytes(page)
+        return str(target)
+
+    def _by_program(self, source: Path, name: str) -> str:
+        """Run stillpath-post, which replaces the file, and return where it put the report."""
+        arguments = ["--on-error", "fail", "--printer", _printer_name()]
+        if self._value("machine"):
+            arguments += ["--machine", self._value("machine")]
+        for option, value in self._options().items():
+            arguments += [f"--{option.replace('_', '-')}", str(value)]
+        reports = self._value("reports")
+        arguments += ["--reports", reports] if reports else ["--no-report"]
+        try:
+            done = subprocess.run(
+                [*_command(self._value("command")), *arguments, str(source)],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                env=_environment(name),
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+                check=False,
+            )
+        except OSError as error:
+            raise Failure(f"{self._value('command')} cannot be run: {error}") from None
+        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        if done.returncode:
+            reason = said[-1] if said else "it does not say why"
+            raise Failure(f"{reason} (exit code {done.returncode})")
+        told = re.search(r"report: (.+)", done.stdout.decode("utf-8", "replace"))
+        return told[1].strip() if told else ""
+
+    def _options(self) -> dict[str, Any]:
+        options = {name: self._value(name) for name in ("method", "robust", "tolerance_um")}
+        return options if options["method"] == "fbf" else {**options, "robust": "off"}
+
+    def _value(self, key: str) -> Any:
+        """Return a setting; what Cura read back from its own files is text."""
+        value = self.getSettingValueByKey(key)
+        if value is None:
+            value = _SETTINGS[key]["default_value"]
+        if _SETTINGS[key]["type"] == "float":
+            return float(str(value).replace(",", "."))
+        return str(value).strip()
+
+
+class Failure(Exception):
+    """It was not done: the reason, for the user."""
+
+
+def _joined(data: list[str]) -> tuple[str, list[int]]:
+    """Return the text of all items, with a comment before each, and which items have one.
+
+    An item that does not begin on a new line goes on with the one before it.
+    """
+    parts, marks = [], []
+    fresh = True
+    for number, item in enumerate(data):
+        if _MARK in item:
+            raise Failure(f"the G-code holds {_MARK} already")
+        if number and fresh and item:
+            parts.append(f"{_MARK}{number}\n")
+            marks.append(number)
+        parts.append(item)
+        fresh = item.endswith("\n") if item else fresh
+    return "".join(parts), marks
+
+
+def _parted(text: str, marks: list[int], count: int) -> list[str]:
+    """Cut a text at its marks into as many items as there were."""
+    first, *rest = _MARK_LINE.split(text)
+    if [int(number) for number in rest[::2]] != marks:
+        raise Failure("the layers cannot be told apart in the compensated file")
+    items = [first, *[""] * (count - 1)]
+    for number, item in zip(marks, rest[1::2]):  # noqa: B905 - as long as each other
+        items[number] = item
+    return items
+
+
+def _with_lines_of(reason: str, text: str) -> str:
+    """Count the lines in a message without our marks, as they are in the file that Cura saves."""
+
+    def counted(found: re.Match[str]) -> str:
+        number = int(found[1])
+        before = text.split("\n", number)[:number]
+        return f"line {number - sum(line.startswith(_MARK) for line in before)}"
+
+    return re.sub(r"\bline (\d+)", counted, reason)
+
+
+def _command(text: str) -> list[str]:
+    """Return the words of a command; a path with spaces needs no quotes if nothing follows it."""
+    if Path(text).is_file() or shutil.which(text):
+        return [text]
+    return [word.strip("\"'") for word in shlex.split(text, posix=os.name == "posix")]
+
+
+def _environment(name: str) -> dict[str, str]:
+    """Return an environment for programs that are not Cura's: without its libraries and Python."""
+    environment = dict(os.environ)
+    if getattr(sys, "frozen", False):
+        for variable in ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH"):
+            environment.pop(variable, None)
+            before = environment.pop(f"{variable}_ORIG", None)  # where PyInstaller keeps it
+            if before:
+                environment[variable] = before
+    return {
+        **environment,
+        "PYTHONUTF8": "1",
+        "SLIC3R_PP_HOST": "Cura",
+        "SLIC3R_PP_OUTPUT_NAME": name,
+    }
+
+
+def _job_name() -> str:
+    with contextlib.suppress(Exception):  # a name is no reason to fail
+        name = Application.getInstance().getPrintInformation().jobName
+        if name:
+            return f"{name}.gcode"
+    return "cura.gcode"
+
+
+def _printer_name() -> str:
+    with contextlib.suppress(Exception):
+        return str(Application.getInstance().getGlobalContainerStack().getName())
+    return ""
+
+
+def _show(text: str, kind: str) -> None:
+    kinds = getattr(Message, "MessageType", None)  # Cura 4.11 and later
+    more = {} if kinds is None else {"message_type": getattr(kinds, kind)}
+    lifetime_s = 0 if kind == "ERROR" else 30
+    Message(text, title="Stillpath", lifetime=lifetime_s, **more).show()
+
+
+# Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
+
+
+class ServiceError(Exception):
+    """The service did not do it; `refused`: nor would it at another try."""
+
+    def __init__(self, message: str, refused: bool = False) -> None:
+        super().__init__(message)
+        self.refused = refused
+
+
+class Service:
+    """A Stillpath server.
+
+    Parameters
+    ----------
+    address : str
+        As in a browser: ``http://127.0.0.1:8000``.
+    key : str
+        Sent as a bearer token; empty for none.
+    timeout_s : float
+        How long the server may be silent, or away while a job is there, before it is given up.
+    tell : callable
+        Is told the stage, and the share that is done or None; may raise to stop the work.
+    """
+
+    _FIRST_PATIENCE_S = 3.0
+    _BUSY = (429, 502, 503, 504)
+    _LONGEST_PAUSE_S = 2.0
+
+    def __init__(
+        self,
+        address: str,
+        key: str = "",
+        timeout_s: float = 60.0,
+        tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
+    ) -> None:
+        parts = urlsplit(address)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ServiceError(
+                f"{address!r} is not the address of a server; one looks like http://127.0.0.1:8000",
+                refused=True,
+            )
+        self._address = address.rstrip("/")
+        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._timeout_s = timeout_s
+        self._tell = tell
+        # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
+        handlers: list[Any] = [_NoRedirection(), _Http(), _Https()]
+        if parts.hostname in ("localhost", "127.0.0.1", "::1"):
+            handlers.append(ProxyHandler({}))
+        self._opener = build_opener(*handlers)
+
+    def compensate(
+        self,
+        source: Path,
+        target: Path,
+        name: str,
+        options: Mapping[str, Any],
+        wait_s: float | None = None,
+    ) -> bytes:
+        """Send a file, wait, fetch the result and return the page of the report.
+
+        Parameters
+        ----------
+        source, target : Path
+            The target is written in place: guard it.
+        name : str
+            What the file is called in the report.
+        options : dict
+            `machine` and other parameters of a job.
+        wait_s : float, optional
+            Give up after this time.
+
+        Raises
+        ------
+        ServiceError
+        """
+        self._tell("asking the server", None)
+        machine = quote(options["machine"], safe="")
+        # Whether address, key and machine are right is known before a long upload.
+        self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
+        job = self._send(source, name, options)
+        path = f"/v1/jobs/{job}"
+        try:
+            self._wait(path, wait_s)
+            self._fetch(f"{path}/result", target)
+            return self._ask("GET", f"{path}/report", self._timeout_s)
+        finally:
+            self._forget(path)
+
+    def _send(self, source: Path, name: str, options: Mapping[str, Any]) -> str:
+        size = source.stat().st_size
+        sent = {key: value for key, value in options.items() if value is not None}
+        query = urlencode({**sent, "name": name[-255:]}, errors="replace")
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        with source.open("rb") as file:
+            body = _Told(file, size, lambda share: self._tell("sending", share))
+            answer = self._ask("POST", f"/v1/jobs?{query}", 0.0, body=body, headers=headers)
+        job = self._document(answer)
+        if job.get("source_bytes") != size:
+            self._forget(f"/v1/jobs/{job.get('id')}")
+            raise ServiceError(f"sent {size} bytes, but {job.get('source_bytes')} arrived")
+        return str(job["id"])
+
+    def _wait(self, path: str, wait_s: float | None) -> None:
+        began, pause_s = time.monotonic(), 0.1
+        while True:
+            job = self._document(self._ask("GET", path, self._timeout_s))
+            state = job.get("state")
+            if state == "done":
+                return
+            if state == "failed":
+                problem = job.get("error") or {}
+                reason = problem.get("detail", "the server does not say why")
+                raise ServiceError(reason, refused=problem.get("status", 500) < 500)
+            if wait_s is not None and time.monotonic() - began > wait_s:
+                raise ServiceError(f"not done within {wait_s:.0f} s; given up")
+            waiting = job.get("queue_position")
+            stage = f"waiting behind {waiting} jobs" if waiting else job.get("stage") or "waiting"
+            self._tell(stage, job.get("progress"))
+            time.sleep(pause_s)
+            pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _fetch(self, path: str, target: Path) -> None:
+        for attempts_left in (2, 1, 0):
+            try:
+                self._fetch_once(path, target)
+                return
+            except _Broken as error:
+                if not attempts_left:
+                    reason = f"the result cannot be fetched from {self._address}: {error}"
+                    raise ServiceError(reason) from None
+
+    def _fetch_once(self, path: str, target: Path) -> None:
+        with self._open("GET", path) as answer, target.open("wb") as file:
+            expected = int(answer.headers.get("Content-Length") or -1)
+            read = 0
+            while True:
+                try:
+                    chunk = answer.read(1 << 18)
+                except (OSError, http.client.HTTPException) as error:
+                    raise _Broken(str(error) or type(error).__name__) from None
+                if not chunk:
+                    break
+                file.write(chunk)
+                read += len(chunk)
+                self._tell("fetching", read / expected if expected > 0 else None)
+        if not read or read != expected >= 0:
+            raise _Broken(f"{read} of {expected} bytes came")
+
+    def _forget(self, path: str) -> None:
+        """Delete the job: what is not fetched by then is not wanted any more."""
+        # Gone, or the server is: either way there is nothing left to do.
+        with contextlib.suppress(ServiceError, _Broken):
+            self._open("DELETE", path, timeout_s=min(5.0, self._timeout_s)).close()
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        patience_s: float,
+        body: Any = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> bytes:
+        """Return the answer; what may pass by itself is tried again for some time."""
+        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        while True:
+            try:
+                with self._open(method, path, body, headers) as answer:
+                    return bytes(answer.read())
+            except (_Broken, OSError, http.client.HTTPException) as error:
+                if time.monotonic() + pause_s > deadline:
+                    raise ServiceError(f"no answer from {self._address}: {error}") from None
+            self._tell("the server does not answer; trying again", None)
+            time.sleep(pause_s)
+            pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _open(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        headers: Mapping[str, str] | None = None,
+        timeout_s: float | None = None,
+    ) -> Any:
+        """Return the open answer; raise `ServiceError` if it is no, `_Broken` if there is none."""
+        request = Request(
+            self._address + path,
+            data=body,
+            headers={**self._headers, **(headers or {})},
+            method=method,
+        )
+        try:
+            return self._opener.open(request, timeout=timeout_s or self._timeout_s)
+        except HTTPError as error:
+            with error:
+                if error.code in self._BUSY:
+                    raise _Broken(f"{error.code} {error.reason}") from None
+                raise self._refusal(error) from None
+        except (OSError, http.client.HTTPException) as error:
+            raise _Broken(str(getattr(error, "reason", "") or error)) from None
+
+    def _document(self, answer: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(answer)
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            raise ServiceError(f"{self._address} answers, but not as a Stillpath server")
+        return document
+
+    def _refusal(self, error: HTTPError) -> ServiceError:
+        """Return the error for an answer of status 300 or above."""
+        try:
+            document = json.loads(error.read(1 << 16))
+        except (ValueError, OSError, http.client.HTTPException):
+            document = None
+        reason = document.get("detail") if isinstance(document, dict) else None
+        reason = reason or f"{self._address} answers {error.code} {error.reason}"
+        if error.code == 401:
+            reason = f"the server does not accept the key (401): {reason}"
+        elif 300 <= error.code < 400:
+            reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
+        elif error.code == 404 and "/v1/jobs/" in error.url:
+            reason = f"the job was cancelled on the server: {reason}"
+        return ServiceError(reason, refused=error.code < 500)
+
+
+class _Broken(Exception):
+    """There is no answer, or not all of it: another try may bring it."""
+
+
+class _EarlyAnswer(http.client.HTTPConnection):
+    """Reads the answer even if the server does not take the whole request."""
+
+    def send(self, data: Any) -> None:
+        if self.sock is None:
+            self.connect()
+        with contextlib.suppress(ConnectionError):
+            super().send(data)
+
+
+class _EarlyAnswerTls(_EarlyAnswer, http.client.HTTPSConnection):
+    pass
+
+
+class _Http(HTTPHandler):
+    def http_open(self, request: Request) -> Any:
+        return self.do_open(_EarlyAnswer, request)
+
+
+class _Https(HTTPSHandler):
+    def https_open(self, request: Request) -> Any:
+        return self.do_open(_EarlyAnswerTls, request)
+
+
+class _NoRedirection(HTTPRedirectHandler):
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+class _Told:
+    """A file that tells which share of it has been read."""
+
+    def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
+        self._file, self._size, self._tell = file, max(size, 1), tell
+
+    def read(self, size: int = -1) -> bytes:
+        self._tell(min(self._file.tell() / self._size, 1.0))
+        return self._file.read(size)
+
+
+# End of the client.

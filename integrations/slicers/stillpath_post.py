@@ -1,0 +1,861 @@
+#!/usr/bin/env python3
+"""Stillpath as a post-processing script of PrusaSlicer, SuperSlicer, OrcaSlicer and BambuStudio.
+
+The slicer appends the path of the sliced file, and the file is changed in place::
+
+    stillpath-post [options] FILE                      on this computer (with the package stillpath)
+    python3 stillpath_post.py --server URL [options] FILE             on a server (this file alone)
+
+This file needs Python 3.8 or later and nothing else. A failure is one line on stderr and an exit
+code that is not 0, and the file is as it was. Set-up: docs/slicer-setup.md.
+
+Exit codes: 0 done, 1 the computer, the network or the server failed, 2 it cannot be done as it was
+put (bad file, machine, option or key), 128 + n ended by signal n.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import http.client
+import json
+import os
+import re
+import shlex
+import signal
+import stat
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.error import HTTPError
+from urllib.parse import quote, urlencode, urlsplit
+from urllib.request import (
+    HTTPHandler,
+    HTTPRedirectHandler,
+    HTTPSHandler,
+    ProxyHandler,
+    Request,
+    build_opener,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from types import FrameType
+    from typing import BinaryIO, NoReturn, TextIO
+
+PROGRAM = "stillpath-post"
+_JOB_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "plate")
+_SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
+# What slicers call a printer, the most particular name first.
+_PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
+_SUFFIXES = (".gcode.3mf", ".gcode", ".bgcode", ".gco", ".g")
+_SHOWN_EVERY_S = 0.1  # on a terminal
+_SAID_EVERY_S = 5.0  # elsewhere
+
+
+class Failure(Exception):
+    """It was not done: one line for the user, and the exit code."""
+
+    def __init__(self, message: object, code: int = 2) -> None:
+        super().__init__(" ".join(str(message).split()))
+        self.code = code
+
+
+class Stopped(BaseException):
+    """A signal asked for the end; no `Exception`, so that nobody handles it on the way out."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.code = 128 + number
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Process one file and return the exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a program without a console has no streams
+            stream.reconfigure(errors="backslashreplace")
+    parser = _parser()
+    given = parser.parse_args(arguments)
+    if given.file is None and not given.setup:
+        parser.error("no FILE is given; slicers append it")
+    voice = Voice(_path(given.log))
+    try:
+        with Signals() as signals:
+            settings = Settings(given)
+            voice.log = settings.log
+            if given.setup:
+                _set_up(settings, voice)
+            else:
+                _process(settings, voice, signals)
+        return 0
+    except Failure as failure:
+        reason, code = str(failure), failure.code
+    except OSError as error:
+        reason, code = _of_system(error), 1
+    except MemoryError:
+        reason, code = "out of memory", 1
+    except (Stopped, KeyboardInterrupt) as stop:
+        voice.fail("interrupted; the file is as it was")
+        return stop.code if isinstance(stop, Stopped) else 130
+    except Exception as error:
+        reason, code = f"a bug of Stillpath: {type(error).__name__}: {error}", 1
+        voice.trace(traceback.format_exc())
+    if given.on_error == "keep":
+        voice.fail(f"NOT compensated, the file stays as sliced: {reason}")
+        return 0
+    voice.fail(reason)
+    return code
+
+
+def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
+    """Compensate the file in place and put the report where it belongs."""
+    began = time.monotonic()
+    # A link is followed, so that what it points to is replaced and not the link.
+    path = settings.file.resolve()
+    if not path.is_file():
+        raise Failure(f"there is no file {path}")
+    if not path.stat().st_size:
+        raise Failure(f"{path} is empty")
+    job = PrintJob(settings.file, settings.printer)
+    machine = settings.machine_for(job.printers)
+    voice.note(
+        f"{job.name} for {machine} (printer {(job.printers or ['not named'])[0]}, "
+        f"flavour {job.flavour or 'not named'}, to {job.host})"
+    )
+    options = {**settings.job_options, "machine": machine}
+    if settings.server:
+        page = _on_server(path, job.name, options, settings, voice)
+    else:
+        page = _here(path, job.name, options, voice, signals)
+    voice.note(f"{job.name} compensated in {time.monotonic() - began:.1f} s")
+    if settings.report and page:
+        _write_report(page, job, settings, voice)
+
+
+def _here(path: Path, name: str, options: dict[str, Any], voice: Voice, signals: Signals) -> bytes:
+    """Compensate on this computer; heavy imports begin here."""
+    try:
+        import service.post
+    except ImportError:
+        raise Failure(
+            "the package stillpath is not installed for this Python; install it, or name a "
+            f"server: --server URL ({sys.executable})"
+        ) from None
+    signals.deferred = True  # what a handler raises inside a compiler or a C library gets lost
+
+    def tell(stage: str, share: float | None) -> None:
+        signals.check()
+        voice.progress(stage, share)
+
+    try:
+        page = service.post.compensate_in_place(path, options, name=name, tell=tell)
+    except service.post.Refused as error:
+        raise Failure(error) from None
+    finally:
+        signals.deferred = False
+    return page.encode()
+
+
+def _on_server(
+    path: Path, name: str, options: dict[str, Any], settings: Settings, voice: Voice
+) -> bytes:
+    """Let a server compensate, and replace the file."""
+    before = path.stat()
+    try:
+        client = Service(
+            settings.server, settings.key, timeout_s=settings.timeout, tell=voice.progress
+        )
+        with replacing(path) as temporary:
+            page = client.compensate(path, temporary, name, options, wait_s=settings.wait)
+            now = path.stat()
+            if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+                raise Failure(f"{path} was changed by somebody else while it was processed", 1)
+    except ServiceError as error:
+        raise Failure(error, 2 if error.refused else 1) from None
+    return page
+
+
+def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) -> None:
+    folder = job.folder or settings.reports
+    target = folder / f"{job.stem}.stillpath.html"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(target) as temporary:
+            temporary.write_bytes(page)
+        voice.note(f"report: {target}")
+    except OSError as error:  # the print is right all the same
+        voice.fail(f"warning: no report: {_of_system(error)}")
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """Yield a temporary file beside `target` that takes its place when the block ends well."""
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
+        with contextlib.suppress(OSError):  # file systems of memory cards know no modes
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o644)
+        temporary.replace(target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+class PrintJob:
+    """What the slicer says of this file, in the environment and by its path.
+
+    `SLIC3R_PP_OUTPUT_NAME` is the path of the finished file if `SLIC3R_PP_HOST` is ``File``, else
+    its name on that host. A script that ran before may have left another name in
+    ``FILE.output_name``; that file is read and left alone.
+    """
+
+    def __init__(
+        self, file: Path, printer: str | None = None, environment: Mapping[str, str] = os.environ
+    ) -> None:
+        said = (_unquoted(environment.get(f"SLIC3R_{name}", "")) for name in _PRINTER_NAMES)
+        self.printers = [printer] if printer else [name for name in said if name]
+        self.flavour = environment.get("SLIC3R_GCODE_FLAVOR", "")
+        self.host = environment.get("SLIC3R_PP_HOST", "File")
+        output = Path(environment.get("SLIC3R_PP_OUTPUT_NAME") or file)
+        renamed = _first_line(file.with_name(file.name + ".output_name"))
+        if renamed:
+            output = output.parent / renamed
+        # BambuStudio names its own temporary file as the output; such names begin with a dot.
+        output = Path(os.path.abspath(str(output)))  # noqa: PTH100 - resolve() follows links
+        local = self.host == "File" and not output.name.startswith(".") and output.parent.is_dir()
+        self.folder = output.parent if local else None
+        name = output.name[: -len(".pp")] if output.name.endswith(".pp") else output.name
+        self.name = name.lstrip(".") or "print.gcode"
+        ending = next((end for end in _SUFFIXES if self.name.lower().endswith(end)), "")
+        self.stem = self.name[: len(self.name) - len(ending)] or "print"
+
+
+class Settings:
+    """Options of the command line, then those of the settings file, then defaults."""
+
+    def __init__(self, given: argparse.Namespace) -> None:
+        self.path = Path(given.config) if given.config else default_settings_path()
+        if given.config and not self.path.is_file() and not given.setup:
+            raise Failure(f"there is no settings file {self.path}")
+        read = read_settings(self.path) if self.path.is_file() else {}
+        self.machines: dict[str, str] = read.pop("machines", {})
+        self._machine, self._fallback = given.machine, read.pop("machine", None)
+        self.file = Path(given.file or "")
+        self.printer = given.printer
+        self.server: str = "" if given.local else given.server or read.get("server", "")
+        self.key: str = given.key or os.environ.get("STILLPATH_KEY", "") or read.get("key", "")
+        self.timeout = _seconds("timeout", given.timeout, read.get("timeout")) or 60.0
+        self.wait = _seconds("wait", given.wait, read.get("wait"))
+        self.log = _path(given.log or read.get("log"))
+        self.reports = _path(given.reports or read.get("reports")) or _data_dir() / "reports"
+        self.report = not given.no_report
+        given.on_error = given.on_error or read.get("on_error", "fail")
+        if given.on_error not in ("fail", "keep"):
+            raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
+        chosen = {name: getattr(given, name) for name in _JOB_OPTIONS}
+        chosen["method"] = chosen["method"] or read.get("method")
+        self.job_options = {name: value for name, value in chosen.items() if value is not None}
+
+    def machine_for(self, printers: Sequence[str]) -> str:
+        """Return the machine for the slicer's names of the printer, the most particular first."""
+        if self._machine:
+            return str(self._machine)
+        for printer in printers:
+            if printer in self.machines:
+                return self.machines[printer]
+        for printer in printers:
+            for pattern, machine in self.machines.items():
+                words = (re.escape(part) for part in pattern.split("*"))
+                if re.fullmatch(".*".join(words), printer, re.IGNORECASE | re.DOTALL):
+                    return machine
+        if self._fallback:
+            return str(self._fallback)
+        name = json.dumps(printers[0] if printers else "name of the printer", ensure_ascii=False)
+        called = name if printers else "(the slicer does not name it)"
+        raise Failure(
+            f"no machine is set for the printer {called}: say --machine NAME, or write "
+            f'{name} = "NAME" under [machines] in {self.path}'
+        )
+
+
+TEMPLATE = """\
+# Settings of stillpath-post. What is said on the command line counts more.
+
+# server = "http://127.0.0.1:8000"   # work there instead of on this computer
+# key = "..."                        # its key; never in the slicer, which writes it into every file
+# machine = "ender3"                 # for printers that are not listed below
+# on_error = "keep"                  # print what was sliced if it fails ("fail": stop the export)
+# reports = "~/stillpath-reports"    # reports of files that are sent to a printer
+# log = "~/stillpath-post.log"       # Windows shows nobody what went wrong: it stands here
+
+# What the slicer calls the printer, and the machine of Stillpath; * stands for anything.
+[machines]
+# "Original Prusa MK4 *" = "mk4"
+# "Voron 2.4 250" = "voron-v24-250"
+"""
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the settings of a TOML file, checked, or raise `Failure` naming what is wrong.
+
+    Before Python 3.11 there is no reader of TOML: then lines ``name = value`` with strings, numbers
+    and ``[machines]`` are understood, as the template has them.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise Failure(f"{path} is not in UTF-8") from None
+    try:
+        import tomllib
+    except ImportError:
+        read = _plain_toml(text, path)
+    else:
+        try:
+            read = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise Failure(f"{path}: {error}") from None
+    read = {name.replace("-", "_"): value for name, value in read.items()}
+    for name, value in read.items():
+        if name == "machines":
+            if not isinstance(value, dict) or not all(isinstance(v, str) for v in value.values()):
+                raise Failure(f'{path}: [machines] holds lines "PRINTER" = "MACHINE"')
+        elif name not in _SETTINGS:
+            raise Failure(f"{path}: there is no setting {name!r}, but {', '.join(_SETTINGS)}")
+        elif not isinstance(value, (int, float) if name in ("timeout", "wait") else str):
+            raise Failure(f"{path}: {name} = {value!r} is of the wrong type")
+    return read
+
+
+_TOML_LINE = re.compile(
+    r"""\s*(?:\[\s*(?P<table>\w+)\s*\]
+    |(?P<name>[\w-]+|"(?:[^"\\]|\\.)*"|'[^']*')\s*=\s*
+     (?P<value>"(?:[^"\\]|\\.)*"|'[^']*'|[+-]?\d+(?:\.\d+)?))?\s*(?:\#.*)?""",
+    re.VERBOSE,
+)
+
+
+def _plain_toml(text: str, path: Path) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    read = table
+    for number, line in enumerate(text.splitlines(), 1):
+        found = _TOML_LINE.fullmatch(line)
+        if found is None:
+            raise Failure(f"{path}, line {number}: cannot be read: {line.strip()[:80]}")
+        if found["table"]:
+            table = read.setdefault(found["table"], {})
+        elif found["name"]:
+            name, value = found["name"], found["value"]
+            quoted = name[0] in "\"'"
+            table[_toml_value(name) if quoted else name] = _toml_value(value)
+    return read
+
+
+def _toml_value(text: str) -> Any:
+    if text[0] == "'":
+        return text[1:-1]
+    return json.loads(text.lstrip("+"))
+
+
+def default_settings_path(environment: Mapping[str, str] = os.environ) -> Path:
+    """Return where the settings lie: the user's folder for settings, by platform."""
+    if environment.get("STILLPATH_POST_CONFIG"):
+        return Path(environment["STILLPATH_POST_CONFIG"])
+    return _user_dir("APPDATA", "XDG_CONFIG_HOME", ".config") / "stillpath" / "post.toml"
+
+
+def _data_dir() -> Path:
+    return _user_dir("LOCALAPPDATA", "XDG_DATA_HOME", ".local/share") / "stillpath"
+
+
+def _user_dir(windows: str, xdg: str, fallback: str) -> Path:
+    home = Path("~").expanduser()
+    if sys.platform == "win32":
+        return Path(os.environ.get(windows) or home / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return home / "Library" / "Application Support"
+    return Path(os.environ.get(xdg) or home / fallback)
+
+
+def _set_up(settings: Settings, voice: Voice) -> None:
+    """Make the settings file if there is none, and say what to paste into the slicer."""
+    if not settings.path.exists():
+        settings.path.parent.mkdir(parents=True, exist_ok=True)
+        settings.path.touch(mode=0o600)  # it may come to hold a key
+        settings.path.write_text(TEMPLATE, encoding="utf-8")
+    program = Path(sys.argv[0]).absolute()
+    if program.suffix == ".py":
+        command = [sys.executable, str(program)]
+    elif sys.platform == "win32" and program.suffix != ".exe":
+        command = [f"{program}.exe"]  # the launcher that pip makes leaves it out
+    else:
+        command = [str(program)]
+    windows = sys.platform == "win32"
+    line = subprocess.list2cmdline(command) if windows else " ".join(map(shlex.quote, command))
+    voice.out(f"settings: {settings.path}")
+    voice.out("line for the slicer's field of post-processing scripts:")
+    voice.out(f"  {line}")
+
+
+class Voice:
+    """Says how the work goes.
+
+    Progress is one line that changes on a terminal, else a line now and then on stdout: slicers
+    show stderr as the reason of a failure, so only that stands there.
+    """
+
+    def __init__(self, log: Path | None = None) -> None:
+        self.log = log
+        """File that everything but progress is appended to."""
+        self._terminal = sys.stderr is not None and sys.stderr.isatty()
+        self._every_s = _SHOWN_EVERY_S if self._terminal else _SAID_EVERY_S
+        self._said_at = time.monotonic()
+        self._line = False
+
+    def progress(self, stage: str, share: float | None = None) -> None:
+        """Say what is being done, and which share of it is."""
+        now = time.monotonic()
+        if now - self._said_at < self._every_s:
+            return
+        self._said_at = now
+        text = stage if share is None else f"{stage} {100 * share:.0f} %"
+        if self._terminal:
+            self._line = True
+            self._write(sys.stderr, f"\r{PROGRAM}: {text:<60}")
+        else:
+            self.out(f"{PROGRAM}: {text}")
+
+    def note(self, text: str) -> None:
+        """Say what the user may want to know."""
+        self._clear()
+        self.out(f"{PROGRAM}: {text}")
+        self._append(text)
+
+    def fail(self, text: str) -> None:
+        """Say what went wrong."""
+        self._clear()
+        self._write(sys.stderr, f"{PROGRAM}: {text}\n")
+        self._append(text)
+
+    def out(self, text: str) -> None:
+        """Write one line to stdout."""
+        self._write(sys.stdout, f"{text}\n")
+
+    def trace(self, text: str) -> None:
+        """Keep what only a programmer understands."""
+        if self.log is not None:
+            self._append(text)
+        else:
+            self._write(sys.stderr, text)
+
+    def _clear(self) -> None:
+        if self._line:
+            self._write(sys.stderr, "\r" + 80 * " " + "\r")
+            self._line = False
+
+    def _append(self, text: str) -> None:
+        if self.log is None:
+            return
+        try:
+            with self.log.open("a", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+        except OSError as error:
+            self.log = None
+            self._write(sys.stderr, f"{PROGRAM}: warning: no log: {_of_system(error)}\n")
+
+    @staticmethod
+    def _write(stream: TextIO | None, text: str) -> None:
+        with contextlib.suppress(OSError, ValueError):  # nobody listens any more
+            if stream is not None:
+                stream.write(text)
+                stream.flush()
+
+
+class Signals:
+    """Turns signals that ask for the end into `Stopped`, at once or, `deferred`, at `check`."""
+
+    def __init__(self) -> None:
+        self.deferred = False
+        self._received = 0
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
+            number = getattr(signal, name, None)
+            if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._on)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def check(self) -> None:
+        """Raise `Stopped` if a signal came."""
+        if self._received:
+            raise Stopped(self._received)
+
+    def _on(self, number: int, _: FrameType | None) -> None:
+        if self.deferred and not self._received:
+            self._received = number
+        else:
+            raise Stopped(number)
+
+
+# Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
+
+
+class ServiceError(Exception):
+    """The service did not do it; `refused`: nor would it at another try."""
+
+    def __init__(self, message: str, refused: bool = False) -> None:
+        super().__init__(message)
+        self.refused = refused
+
+
+class Service:
+    """A Stillpath server.
+
+    Parameters
+    ----------
+    address : str
+        As in a browser: ``http://127.0.0.1:8000``.
+    key : str
+        Sent as a bearer token; empty for none.
+    timeout_s : float
+        How long the server may be silent, or away while a job is there, before it is given up.
+    tell : callable
+        Is told the stage, and the share that is done or None; may raise to stop the work.
+    """
+
+    _FIRST_PATIENCE_S = 3.0
+    _BUSY = (429, 502, 503, 504)
+    _LONGEST_PAUSE_S = 2.0
+
+    def __init__(
+        self,
+        address: str,
+        key: str = "",
+        timeout_s: float = 60.0,
+        tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
+    ) -> None:
+        parts = urlsplit(address)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise ServiceError(
+                f"{address!r} is not the address of a server; one looks like http://127.0.0.1:8000",
+                refused=True,
+            )
+        self._address = address.rstrip("/")
+        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._timeout_s = timeout_s
+        self._tell = tell
+        # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
+        handlers: list[Any] = [_NoRedirection(), _Http(), _Https()]
+        if parts.hostname in ("localhost", "127.0.0.1", "::1"):
+            handlers.append(ProxyHandler({}))
+        self._opener = build_opener(*handlers)
+
+    def compensate(
+        self,
+        source: Path,
+        target: Path,
+        name: str,
+        options: Mapping[str, Any],
+        wait_s: float | None = None,
+    ) -> bytes:
+        """Send a file, wait, fetch the result and return the page of the report.
+
+        Parameters
+        ----------
+        source, target : Path
+            The target is written in place: guard it.
+        name : str
+            What the file is called in the report.
+        options : dict
+            `machine` and other parameters of a job.
+        wait_s : float, optional
+            Give up after this time.
+
+        Raises
+        ------
+        ServiceError
+        """
+        self._tell("asking the server", None)
+        machine = quote(options["machine"], safe="")
+        # Whether address, key and machine are right is known before a long upload.
+        self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
+        job = self._send(source, name, options)
+        path = f"/v1/jobs/{job}"
+        try:
+            self._wait(path, wait_s)
+            self._fetch(f"{path}/result", target)
+            return self._ask("GET", f"{path}/report", self._timeout_s)
+        finally:
+            self._forget(path)
+
+    def _send(self, source: Path, name: str, options: Mapping[str, Any]) -> str:
+        size = source.stat().st_size
+        sent = {key: value for key, value in options.items() if value is not None}
+        query = urlencode({**sent, "name": name[-255:]}, errors="replace")
+        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        with source.open("rb") as file:
+            body = _Told(file, size, lambda share: self._tell("sending", share))
+            answer = self._ask("POST", f"/v1/jobs?{query}", 0.0, body=body, headers=headers)
+        job = self._document(answer)
+        if job.get("source_bytes") != size:
+            self._forget(f"/v1/jobs/{job.get('id')}")
+            raise ServiceError(f"sent {size} bytes, but {job.get('source_bytes')} arrived")
+        return str(job["id"])
+
+    def _wait(self, path: str, wait_s: float | None) -> None:
+        began, pause_s = time.monotonic(), 0.1
+        while True:
+            job = self._document(self._ask("GET", path, self._timeout_s))
+            state = job.get("state")
+            if state == "done":
+                return
+            if state == "failed":
+                problem = job.get("error") or {}
+                reason = problem.get("detail", "the server does not say why")
+                raise ServiceError(reason, refused=problem.get("status", 500) < 500)
+            if wait_s is not None and time.monotonic() - began > wait_s:
+                raise ServiceError(f"not done within {wait_s:.0f} s; given up")
+            waiting = job.get("queue_position")
+            stage = f"waiting behind {waiting} jobs" if waiting else job.get("stage") or "waiting"
+            self._tell(stage, job.get("progress"))
+            time.sleep(pause_s)
+            pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _fetch(self, path: str, target: Path) -> None:
+        for attempts_left in (2, 1, 0):
+            try:
+                self._fetch_once(path, target)
+                return
+            except _Broken as error:
+                if not attempts_left:
+                    reason = f"the result cannot be fetched from {self._address}: {error}"
+                    raise ServiceError(reason) from None
+
+    def _fetch_once(self, path: str, target: Path) -> None:
+        with self._open("GET", path) as answer, target.open("wb") as file:
+            expected = int(answer.headers.get("Content-Length") or -1)
+            read = 0
+            while True:
+                try:
+                    chunk = answer.read(1 << 18)
+                except (OSError, http.client.HTTPException) as error:
+                    raise _Broken(str(error) or type(error).__name__) from None
+                if not chunk:
+                    break
+                file.write(chunk)
+                read += len(chunk)
+                self._tell("fetching", read / expected if expected > 0 else None)
+        if not read or read != expected >= 0:
+            raise _Broken(f"{read} of {expected} bytes came")
+
+    def _forget(self, path: str) -> None:
+        """Delete the job: what is not fetched by then is not wanted any more."""
+        # Gone, or the server is: either way there is nothing left to do.
+        with contextlib.suppress(ServiceError, _Broken):
+            self._open("DELETE", path, timeout_s=min(5.0, self._timeout_s)).close()
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        patience_s: float,
+        body: Any = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> bytes:
+        """Return the answer; what may pass by itself is tried again for some time."""
+        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        while True:
+            try:
+                with self._open(method, path, body, headers) as answer:
+                    return bytes(answer.read())
+            except (_Broken, OSError, http.client.HTTPException) as error:
+                if time.monotonic() + pause_s > deadline:
+                    raise ServiceError(f"no answer from {self._address}: {error}") from None
+            self._tell("the server does not answer; trying again", None)
+            time.sleep(pause_s)
+            pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _open(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        headers: Mapping[str, str] | None = None,
+        timeout_s: float | None = None,
+    ) -> Any:
+        """Return the open answer; raise `ServiceError` if it is no, `_Broken` if there is none."""
+        request = Request(
+            self._address + path,
+            data=body,
+            headers={**self._headers, **(headers or {})},
+            method=method,
+        )
+        try:
+            return self._opener.open(request, timeout=timeout_s or self._timeout_s)
+        except HTTPError as error:
+            with error:
+                if error.code in self._BUSY:
+                    raise _Broken(f"{error.code} {error.reason}") from None
+                raise self._refusal(error) from None
+        except (OSError, http.client.HTTPException) as error:
+            raise _Broken(str(getattr(error, "reason", "") or error)) from None
+
+    def _document(self, answer: bytes) -> dict[str, Any]:
+        try:
+            document = json.loads(answer)
+        except ValueError:
+            document = None
+        if not isinstance(document, dict):
+            raise ServiceError(f"{self._address} answers, but not as a Stillpath server")
+        return document
+
+    def _refusal(self, error: HTTPError) -> ServiceError:
+        """Return the error for an answer of status 300 or above."""
+        try:
+            document = json.loads(error.read(1 << 16))
+        except (ValueError, OSError, http.client.HTTPException):
+            document = None
+        reason = document.get("detail") if isinstance(document, dict) else None
+        reason = reason or f"{self._address} answers {error.code} {error.reason}"
+        if error.code == 401:
+            reason = f"the server does not accept the key (401): {reason}"
+        elif 300 <= error.code < 400:
+            reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
+        elif error.code == 404 and "/v1/jobs/" in error.url:
+            reason = f"the job was cancelled on the server: {reason}"
+        return ServiceError(reason, refused=error.code < 500)
+
+
+class _Broken(Exception):
+    """There is no answer, or not all of it: another try may bring it."""
+
+
+class _EarlyAnswer(http.client.HTTPConnection):
+    """Reads the answer even if the server does not take the whole request."""
+
+    def send(self, data: Any) -> None:
+        if self.sock is None:
+            self.connect()
+        with contextlib.suppress(ConnectionError):
+            super().send(data)
+
+
+class _EarlyAnswerTls(_EarlyAnswer, http.client.HTTPSConnection):
+    pass
+
+
+class _Http(HTTPHandler):
+    def http_open(self, request: Request) -> Any:
+        return self.do_open(_EarlyAnswer, request)
+
+
+class _Https(HTTPSHandler):
+    def https_open(self, request: Request) -> Any:
+        return self.do_open(_EarlyAnswerTls, request)
+
+
+class _NoRedirection(HTTPRedirectHandler):
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+class _Told:
+    """A file that tells which share of it has been read."""
+
+    def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
+        self._file, self._size, self._tell = file, max(size, 1), tell
+
+    def read(self, size: int = -1) -> bytes:
+        self._tell(min(self._file.tell() / self._size, 1.0))
+        return self._file.read(size)
+
+
+# End of the client.
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        prog=PROGRAM,
+        description="Compensate a sliced file in place, as a post-processing script of a slicer.",
+        epilog="Set-up of each slicer: docs/slicer-setup.md",
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("file", metavar="FILE", nargs="?", help="the sliced file; slicers append it")
+    add("--machine", "-m", metavar="M", help="machine; else by the slicer's printer name")
+    add("--printer", metavar="NAME", help="the printer's name, if the slicer does not tell it")
+    add("--server", metavar="URL", help="work on this server instead of on this computer")
+    add("--local", action="store_true", help="on this computer, even if the settings name a server")
+    add("--key", metavar="KEY", help="key of the server; better in the settings or STILLPATH_KEY")
+    add("--method", metavar="M", help="as of `stillpath compensate`, and so the next five")
+    add("--basis", metavar="B")
+    add("--robust", metavar="R")
+    add("--along", metavar="W", type=float)
+    add("--tolerance-um", metavar="T", type=float)
+    add("--plate", metavar="N", type=int)
+    add("--on-error", choices=("fail", "keep"), help="keep: print what was sliced, exit code 0")
+    add("--reports", metavar="DIR", help="for reports of files that do not stay on this computer")
+    add("--no-report", action="store_true", help="write no report")
+    add("--log", metavar="FILE", help="append what happens to this file")
+    add("--timeout", metavar="S", type=float, help="patience with a silent server [60]")
+    add("--wait", metavar="S", type=float, help="give a job on a server up after this time")
+    add("--config", metavar="FILE", help=f"settings [{default_settings_path()}]".replace("%", "%%"))
+    add("--setup", action="store_true", help="make the settings; show the line for the slicer")
+    return parser
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        Voice().fail(f"{message} (--help lists the options)")
+        raise SystemExit(2)
+
+
+def _seconds(name: str, *given: float | None) -> float | None:
+    """Return the first duration that was given."""
+    for value in given:
+        if value is not None:
+            if not 0 < value < 1e7:
+                raise Failure(f"{name} is {value} s; it must be positive")
+            return float(value)
+    return None
+
+
+def _path(text: str | None) -> Path | None:
+    return Path(text).expanduser() if text else None
+
+
+def _first_line(path: Path) -> str:
+    try:
+        with path.open(encoding="utf-8", errors="surrogateescape") as file:
+            return file.readline().strip()
+    except OSError:
+        return ""
+
+
+def _unquoted(text: str) -> str:
+    """Return the first value of a setting as slicers write it: in lists they may be quoted."""
+    text = text.strip()
+    inside = re.match(r'"((?:[^"\\]|\\.)*)"', text)
+    return re.sub(r"\\(.)", r"\1", inside[1]) if inside else text
+
+
+def _of_system(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    return f"{place}{error.strerror or error}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

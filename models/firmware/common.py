@@ -1,0 +1,86 @@
+"""What every firmware's section of a machine document holds."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = [
+    "Document",
+    "Finite",
+    "FirmwareFacts",
+    "FirmwareRetraction",
+    "Hotend",
+    "NonNegative",
+    "Positive",
+]
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Document(BaseModel):
+    """Part of a machine document: unknown names are refused, nothing changes afterwards."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Hotend(Document):
+    """Nozzle and filament."""
+
+    nozzle_diameter_mm: Positive = 0.4
+    filament_diameter_mm: Positive = 1.75
+
+
+class FirmwareRetraction(Document):
+    """What G10 and G11 do (Klipper: [firmware_retraction], Marlin: M207 and M208)."""
+
+    retract_length_mm: NonNegative = 0.8
+    retract_speed_mm_s: Positive = 35.0
+    unretract_extra_length_mm: NonNegative = 0.0
+    unretract_speed_mm_s: Positive = 35.0
+
+
+class FirmwareFacts(Document):
+    """Facts that G-code cannot tell and that every firmware has; the base of their sections.
+
+    A section adds `kind` (its discriminator), `extruder` (a `Hotend` or more), and its limits.
+    """
+
+    arc_resolution_mm: Positive = 1.0
+    arcs: bool = True
+    retraction: FirmwareRetraction | None = FirmwareRetraction()
+    harmless_macros: tuple[str, ...] = ()
+    """Configured macros that neither move nor wait, for instance _ON_LAYER_CHANGE."""
+    stopping_macros: tuple[str, ...] = ()
+    """Configured macros that wait but end at the position where they began."""
+    unknown_commands: Literal["unknown", "skip"] = "unknown"
+    """What an upper-case name that no table knows does: leaves the state unknown (it may be a
+    macro), or nothing (the firmware is known to lack it)."""
+    homed_at_start: bool = False
+    """True: X, Y and Z are known (at `home_mm`) before the first line."""
+    home_mm: tuple[Finite, Finite, Finite] | None = None
+    """Where G28 leaves the axes, if the machine says; None: unknown after homing."""
+    max_segments_per_s: Positive = 1000.0
+
+    @property
+    def hotend(self) -> Hotend:
+        """Nozzle and filament."""
+        raise NotImplementedError
+
+    @property
+    def fastest_mm_s(self) -> float:
+        """Highest configured speed of X and Y."""
+        raise NotImplementedError
+
+    @property
+    def largest_accel_mm_s2(self) -> float:
+        """Largest configured acceleration of moves that print."""
+        raise NotImplementedError
+
+    @property
+    def fastest_z_mm_s(self) -> float:
+        """Highest configured speed of Z."""
+        raise NotImplementedError

@@ -1,0 +1,165 @@
+"""A Marlin machine's firmware: what Configuration.h and M503 say and its G-code cannot tell.
+
+The defaults are those of a Creality Ender-3 on Marlin 2.1 (MarlinFirmware/Configurations,
+config/examples/Creality/Ender-3/CrealityV1, 2.1.x). Rules and sources: docs/marlin.md.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from models.firmware.common import Document, FirmwareFacts, Hotend, NonNegative, Positive
+
+__all__ = ["Marlin", "MarlinPlanner", "MarlinShaper", "PerAxis", "PerAxisLimit"]
+
+
+class PerAxis(Document):
+    """One positive number for each of X, Y, Z and E."""
+
+    x: Positive
+    y: Positive
+    z: Positive
+    e: Positive
+
+
+class PerAxisLimit(Document):
+    """One number, 0 or more, for each of X, Y, Z and E."""
+
+    x: NonNegative
+    y: NonNegative
+    z: NonNegative
+    e: NonNegative
+
+
+class MarlinPlanner(Document):
+    """The planner limits as they are at power-on (M503); the file may change them as it goes."""
+
+    max_feedrate_mm_s: PerAxis = PerAxis(x=500.0, y=500.0, z=5.0, e=25.0)
+    """M203."""
+    max_accel_mm_s2: PerAxis = PerAxis(x=500.0, y=500.0, z=100.0, e=5000.0)
+    """M201."""
+    accel_mm_s2: Positive = 500.0
+    """M204 P."""
+    retract_accel_mm_s2: Positive = 500.0
+    """M204 R."""
+    travel_accel_mm_s2: Positive = 500.0
+    """M204 T."""
+    jerk_mm_s: PerAxisLimit = PerAxisLimit(x=10.0, y=10.0, z=0.3, e=5.0)
+    """M205 X Y Z E, where CLASSIC_JERK is configured."""
+    junction_deviation_mm: Annotated[float, Field(gt=0, le=10)] = 0.08
+    """M205 J, where CLASSIC_JERK is not configured."""
+    min_segment_time_us: NonNegative = 20_000.0
+    """M205 B."""
+    min_feedrate_mm_s: NonNegative = 0.0
+    """M205 S."""
+    min_travel_feedrate_mm_s: NonNegative = 0.0
+    """M205 T."""
+
+
+class MarlinShaper(Document):
+    """The firmware's own ZV shaper as configured (M593), to be restored after our moves."""
+
+    freq_x_hz: NonNegative = 0.0
+    damping_x: Annotated[float, Field(ge=0, lt=1)] = 0.15
+    freq_y_hz: NonNegative = 0.0
+    damping_y: Annotated[float, Field(ge=0, lt=1)] = 0.15
+
+
+class Marlin(FirmwareFacts):
+    """Facts of a Marlin machine that its G-code cannot tell."""
+
+    kind: Literal["marlin"] = "marlin"
+    variant: Literal["2.0", "2.1", "bugfix", "prusa", "bambu"] = "2.1"
+    """Which rules the planner follows: releases 2.0.x and 2.1.x up to 2.1.2, the planner of
+    bugfix-2.1.x since 2024, Prusa-Firmware-Buddy, or Bambu's closed firmware (an estimate)."""
+    extruder: Hotend = Hotend()
+    planner: MarlinPlanner = MarlinPlanner()
+    steps_per_mm: PerAxis = PerAxis(x=80.0, y=80.0, z=400.0, e=93.0)
+    """M92."""
+    junction: Literal["deviation", "classic_jerk"] = "deviation"
+    small_segment_junctions: bool = True
+    """JD_HANDLE_SMALL_SEGMENTS."""
+    s_curve: bool = False
+    """S_CURVE_ACCELERATION."""
+    slowdown: bool = True
+    """SLOWDOWN: segments shorter than M205 B are stretched while the queue is short."""
+    min_steps_per_segment: Annotated[int, Field(ge=1, le=1000)] = 6
+    """MIN_STEPS_PER_SEGMENT: 6 in most configurations, 1 in some."""
+    block_buffer_size: Literal[4, 8, 16, 32, 64, 128] = 16
+    """BLOCK_BUFFER_SIZE."""
+    minimum_planner_speed_mm_s: Positive = 0.05
+    """MINIMUM_PLANNER_SPEED of 2.0 and 2.1."""
+    linear_advance: bool | None = None
+    """LIN_ADVANCE, classic: K above 0 caps accelerations. None: not known; times are planned as
+    without it, but a file that sets K is taken for one of a printer that has it."""
+    linear_advance_k_s: NonNegative = 0.0
+    """K at power-on (M900)."""
+    min_arc_segment_mm: Positive = 0.1
+    """MIN_ARC_SEGMENT_MM; the longest segment is `arc_resolution_mm` (MAX_ARC_SEGMENT_MM)."""
+    min_circle_segments: Annotated[int, Field(ge=1)] = 72
+    """MIN_CIRCLE_SEGMENTS."""
+    inch_mode: bool = False
+    """INCH_MODE_SUPPORT: G20."""
+    cnc_planes: bool = False
+    """CNC_WORKSPACE_PLANES: G18 and G19."""
+    cnc_workspaces: bool = False
+    """CNC_COORDINATE_SYSTEMS: G53 to G59.3 and G92.1."""
+    bezier_curves: bool = False
+    """BEZIER_CURVE_SUPPORT: G5."""
+    saved_positions: bool = False
+    """SAVED_POSITIONS: G60 and G61."""
+    motion_modes: bool = False
+    """GCODE_MOTION_MODES: a line may leave out the G of the line before it."""
+    case_insensitive: bool = False
+    """GCODE_CASE_INSENSITIVE: lower case is read."""
+    paren_comments: bool = False
+    """PAREN_COMMENTS: ( ) encloses a comment."""
+    max_cmd_size: Annotated[int, Field(ge=32, le=4096)] = 96
+    """MAX_CMD_SIZE: one less than this is read of a line, the rest is cut off."""
+    shaper: MarlinShaper | None = None
+    """None: not known. Without a shaper (M593) both frequencies are 0."""
+    board: Literal["32bit", "avr"] = "32bit"
+    """An 8-bit board computes step rates in 16 bits and cannot follow a dense stream."""
+    step_timer_hz: Annotated[float, Field(ge=1e5, le=1e9)] = 2e6
+    """STEPPER_TIMER_RATE: times between steps are whole ticks of it."""
+    step_smoothing_hz: NonNegative = 0.0
+    """ADAPTIVE_STEP_SMOOTHING: steps are timed in halves, quarters, ... up to this rate
+    (MIN_STEP_ISR_FREQUENCY); 0: it is off."""
+    link: Literal["media", "serial"] = "media"
+    """Where the lines come from: the printer's own card or stick, or a host's serial line."""
+    baud_rate: Annotated[int, Field(gt=0)] = 115_200
+    unknown_commands: Literal["unknown", "skip"] = "skip"
+    max_segments_per_s: Positive = 500.0
+    """What a 32-bit board reads, plans and executes for long; the queue bears short bursts."""
+
+    @model_validator(mode="after")
+    def _arcs_fit(self) -> Marlin:
+        if self.min_arc_segment_mm > self.arc_resolution_mm:
+            raise ValueError(
+                f"min_arc_segment_mm {self.min_arc_segment_mm:g} is above arc_resolution_mm "
+                f"{self.arc_resolution_mm:g}"
+            )
+        return self
+
+    @property
+    def hotend(self) -> Hotend:
+        """Nozzle and filament."""
+        return self.extruder
+
+    @property
+    def fastest_mm_s(self) -> float:
+        """Highest configured speed of X and Y."""
+        return min(self.planner.max_feedrate_mm_s.x, self.planner.max_feedrate_mm_s.y)
+
+    @property
+    def largest_accel_mm_s2(self) -> float:
+        """Largest configured acceleration of moves that print."""
+        limit = self.planner.max_accel_mm_s2
+        return min(self.planner.accel_mm_s2, max(limit.x, limit.y))
+
+    @property
+    def fastest_z_mm_s(self) -> float:
+        """Highest configured speed of Z."""
+        return self.planner.max_feedrate_mm_s.z

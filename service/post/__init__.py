@@ -1,0 +1,72 @@
+"""What `integrations/slicers/stillpath_post.py` does on this computer; heavy imports wait."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Refused", "compensate_in_place"]
+
+
+class Refused(Exception):
+    """It cannot be done as it was put: bad file, machine or option."""
+
+
+def compensate_in_place(
+    path: Path,
+    options: Mapping[str, Any],
+    *,
+    name: str,
+    tell: Callable[[str, float | None], object],
+) -> str:
+    """Compensate a sliced file in place and return the page of its report.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced when the new file is complete, else left as it was.
+    options : mapping
+        `machine`, a name or the path of a document, and fields of `pipeline.options.Options`.
+    name : str
+        What the report calls the file; slicers hand over temporary ones.
+    tell : callable
+        Is told the stage and the share that is done; may raise to stop the work.
+
+    Raises
+    ------
+    Refused
+    """
+    from service.environment import prepare_environment
+
+    prepare_environment()
+
+    from pydantic import ValidationError
+
+    from compensation.base import DesignError
+    from gcode.errors import GcodeError
+    from models.errors import ModelError
+    from service.machines.commands import open_machines
+    from service.pipeline.options import Options
+    from service.pipeline.progress import Progress
+    from service.reports import render_report
+
+    def told(progress: Progress) -> None:
+        tell(progress.stage, progress.fraction)
+
+    try:
+        found = open_machines().for_job(options["machine"], files=True)
+        chosen = Options(**{key: options[key] for key in options if key != "machine"})
+
+        from service.pipeline.road import compensate_file
+
+        tell("starting", None)
+        result = compensate_file(path, path, found.machine, chosen, progress=told)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise Refused(f"{field}: {first['msg']} (given: {first['input']!r})") from None
+    except (GcodeError, ModelError, DesignError) as error:
+        raise Refused(str(error)) from error
+    result.warnings.extend(found.warnings)
+    return render_report(result.model_copy(update={"source_name": name}))

@@ -1,0 +1,205 @@
+"""What must hold for any bytes: what one file may do to the interpreter, the planner and the road.
+
+Nothing but a `GcodeError` may come out, and what comes out of the road holds every line of the
+file, with the machine in the same state at each of them.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from gcode.dialect import Dialect
+from gcode.errors import GcodeError
+from gcode.interpreter import Interpreter
+from gcode.pieces import Splitter
+from gcode.types import Moves, Phases, ProgramBlock
+from models.machine import AxisTravel, Machine
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file, plan_passage
+from tests.gcode.states import differences, has_code
+
+__all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_road", "walk"]
+
+_LONGEST_S = 300.0
+"""Lines whose moves last longer are taken out before the road: every second of print costs."""
+
+_REPEATED = re.compile(rb"SET_INPUT_SHAPER|M572|M593|M900", re.IGNORECASE)
+_TICKS_MM_S = 0.02
+"""By how much a speed may be below 0 where a firmware rounds times to its clock's ticks."""
+_WILD = re.compile(r"#\d+ b'\s*(N\d+\s*)?G92.*G92 moved$", re.IGNORECASE)
+"""A wild extruder is far ahead where a G92 stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one file."""
+
+    text: bytes
+    """The file without the lines that were refused."""
+    refusals: list[GcodeError]
+    written: bytes | None
+    """None: refused as a whole."""
+    put_back: int = 0
+
+
+def roomy(machine: Machine, half_mm: float = 5000.0) -> Machine:
+    """Return the machine with room for files of other printers."""
+    travel = {axis: AxisTravel(min_mm=-half_mm, max_mm=half_mm) for axis in ("x", "y", "z")}
+    return machine.model_copy(update={"travel": travel})
+
+
+def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) -> Outcome:
+    """Bring a damaged file through everything; what may not be is an AssertionError or worse."""
+    read_through(data, machine)
+    text, refusals = without_refused(data, machine)
+    if text and not text.endswith(b"\n"):
+        text += b"\n"  # the writer would add it before its footer
+    # Ends of lines other than LF and CRLF are the interpreter's business alone.
+    if b"\r" not in text.replace(b"\r\n", b"\n"):
+        text = _tagged(text)
+    written, put_back = None, 0
+    for _ in range(8):
+        try:
+            written, put_back = through_the_road(text, machine, folder, method, cache)
+            break
+        except GcodeError as error:
+            refusals.append(error)
+            if error.line is None:
+                break
+            text = _without(text, {error.line})
+    return Outcome(text, refusals, written, put_back)
+
+
+def read_through(data: bytes, machine: Machine) -> GcodeError | None:
+    """Interpret and plan a file as it is; return why it is refused."""
+    blocks, error = interpreted(data, machine)
+    splitter = Splitter(machine, compensate=False)
+    try:
+        for block in blocks:
+            for passage in splitter.push(block):
+                for part in plan_passage(passage, machine):
+                    if isinstance(part, Phases):
+                        check_phases(part)
+    except GcodeError as caught:
+        error = error or caught
+    return error
+
+
+def interpreted(
+    data: bytes, machine: Machine, dialect: Dialect | None = None
+) -> tuple[list[ProgramBlock], GcodeError | None]:
+    """Interpret a file in blocks; return what was read, and why the rest is refused."""
+    reader = Interpreter(machine, dialect=dialect)
+    error = None
+    blocks: list[ProgramBlock] = []
+    try:
+        for start in range(0, len(data), 4096):
+            blocks += reader.push(data[start : start + 4096])
+        blocks += reader.flush()
+    except GcodeError as caught:
+        error = caught
+    if error is not None:
+        assert error.line is not None
+        assert 1 <= error.line <= data.count(b"\n") + 1
+    text = b"".join(block.text for block in blocks)
+    assert data.startswith(text) if error else text == data
+    for block in blocks:
+        moves, events = block.moves, block.events
+        assert np.all(np.isfinite(moves.start_mm))
+        assert np.all(np.isfinite(moves.end_mm))
+        assert np.all(moves.speed_mm_s > 0.0)
+        assert np.all(np.isfinite(moves.speed_mm_s))
+        for table, ids in ((block.limits, "limits_id"), (block.modal, "modal_id")):
+            for rows in (moves, events):
+                column = getattr(rows, ids)
+                assert np.all((column >= 0) & (column < len(table)))
+        spans = {*zip(moves.byte_start.tolist(), moves.byte_end.tolist(), strict=True)}
+        spans |= {*zip(events.byte_start.tolist(), events.byte_end.tolist(), strict=True)}
+        assert sum(end - start for start, end in spans) == len(block.text)
+    for limits in blocks[-1].limits if blocks else []:
+        assert np.all(np.isfinite(limits.as_row()))
+    return blocks, error
+
+
+def check_phases(phases: Phases) -> None:
+    """Durations and speeds are finite and not negative; time only grows."""
+    for f in fields(phases):
+        assert np.all(np.isfinite(getattr(phases, f.name))), f.name
+    for name in ("accel_s", "cruise_s", "decel_s", "start_mm_s", "cruise_mm_s", "end_mm_s"):
+        assert np.all(getattr(phases, name) >= (-_TICKS_MM_S if "mm_s" in name else 0.0)), name
+    assert np.all(np.diff(phases.t_s) >= -1e-9)
+
+
+def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeError]]:
+    """Take out the lines that are refused, and those that take minutes, one after the other."""
+    refusals: list[GcodeError] = []
+    lines = data.split(b"\n")
+    reader = Interpreter(machine, strict_bounds=True)
+    good: list[bytes] = []
+    for number, line in enumerate(lines):
+        ended = line + (b"\n" if number + 1 < len(lines) else b"")
+        if not ended:
+            continue
+        before = reader.snapshot()
+        try:
+            blocks = reader.push(ended) + ([] if ended.endswith(b"\n") else reader.flush())
+            slow = any(np.any(_lasts_s(b.moves) > _LONGEST_S) for b in blocks)
+            slow = slow or any(np.any(b.events.dwell_s > _LONGEST_S) for b in blocks)
+        except GcodeError as error:
+            refusals.append(error)
+            slow = True
+        if slow:
+            reader = before
+        else:
+            good.append(ended)
+    return b"".join(good), refusals
+
+
+def through_the_road(
+    text: bytes, machine: Machine, folder: Path, method: str, cache: Path
+) -> tuple[bytes, int]:
+    """Compensate a file; check lines, states and that nothing else is left behind."""
+    source, target = folder / "in.gcode", folder / "out.gcode"
+    target.unlink(missing_ok=True)
+    source.write_bytes(text)
+    try:
+        result = compensate_file(source, target, machine, Options(method=method), cache_dir=cache)
+    except GcodeError:
+        assert source.read_bytes() == text
+        assert sorted(p.name for p in folder.iterdir()) == ["in.gcode"]
+        raise
+    assert source.read_bytes() == text
+    assert sorted(p.name for p in folder.iterdir()) == ["in.gcode", "out.gcode"]
+    written = target.read_bytes()
+    if method == "none":
+        assert written == text
+    elif b"\r" not in text.replace(b"\r\n", b"\n"):
+        problems = [p for p in differences(text, written, machine) if not _WILD.match(p)]
+        assert problems == [], problems[:5]
+    return written, len(result.put_back)
+
+
+def _lasts_s(moves: Moves) -> np.ndarray:
+    way = moves.end_mm - moves.start_mm
+    length = np.sqrt(np.sum(way[:, :3] ** 2, axis=1))
+    return np.asarray(np.where(length > 0.0, length, np.abs(way[:, 3])) / moves.speed_mm_s)
+
+
+def _tagged(text: bytes) -> bytes:
+    """Number the lines that hold code, so that they can be found again (`tests.gcode.states`)."""
+    out = []
+    for number, line in enumerate(text.split(b"\n"), 1):
+        body = line.rstrip(b"\r")
+        # What a file says about the shaper is said again later: such lines may be there twice.
+        plain = has_code(body) and not _REPEATED.search(body)
+        out.append(body + b" ;#%d" % number + line[len(body) :] if plain else line)
+    return b"\n".join(out)
+
+
+def _without(text: bytes, numbers: set[int]) -> bytes:
+    lines = text.split(b"\n")
+    return b"\n".join(line for number, line in enumerate(lines, 1) if number not in numbers)

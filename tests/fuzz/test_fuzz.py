@@ -1,0 +1,127 @@
+"""Slices of what `benchmarks/fuzz.py` and `hostile.py` do at length, and what they found."""
+
+from __future__ import annotations
+
+import gzip
+import random
+from pathlib import Path
+
+import pytest
+
+from gcode.errors import GcodeError
+from gcode.firmware.registry import kit
+from gcode.interpreter import Interpreter
+from tests.fuzz.checks import read_through, through_the_road, walk
+from tests.fuzz.hostile import HOSTILE, pieces
+from tests.fuzz.machines import KINDS, machine_of
+from tests.fuzz.mutations import excerpts
+from tests.gcode.states import tagged
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*_*.gcode"))
+
+
+def test_damage_is_the_seed_s() -> None:
+    files = [path.read_bytes() for path in EXAMPLES]
+    made = [list(excerpts(files, 30_000, random.Random(seed))) for seed in (1, 1, 2)]
+    assert made[0] == made[1]
+    assert made[0] != made[2]
+    assert 30_000 <= sum(map(len, made[0])) < 100_000
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_are_read_and_planned_or_refused(kind: str) -> None:
+    machine = machine_of(kind)
+    files = [path.read_bytes() for path in EXAMPLES]
+    for data in excerpts(files, 60_000, random.Random(KINDS.index(kind)), size=3000):
+        read_through(data, machine)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", sorted(HOSTILE))
+def test_hostile_files_are_read_or_refused(kind: str, name: str) -> None:
+    reader = Interpreter(machine_of(kind))
+    size = min(HOSTILE[name][1], 300)
+    data = b"".join(pieces(name, size))
+    read = b""
+    try:
+        for block in [*reader.push(data), *reader.flush()]:
+            read += block.text
+    except GcodeError as error:
+        told = error
+    else:
+        assert read == data
+        return
+    assert told.line is not None
+    assert len(str(told)) < 500
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+FOUND = {
+    "an arc that only feeds needs the file's F": (
+        "M83\nG1 X252.037 Y148.647 E.00484\nG3 X252.48 Y147.533 I8.433 J2.711 E.0386\n"
+        "G3 X252.48 Y147.533 I8.433 J2.711 E.0386\nG1 X253.084 Y146.652 E.03435\n"
+    ),
+    "an arc of no length must not become a circle": (
+        "N3910 G1 X0.3000 F20.\nN3960 G3 X0.0000 Y2.3000 I0. J-.05\nN3970 G1 Y2.0000\n"
+        "N3980 G2 X0.0000 Y2.0000 I.1 J.1\nN4010 G0 X0.5000 Y2.0000\n"
+    ),
+    "G01 is G1": "G28\nM83\nG1 X50 Y50 F6000\nG1 X90 E1\nG01 E-.8\nG1 X60 Y60\nG01 E.8\nG1 X90\n",
+    "an unknown Z is not named": (
+        "G1 X110.304 Y111.102 E5.00986\nSET_GCODE_OFFSET Z_ADJUST=0.009174993 MOVE=1 MOVE_SPEED=5\n"
+        "G1 X113.461 Y114.428 F9000\nG1 E5 F2400\n"
+    ),
+    "rests stand on the plan": (
+        "G1 X36.788 Y62.785 E0.05436\nG1 X36.786 Y62.787 E0.00004\nG1 X36.786 Y62.787 E0.00003\n"
+        "G1 X36.277 Y62.401 E0.02931\n"
+    ),
+    "the places of numbered lines": (
+        "N1 G1 X2.0000 Y1.5000\nN2 G1 Z-.02 F5.\nN3 G0 X2.5000 Y1.5000\nN4 G1 Z-.02 F5.\n"
+        "N5 G1 X2.8000 F20.\n"
+    ),
+}
+
+FOUND_IN_MARLIN = (
+    "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
+    "G1 X119.971 Y118.323 E5.34247\nG1 E1.84247 F3600\nG2 X119.495 Y117.807 I-265.097 J244.069"
+    " E1.50880\n"
+    "G2 X120.720 Y118.024 I2.419 J-10.088 E0.91721\nG1 X119.466 Y122.251 E5.02687\n"
+    "G1 X108.526 Y117.369 E5.0076\nG1 E1.5076 F3600\nG1 E.0076 F3600\nG1 F7200\n"
+    "G1 X111.498 Y117.81 E1.40752\n"
+)
+
+
+@pytest.mark.slow
+def test_no_line_passes_a_rest_that_takes_no_time(tmp_path: Path, cache: Path) -> None:
+    data = tagged(FOUND_IN_MARLIN.encode())
+    through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)
+
+
+@pytest.mark.slow  # tunes the shaper of its machine
+@pytest.mark.parametrize("name", FOUND)
+@pytest.mark.parametrize("method", ["shaper:mzv", "fbf"])
+def test_what_was_found_once(name: str, method: str, tmp_path: Path, cache: Path) -> None:
+    through_the_road(tagged(FOUND[name].encode()), machine_of("klipper"), tmp_path, method, cache)
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_down_the_road(
+    kind: str, tmp_path: Path, cache: Path, shared_dir: Path
+) -> None:
+    machine = machine_of(kind)
+    found = sorted((shared_dir / "corpus").glob("*/*.gz"))
+    files = [gzip.decompress(path.read_bytes()) for path in found]
+    written = 0
+    methods = ("shaper:mzv", "fbf", "none")
+    if kit(machine).refusal is not None:
+        methods = ("none",) * 3
+    for number, data in enumerate(excerpts(files, 60_000, random.Random(7), size=4000)):
+        folder = tmp_path / f"{number}"
+        folder.mkdir()
+        written += walk(data, machine, folder, methods[number % 3], cache).written is not None
+    assert written > 3

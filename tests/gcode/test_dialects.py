@@ -1,0 +1,438 @@
+"""What each firmware makes of the same text: cases worked out by hand from the firmwares' sources.
+
+The sources are named in docs/dialects.md and at the head of the modules under test.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from gcode.errors import GcodeError
+from gcode.interpreter import Interpreter
+from gcode.types import EventKind, ProgramBlock
+from models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
+from models.machine import Machine
+
+HOMED = {"homed_at_start": True, "home_mm": (0.0, 0.0, 0.0)}
+BUILD = {
+    **dict.fromkeys(
+        ("inch_mode", "cnc_planes", "cnc_workspaces", "bezier_curves", "saved_positions"), True
+    ),
+    **HOMED,
+}
+FIRMWARES: dict[str, FirmwareFacts] = {
+    "klipper": Klipper(**HOMED),
+    "marlin": Marlin(**BUILD),
+    "marlin-2.0": Marlin(**BUILD, variant="2.0"),
+    "marlin-stock": Marlin(**HOMED),
+    "marlin-loose": Marlin(
+        **BUILD, motion_modes=True, case_insensitive=True, paren_comments=True, max_cmd_size=128
+    ),
+    "prusa": Marlin(**BUILD, variant="prusa"),
+    "bambu": Marlin(**BUILD, variant="bambu"),
+    "reprapfirmware": RepRapFirmware(**HOMED),
+}
+FAMILY = ("marlin", "marlin-2.0", "prusa", "bambu")
+LARGE = ("marlin", "marlin-2.0", "bambu")  # with all options built in
+
+
+@pytest.fixture
+def read(golden_machine: Machine):
+    def reader(text: str, name: str, **facts: str) -> tuple[ProgramBlock, Interpreter]:
+        firmware = FIRMWARES[name].model_copy(update=facts)
+        machine = golden_machine.model_copy(update={"firmware": firmware})
+        interpreter = Interpreter(machine, strict_bounds=False)
+        blocks = [*interpreter.push(text.encode()), *interpreter.flush()]
+        assert len(blocks) == 1
+        return blocks[0], interpreter
+
+    return reader
+
+
+def same(names: tuple[str, ...], *row: float) -> dict[str, tuple[float, ...]]:
+    return dict.fromkeys(names, row)
+
+
+ALL = ("klipper", *FAMILY, "reprapfirmware")
+CASES = {
+    # text: where the machine is afterwards (x y z e), per firmware
+    "exponents": (
+        "M83\nG1 X1e-1 F600\n",
+        {
+            "klipper": (1, 0, 0, -1),
+            **same(FAMILY, 1, 0, 0, 0),
+            "reprapfirmware": (0.1, 0, 0, 0),
+        },
+    ),
+    "exponents in capitals": (
+        "M83\nG1 X1E2 F600\n",
+        {**same(("klipper", *FAMILY), 1, 0, 0, 2), "reprapfirmware": (100, 0, 0, 0)},
+    ),
+    "G90 behind M83": (
+        "M83\nG90\nG1 X1 E1 F600\nG1 X2 E1\n",
+        {**same(("klipper", "reprapfirmware"), 2, 0, 0, 2), **same(FAMILY, 2, 0, 0, 1)},
+    ),
+    "G91 behind M82": (
+        "M82\nG91\nG1 X1 E1 F600\nG1 X1 E1\n",
+        {**same(("klipper", *FAMILY), 2, 0, 0, 2), "reprapfirmware": (2, 0, 0, 1)},
+    ),
+    "M82 behind G91": (
+        "G91\nM82\nG1 X1 E1 F600\nG1 X1 E1\n",
+        {"klipper": (2, 0, 0, 2), **same((*FAMILY, "reprapfirmware"), 2, 0, 0, 1)},
+    ),
+    "bare G92": (
+        "G1 X5 F600\nG92\nG1 X1\n",
+        {"klipper": (6, 0, 0, 0), **same((*FAMILY, "reprapfirmware"), 1, 0, 0, 0)},
+    ),
+    "G92 moves the origin, or the machine": (
+        "G1 X5 F600\nG92 X0\nG1 X1\n",
+        {**same(("klipper", *FAMILY), 6, 0, 0, 0), "reprapfirmware": (1, 0, 0, 0)},
+    ),
+    "repeated words": (
+        "G1 X5 X6 F600\n",
+        {**same(("klipper", *FAMILY), 6, 0, 0, 0), "reprapfirmware": (5, 0, 0, 0)},
+    ),
+    "two commands on a line": (
+        "G91 G1 X5 F600\nG1 X1\n",
+        {
+            # Klipper and Marlin read G91 with odd words.
+            **same(("klipper", *FAMILY), 1, 0, 0, 0),
+            "reprapfirmware": (6, 0, 0, 0),
+        },
+    ),
+    "lower case": (
+        "g1 x5 f600\n",
+        {**same(("klipper", "reprapfirmware"), 5, 0, 0, 0), **same(FAMILY, 0, 0, 0, 0)},
+    ),
+    "leading zeros": (
+        "G01 X5 F600\n",
+        {"klipper": (0, 0, 0, 0), **same((*FAMILY, "reprapfirmware"), 5, 0, 0, 0)},
+    ),
+    "line number and checksum": ("N3 G1 X5 F600*54\nN4;G1 X7\n", same(ALL, 5, 0, 0, 0)),
+    "wrong checksum": (
+        "N3 G1 X5 F600*1\n",
+        {**same(("klipper", *FAMILY), 5, 0, 0, 0), "reprapfirmware": (0, 0, 0, 0)},
+    ),
+    "inches": (
+        "G20\nG1 X1 E1 F60\nG21\nG1 Y1\n",
+        {**same((*LARGE, "reprapfirmware"), 25.4, 1, 0, 25.4), **same(("prusa",), 1, 1, 0, 1)},
+    ),
+    "indentation and comments do not count": (
+        " " * 300 + "G1 X5 F600 ;" + "c" * 300 + "\n;" + "c" * 300 + "\n",
+        {"reprapfirmware": (5, 0, 0, 0)},
+    ),
+    "retraction of Simplify3D": (
+        "M83\nG1 X1 E1 F600\nM103\nG11\nM103\nM101\n",
+        {"reprapfirmware": (1, 0, 0, 1)},
+    ),
+    "flow": (
+        "M83\nM221 S50\nG1 X1 E2 F600\nG1 E2\n",
+        {**same(("klipper", *FAMILY), 1, 0, 0, 2), "reprapfirmware": (1, 0, 0, 3)},
+    ),
+    "flow without a number": (
+        "M83\nM221 S50\nM221 X0 Y0 Z0\nG1 X1 E2 F600\n",
+        {"klipper": (1, 0, 0, 2), **same((*FAMILY, "reprapfirmware"), 1, 0, 0, 1)},
+    ),
+    "F0": ("G1 X1 F600\nG1 X2 F0\n", same(FAMILY, 2, 0, 0, 0)),
+    "a word without a number": ("G1 X Y5 F600\n", same(FAMILY, 0, 5, 0, 0)),
+    "full circle": ("G1 X10 F600\nG2 I-5\n", same(ALL, 10, 0, 0, 0)),
+    "helix with turns": ("G17\nG1 X10 F600\nG3 Z4 I-5 J0 P1\n", same(FAMILY, 10, 0, 4, 0)),
+    "arc with R": ("G1 X10 F600\nG2 X0 R5\n", same((*FAMILY, "reprapfirmware"), 0, 0, 0, 0)),
+    "arc without centre": ("G1 X10 F600\nG2 X0 Y3\nG1 X8\n", same(FAMILY, 8, 0, 0, 0)),
+    "curve": ("G5 X10 Y0 I0 J5 P0 Q5 F600\n", same(LARGE, 10, 0, 0, 0)),
+    "workspaces": (
+        "G54\nG1 X1 F600\nG92 X0\nG1 X1\nG55\nG1 X1\nG54\nG1 X2\nG53 G1 X4\nG1 X5\n",
+        same(LARGE, 6, 0, 0, 0),
+    ),
+    "workspaces of RepRapFirmware": (
+        "G10 L2 P2 X10\nG55\nG1 X1 F600\nG53 G1 X3\nG1 X2\n",
+        {"reprapfirmware": (12, 0, 0, 0)},
+    ),
+    "saved place": (
+        "G1 X3 Y4 F600\nG60 S1\nG1 X9 Y9\nG61 S1 X Y0.5\n",
+        same(LARGE, 3, 4.5, 0, 0),
+    ),
+    "saved place of RepRapFirmware": (
+        "G1 X3 Y4 F600\nG60 S1\nG1 X9 Y9\nG1 R1 X0 Y0.5\n",
+        {"reprapfirmware": (3, 4.5, 0, 0)},
+    ),
+    "retraction and back": ("M83\nG1 X1 E1 F600\nG10\nG10\nG11\n", same(ALL, 1, 0, 0, 1)),
+    "volumetric": (
+        f"M83\nM200 D2\nG1 X1 E{math.pi} F600\n",
+        same((*FAMILY, "reprapfirmware"), 1, 0, 0, 1),
+    ),
+    "a line that is too long": (
+        "G1 X5 F600" + " " * 90 + "Y7\n",
+        {
+            **same(("klipper", "bambu", "reprapfirmware"), 5, 7, 0, 0),
+            **same(("marlin", "marlin-2.0", "prusa"), 5, 0, 0, 0),
+            "marlin-loose": (5, 7, 0, 0),
+        },
+    ),
+    "a build that takes all": (
+        "g1 x5 f600 (Y9)\nX6\nG80\nX7\n",
+        {"marlin-loose": (6, 0, 0, 0), "marlin": (0, 0, 0, 0)},
+    ),
+    "blanks and subcodes": (
+        "G  1 X5 F600\nG1.5 X6\n",
+        same(FAMILY, 6, 0, 0, 0),
+    ),
+    "comments in brackets": ("G1 X5 F600 ;(Y7)\n", same(ALL, 5, 0, 0, 0)),
+    "G10 with a tool": ("G10 P0 S200\nG1 X1 F600\n", {"reprapfirmware": (1, 0, 0, 0)}),
+    "modes saved": ("M120\nG91\nM121\nG1 X5 F600\nG1 X6\n", {"reprapfirmware": (6, 0, 0, 0)}),
+    "CNC mode": ("M453\nG1 X5 (out) Y2 F600\nX7\n", {"reprapfirmware": (7, 2, 0, 0)}),
+    "quoted text": (
+        'M117 "G1 X9"\nM118 P0 S"G1 X9"\nG1 X1 F600\n',
+        {"reprapfirmware": (1, 0, 0, 0)},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "name"), [(case, name) for case, (_, ends) in CASES.items() for name in ends]
+)
+def test_where_it_ends(case: str, name: str, read) -> None:
+    text, ends = CASES[case]
+    _, interpreter = read(text, name)
+    assert interpreter.position_mm == pytest.approx(ends[name], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "words"),
+    [
+        ("G20", "klipper", "inches"),
+        ("G2 X5 R9", "klipper", "R"),
+        ("G1 X F600", "klipper", "not a number"),
+        ("G1 X F600", "reprapfirmware", "not a number"),
+        ("G1 X10 F600\nG2 X0 R4", "reprapfirmware", "too short"),
+        ("G2 I5 R0", "reprapfirmware", "where it begins"),
+        ("G1 X10 F600\nG2 X5 Y7 I-5", "reprapfirmware", "off its circle"),
+        ("G1 X1 F0", "reprapfirmware", "feedrate"),
+        ("G1 X5 F600" + " " * 300 + "Y7", "reprapfirmware", "aborts the print"),
+        ("EXCLUDE_OBJECT_DEFINE NAME=" + "a" * 300, "reprapfirmware", "aborts the print"),
+        ("G1 X10 F600\nG2 I-5 P1", "marlin-2.0", "divides by zero"),
+        ("G2 I5 P101", "marlin", "100"),
+    ],
+)
+def test_refused(line: str, name: str, words: str, read) -> None:
+    with pytest.raises(GcodeError, match=words):
+        read(line + "\n", name)
+
+
+def test_r_one_per_cent_too_short(read) -> None:
+    for name in ("marlin", "reprapfirmware"):
+        block, _ = read("G1 X10 F600\nG2 X0 R4.97\n", name)
+        # A half circle about the middle: clockwise from +x goes through -y.
+        assert block.moves.end_mm[1:, 1].min() == pytest.approx(-5.0, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "sign"),
+    [("klipper", 1), ("marlin", -1), ("marlin-2.0", -1), ("reprapfirmware", -1)],
+)
+def test_direction_in_the_zx_plane(name: str, sign: int, read) -> None:
+    """Clockwise from +x: Klipper counts from X to Z, everybody else from Z to X."""
+    block, _ = read("G18\nG1 X10 F600\nG2 X0 I-5 K0\n", name)
+    z = block.moves.end_mm[1:, 2]
+    assert np.abs(z).max() == pytest.approx(5.0, abs=0.05)
+    assert np.sign(z[len(z) // 2]) == -sign
+
+
+def test_pieces_of_arcs(read) -> None:
+    counts = {}
+    for name in ("klipper", "marlin", "marlin-2.0", "reprapfirmware"):
+        block, _ = read("G1 X10 F6000\nG2 I-5\n", name)
+        counts[name] = len(block.moves) - 1
+    # 31.4 mm around: floor of 1 mm; at least 72 in a circle; sqrt(8 * 5 * 0.005) = 0.447 mm.
+    assert counts == {"klipper": 31, "marlin": 72, "marlin-2.0": 72, "reprapfirmware": 71}
+
+
+def test_limits(read) -> None:
+    text = "M201 X1000 E5000\nM203 X300\nM204 P1500 T2500\nM205 X8 B0 J0.02\nM204 S700\n"
+    block, _ = read(text, "marlin")
+    after = block.limits[block.events.limits_id[-1]]
+    assert (after.accel_x_mm_s2, after.accel_e_mm_s2, after.feedrate_x_mm_s) == (1000, 5000, 300)
+    assert (after.print_accel_mm_s2, after.travel_accel_mm_s2) == (700, 700)
+    # Junction deviation is built in, so X is passed over.
+    assert (after.min_segment_time_us, after.junction_deviation_mm) == (0, 0.02)
+    assert after.jerk_x_mm_s == block.limits[0].jerk_x_mm_s
+    block, _ = read("M205 X8 Y7 B0 J0.02\n", "marlin", junction="classic_jerk")
+    after = block.limits[block.events.limits_id[-1]]
+    assert (after.jerk_x_mm_s, after.jerk_y_mm_s, after.min_segment_time_us) == (8, 7, 0)
+    assert after.junction_deviation_mm == block.limits[0].junction_deviation_mm
+    block, _ = read("M203 X300 S1\n", "reprapfirmware")
+    assert block.limits[block.events.limits_id[-1]].speed_x_mm_s == 300
+    block, _ = read("M201 X77\nM900 K0.3\nM501\nG4\n", "marlin")
+    assert block.limits[block.events.limits_id[-1]] == block.limits[0]
+    assert block.limits[block.events.limits_id[1]].linear_advance_k_s == 0.3
+    block, _ = read(
+        "M203 X18000 I60\nM566 X600 P1\nM205 X20\nM204 P900\nM205 X4\n", "reprapfirmware"
+    )
+    after = block.limits[block.events.limits_id[-1]]
+    assert (after.speed_x_mm_s, after.min_speed_mm_s, after.jerk_policy) == (300, 1, 1)
+    assert (after.jerk_x_mm_s, after.max_jerk_x_mm_s, after.print_accel_mm_s2) == (4, 10, 900)
+    assert block.limits[block.events.limits_id[2]].jerk_x_mm_s == 10
+
+
+@pytest.mark.parametrize("name", ["marlin", "reprapfirmware", "klipper"])
+def test_repeated_lines_do_the_same_again(name: str, read) -> None:
+    """The kernel remembers what a line did; the second time it goes the same way."""
+    text = "M204 P900 T800\n;TYPE:a\nG1 X{0} F600\nM204 P700 T600\n;TYPE:b\nG1 X{1}\n"
+    block, interpreter = read("".join(text.format(2 * k + 1, 2 * k + 2) for k in range(3)), name)
+    moves = block.moves
+    assert moves.feature.tolist() == [0, 1] * 3
+    assert [block.limits[k] for k in moves.limits_id[:2]] * 3 == [
+        block.limits[k] for k in moves.limits_id
+    ]
+    assert interpreter.feature_names == ["a", "b"]
+
+
+def test_dwells(read) -> None:
+    def dwell(text: str, name: str) -> list[float]:
+        return read(text, name)[0].events.dwell_s.tolist()
+
+    assert dwell("G4 P500\nG4 S2\nG4 S1 P5\nG4\n", "klipper") == [0.5, 0, 0.005, 0]
+    for name in ("marlin", "reprapfirmware"):
+        assert dwell("G4 P500\nG4 S2\nG4 S1 P5\nG4\n", name) == [0.5, 2, 1, 0]
+    block, _ = read("G4\n", "reprapfirmware")
+    assert block.events.kind[0] == EventKind.HARMLESS
+
+
+def test_tools(read) -> None:
+    block, _ = read("G1 X1 F600\nT1\nG1 X2\nT0\nG1 X3\n", "marlin")
+    assert block.moves.tool.tolist() == [0, 1, 0]
+    assert block.events.kind.tolist() == [EventKind.UNKNOWN] * 2
+    # The print before may have ended with another tool.
+    assert read("T0\nT0\n", "marlin")[0].events.kind.tolist() == [EventKind.UNKNOWN, EventKind.STOP]
+    parked = read("T0\nP0 S1 L2\nT0 S1\n", "prusa")[0].events.kind.tolist()
+    assert parked == [EventKind.UNKNOWN] * 3
+    assert read("T0\n", "reprapfirmware")[0].events.kind.tolist() == [EventKind.UNKNOWN]
+    assert read("T1000\nG1 X1 F60\n", "bambu")[0].moves.tool.tolist() == [0]
+
+
+CLASSES = {
+    "M593 F40": {"marlin": EventKind.SHAPER, "reprapfirmware": EventKind.SHAPER},
+    "M975 S1": {"bambu": EventKind.SHAPER, "marlin": EventKind.UNKNOWN},
+    "M624 AQAAAAAAAAA=": {"bambu": EventKind.OBJECT},
+    "M572 S0.03": {"prusa": EventKind.STOP},
+    "M74 W150": {"prusa": EventKind.SHAPER},
+    "M900 K0.05": {
+        "marlin": EventKind.STOP,
+        "prusa": EventKind.STOP,
+        "bambu": EventKind.STOP,
+        "klipper": EventKind.HARMLESS,
+    },
+    "M204.2 K0.5": {"bambu": EventKind.UNKNOWN},
+    "M900 K0": {"marlin": EventKind.HARMLESS},  # as it is already
+    "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
+    "M221 S90 T1": {"marlin": EventKind.HARMLESS},
+    "M7": {"marlin": EventKind.STOP},
+    "G28.5": {"marlin": EventKind.UNKNOWN},
+    "M1234": {
+        "marlin": EventKind.HARMLESS,
+        "bambu": EventKind.UNKNOWN,
+        "reprapfirmware": EventKind.UNKNOWN,  # sys/M1234.g may be there
+    },
+    "EXCLUDE_OBJECT_START NAME=a": {
+        "marlin": EventKind.HARMLESS,
+        "reprapfirmware": EventKind.HARMLESS,
+    },
+    **{
+        line: {"marlin": EventKind.UNKNOWN}
+        for line in (
+            "M23 other.gco",
+            "M26 S0",
+            "M111 S8",
+            "M306 T",
+            "M350 X16",
+            "M401",
+            "M402",
+            "M425 F1",
+            "M493 S1",
+            "M915",
+            "M1000",
+            "M102 S10",
+            "M217 Q",
+            "M28 log.gco",
+        )
+    },
+    **{
+        line: {"prusa": EventKind.UNKNOWN}
+        for line in ("P0 S1 L2 D0", "M958 X1", "M1959", "M1977", "M9150", "G65", "G426", "M970 X1")
+    },
+    **{line: {"marlin-stock": EventKind.UNKNOWN} for line in ("G20", "G18", "G54", "G5 X1", "G60")},
+    **{line: {"marlin-stock": EventKind.HARMLESS} for line in ("G17", "G80", "g1 X5")},
+    **{
+        line: {"reprapfirmware": EventKind.UNKNOWN}
+        for line in (
+            "T-1",
+            "T R1",
+            "M109 S200",
+            "M401",
+            "M569 P0 S0",
+            "M673",
+            "M24",
+            'M291 P"jog" X1',
+            "M376 H5",
+            "M582 T2",
+            "M957",
+            "G10 L1 P0 X1",
+            "M28 a.g",
+        )
+    },
+    **{
+        line: {"reprapfirmware": EventKind.STOP}
+        for line in ("M17", "M906 X800", "M913 X50", "G17", "M302 P1", "M92 X80")
+    },
+    "M107": {"reprapfirmware": EventKind.HARMLESS},
+    "M600": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.UNKNOWN},
+    "M500": {"marlin": EventKind.UNKNOWN, "reprapfirmware": EventKind.HARMLESS},
+    "G1 X5 H1": {"reprapfirmware": EventKind.UNKNOWN},
+    "M116": {"reprapfirmware": EventKind.STOP, "marlin": EventKind.HARMLESS},
+    "G92 E0": {"marlin": EventKind.MODE, "reprapfirmware": EventKind.MODE},
+    "G92 X5": {"marlin": EventKind.MODE, "reprapfirmware": EventKind.STOP},
+    "M117 G1 X5 ; text": dict.fromkeys(ALL, EventKind.HARMLESS),
+    "M106 S255 ; G1": dict.fromkeys(ALL, EventKind.HARMLESS),
+}
+
+
+@pytest.mark.parametrize("line", CLASSES)
+def test_classes(line: str, read) -> None:
+    for name, kind in CLASSES[line].items():
+        assert read(f"{line}\n", name)[0].events.kind.tolist() == [kind], name
+
+
+def test_meta_commands_are_barriers(read) -> None:
+    block, interpreter = read(
+        'G1 X1 F600\nif move.axes[0].homed\n  G1 X50\n  G91\n  M117 yes\necho "hi"\n'
+        "G1 X2\nG1 X{var.a}\nG28\nG1 X3\n",
+        "reprapfirmware",
+    )
+    assert block.moves.end_mm[:, 0].tolist() == [1, 2, 3]
+    assert block.moves.known.tolist() == [7, 0, 7]
+    assert block.events.kind.tolist() == [
+        EventKind.UNKNOWN,
+        EventKind.UNKNOWN,
+        EventKind.UNKNOWN,
+        EventKind.HARMLESS,
+        EventKind.HARMLESS,
+        EventKind.UNKNOWN,
+        EventKind.UNKNOWN,
+    ]
+    assert any("conditional" in text for text in interpreter.warnings)
+    assert any("expression" in text for text in interpreter.warnings)
+
+
+def test_hop(read) -> None:
+    block, _ = read("M83\nM207 S1 F1800 Z0.4\nG1 X1 Z1 F600\nG10\nG1 X2\nG11\nG1 X3 Z1\n", "marlin")
+    assert block.moves.end_mm[:, 2].tolist() == pytest.approx([1, 1, 1.4, 1.4, 1, 1, 1])
+    assert block.moves.end_mm[:, 3].tolist() == pytest.approx([0, -1, -1, -1, -1, 0, 0])
+    assert block.moves.speed_mm_s[1] == pytest.approx(30)
+
+
+def test_lines_in_inches_stay_as_they_are(read) -> None:
+    block, _ = read("G1 X1 F600\nG20\nG1 X1\nG21\nG1 X1\n", "marlin")
+    assert (block.moves.known & 8).tolist() == [0, 8, 0]

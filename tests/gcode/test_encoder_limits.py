@@ -1,0 +1,67 @@
+"""The encoder's view of single moves against the same rules on whole columns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gcode.firmware._encoding_kernels import round_ends
+from gcode.firmware.klipper._motion_kernels import move_limits
+
+FACTS = (20.0, 200.0, 100.0, 5000.0, 1.0)
+
+
+def test_limits_of_moves() -> None:
+    """klippy/toolhead.py and extruder.py, a column at a time."""
+    rng = np.random.default_rng(2)
+    n = 400
+    travel = rng.normal(0.0, 0.3, (n, 4)) * (rng.random((n, 4)) < [0.9, 0.9, 0.2, 0.7])
+    travel[::17, :3] = 0.0
+    travel[::17, 3] = rng.normal(0.0, 1.0, len(travel[::17]))
+    start = np.cumsum(travel, axis=0) - travel
+    limits = np.array([[500.0, 3e5, 500.0, 0.0], [80.0, 3000.0, 5.0, 0.5]])
+    which = rng.integers(0, 2, n).astype(np.int32)
+    length, accel, speed, junction = np.empty((4, n))
+    stops = np.empty(n, bool)
+    move_limits(start, start + travel, which, limits, FACTS, length, accel, speed, junction, stops)
+    z_speed, z_accel, e_speed, e_accel, e_corner = FACTS
+    travel = (start + travel) - start
+    path = np.linalg.norm(travel[:, :3], axis=1)
+    np.testing.assert_array_equal(stops, path == 0.0)
+    path = np.where(stops, np.abs(travel[:, 3]), path)
+    safe = np.where(path > 0.0, path, 1.0)
+    np.testing.assert_allclose(length, path, rtol=1e-12)
+    climb, ratio = np.abs(travel[:, 2]) / safe, travel[:, 3] / safe
+    alone = (travel[:, 0] == 0.0) & (travel[:, 1] == 0.0)
+    pull = np.where(alone | (ratio < 0.0), np.abs(ratio), 0.0)
+    with np.errstate(divide="ignore"):
+        most = np.minimum.reduce([limits[which, 1], z_accel / climb, e_accel / pull])
+        fastest = np.minimum.reduce([limits[which, 0], z_speed / climb, e_speed / pull])
+        by_filament = e_corner / np.abs(np.diff(ratio))
+    np.testing.assert_allclose(accel, most, rtol=1e-9)
+    np.testing.assert_allclose(speed, fastest, rtol=1e-9)
+    unit = travel[:, :3] / safe[:, None]
+    cosine = np.clip(np.sum(unit[1:] * unit[:-1], axis=1), -1.0, 1.0)
+    tangent = np.sqrt((1.0 + cosine) / np.maximum(1.0 - cosine, 1e-12))
+    reach = np.minimum(path[1:] * most[1:], path[:-1] * most[:-1])
+    half = np.sqrt(0.5 * (1.0 + cosine))
+    turn = np.sqrt((np.sqrt(2.0) - 1.0) * half / np.maximum(1.0 - half, 1e-12))
+    corner = turn * np.minimum(limits[which[1:], 2], limits[which[:-1], 2])
+    expected = np.minimum.reduce([by_filament, np.sqrt(0.5 * reach * tangent), corner])
+    assert junction[0] == 0.0
+    np.testing.assert_allclose(junction[1:], expected, rtol=1e-7)
+
+
+def test_ends_are_rounded_but_for_the_last_of_a_group() -> None:
+    rng = np.random.default_rng(3)
+    end_mm = rng.normal(0.0, 100.0, (4, 60))
+    group = np.repeat([0, 2, 3], [20, 1, 39])
+    grid = np.array([1000, 12500, 1000])
+    position = np.empty((60, 4), np.int64)
+    round_ends(end_mm, group, grid, 1e6, position)
+    units = np.round(1e6 * end_mm.T).astype(np.int64)
+    final = [19, 20, 59]
+    np.testing.assert_array_equal(position[final], units[final])
+    np.testing.assert_array_equal(position[:, 3], units[:, 3])
+    inner = np.delete(np.arange(60), final)
+    wanted = grid * np.round(units[inner, :3] / grid).astype(np.int64)
+    np.testing.assert_array_equal(position[inner, :3], wanted)

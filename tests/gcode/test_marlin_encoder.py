@@ -1,0 +1,258 @@
+"""Marlin's stream: vertices that it executes, rates that land on time, and its words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
+from gcode.firmware.marlin.encoder import STREAM_ACCEL_MM_S2, stream_limits
+from gcode.firmware.marlin.kit import MarlinKit
+from gcode.firmware.marlin.limits import initial_limits
+from gcode.firmware.marlin.voice import MarlinVoice
+from gcode.interpreter import Interpreter
+from models.firmware import Marlin
+from models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from tests.gcode.cutting import HEAD
+from tests.gcode.prints import polygon
+from tests.gcode.states import differences, tagged
+
+FIRMWARE = Marlin(
+    min_steps_per_segment=1,
+    steps_per_mm=PerAxis(x=160.0, y=160.0, z=400.0, e=400.0),
+    planner=MarlinPlanner(
+        max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
+        max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
+        accel_mm_s2=2000.0,
+        travel_accel_mm_s2=2000.0,
+        junction_deviation_mm=0.02,
+    ),
+)
+
+
+def with_firmware(firmware: Marlin = FIRMWARE) -> Machine:
+    return load_machine("ender3").model_copy(update={"firmware": firmware})
+
+
+# Vertices
+
+
+def thinned(x: list[int], end_s: list[float], **options: Any) -> list[bool]:
+    n = len(x)
+    steps = np.column_stack((x, np.zeros(n), np.zeros(n))).astype(np.int64)
+    given = {"least": 6, "rate": 1e6, "burst": 8.0, "corexy": False, **options}
+    keep = np.zeros(n, np.bool_)
+    begin, group = np.zeros((1, 3), np.int64), np.zeros(n, np.int64)
+    thin(steps, begin, np.array(end_s), np.zeros(1), group, *given.values(), keep)
+    return keep.tolist()
+
+
+def test_short_hops_wait_for_more_steps() -> None:
+    # 4 steps are too few; 8 from the start will do; of the end's 3 the vertex before goes.
+    assert thinned([4, 8, 20, 23], [0.001, 0.002, 0.003, 0.004]) == [False, True, False, True]
+    assert thinned([4, 8, 20, 23], [0.001, 0.002, 0.003, 0.004], least=1) == [True] * 4
+
+
+def test_no_more_segments_than_come_in() -> None:
+    # Two blocks in stock and a good 250 lines a second: the third waits until 5 ms, when
+    # .25 + 3 * .25 have come in; then one in four; the last is always kept.
+    times = [0.001 * k for k in range(1, 13)]
+    keep = thinned([10 * k for k in range(1, 13)], times, least=1, rate=250.1, burst=2.0)
+    assert np.flatnonzero(keep).tolist() == [0, 1, 4, 8, 11]
+
+
+def test_a_turn_straight_back_gets_a_step_to_the_side() -> None:
+    # Also across a vertex where nothing moves.
+    steps = np.array([[10, 0, 0], [10, 0, 0], [2, 0, 0], [-5, 0, 0]], np.int64)
+    wish = steps[:, :2] + np.array([0.0, -0.3])
+    bend_reversals(steps, np.zeros((1, 3), np.int64), np.zeros(4, np.int64), wish)
+    assert steps[:, 0].tolist() == [10, 10, 2, -5]
+    assert steps[2, 1] == -1
+    assert steps[3].tolist() == [-5, 0, 0]
+
+
+# Rates
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([80.0, 160.0]))
+@settings(max_examples=40, deadline=None)
+def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
+    rng = np.random.default_rng(seed)
+    n = 200
+    planned_s = rng.uniform(1e-3, 8e-3, n)
+    speed = 60.0 + 40.0 * np.sin(np.cumsum(rng.normal(0.0, 0.2, n)))
+    steps = np.maximum(np.round(speed * planned_s * per_mm), 1.0)
+    feedrate, predicted = np.zeros(n), np.zeros(n)
+    assign_rates(
+        np.ones(n, np.bool_),
+        steps,
+        steps / per_mm,
+        np.cumsum(planned_s),
+        planned_s,
+        np.full(n, 500.0),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        STREAM_ACCEL_MM_S2,
+        False,
+        False,
+        2e6,
+        0.0,
+        feedrate,
+        predicted,
+    )
+    late_s = np.cumsum(predicted)[5:] - np.cumsum(planned_s)[5:]
+    # A block may end early by the share of a step that the next one loses.
+    assert np.all(late_s < 1.5e-4)
+    assert np.all(late_s * speed[5:] * per_mm > -2.5)
+    rate = feedrate / 60.0 * per_mm
+    # The firmware rounds up: nothing that is written lies on a whole rate.
+    assert np.all(np.abs(rate - np.round(rate)) > 0.1)
+
+
+# Words
+
+
+def test_limits_of_a_stream() -> None:
+    own = initial_limits(FIRMWARE)
+    stream = stream_limits(own, 500.0)
+    assert stream.min_segment_time_us == 0.0
+    assert stream.retract_accel_mm_s2 == own.retract_accel_mm_s2
+    assert stream.linear_advance_k_s == own.linear_advance_k_s
+    lines = MarlinVoice(FIRMWARE).limits(stream).decode().splitlines()
+    assert lines == [
+        "M201 X300000 Y300000 Z20000 E300000",
+        "M203 X500 Y500 Z20 E200",
+        "M204 P300000 R500 T300000",
+        "M205 B0 S0 T0 J0.3",
+    ]
+    assert all(len(line) < 96 for line in lines)
+    classic = MarlinVoice(Marlin(junction="classic_jerk")).limits(stream).decode()
+    assert classic.splitlines()[3] == "M205 B0 S0 T0 X500 Y500 Z10 E100"
+
+
+def test_the_shaper_of_the_firmware() -> None:
+    shaper = MarlinShaper(freq_x_hz=40.0, freq_y_hz=35.5)
+    voice = MarlinVoice(Marlin(shaper=shaper))
+    assert voice.shaper_off == b"M593 F0\n"
+    assert voice.shaper_on == b"M593 X F40 D0.15\nM593 Y F35.5 D0.15\n"
+    for none in (Marlin(variant="2.0"), Marlin(shaper=MarlinShaper())):
+        assert (MarlinVoice(none).shaper_off, MarlinVoice(none).shaper_on) == (b"", b"")
+    # Nobody says whether there is one: off it goes, and the road warns.
+    unknown = MarlinVoice(Marlin())
+    assert (unknown.shaper_off, unknown.shaper_on) == (b"M593 F0\n", None)
+
+
+@pytest.mark.parametrize(
+    ("facts", "says"),
+    [
+        ({"variant": "bambu"}, "closed"),
+        ({"variant": "prusa"}, "HWLIMIT"),
+        ({"variant": "bugfix"}, "2.1.2"),
+        ({"board": "avr"}, "8-bit"),
+        ({"s_curve": True}, "S_CURVE"),
+        ({"min_steps_per_segment": 6}, "MIN_STEPS_PER_SEGMENT 1"),
+        ({"planner": MarlinPlanner(junction_deviation_mm=0.005)}, "M205 J takes 0.01 to 0.3 mm"),
+    ],
+)
+def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) -> None:
+    firmware = FIRMWARE.model_copy(update=facts)
+    refusal = MarlinKit(with_firmware(firmware), firmware).refusal
+    assert refusal is not None
+    assert says in refusal
+
+
+def test_a_stock_machine_can() -> None:
+    assert MarlinKit(with_firmware(), FIRMWARE).refusal is None
+
+
+# The road
+
+
+PRINT = HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2100\nG28 X\n"
+
+
+def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None:
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_text("M204 P1500 T1800\n" + PRINT)
+    firmware = FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)})
+    machine = with_firmware(firmware)
+    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
+    assert result.pieces > 0
+    assert result.put_back == []
+    text = target.read_bytes()
+    assert b"M205 B0" in text
+    interpreter = Interpreter(machine)
+    blocks = [*interpreter.push(text), *interpreter.flush()]
+    last = blocks[-1].limits[int(blocks[-1].events.limits_id[-1])].as_row()
+    assert last[8:11] == (1500.0, 500.0, 1800.0)
+    assert last[:8] == initial_limits(firmware).as_row()[:8]
+    assert last[15:17] == (0.02, 20_000.0)
+
+
+@pytest.mark.parametrize("stated", [True, None])
+def test_linear_advance_leaves_the_print_as_it_came(tmp_path: Path, stated: bool | None) -> None:
+    """Whether the machine says that it has it or only the file does."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_text("M900 K0.05\n" + PRINT)
+    facts = {"home_mm": (0.0, 0.0, 0.0), "linear_advance": stated}
+    machine = with_firmware(FIRMWARE.model_copy(update=facts))
+    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
+    assert len(result.put_back) == result.pieces > 0
+    assert all("M900 K0" in piece.reason for piece in result.put_back)
+    assert b"M205 B0" not in target.read_bytes()
+
+
+@pytest.mark.parametrize("mode", ["M82", "M83"])
+def test_far_from_zero_no_filament_is_lost(tmp_path: Path, mode: str) -> None:
+    """Marlin adds up E in single precision: nine metres out a stream would lose a percent."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    lines, e = [f"{mode}\nG92 E9000\nG1 X120 Y100 F6000"], 9000.0
+    for k, line in enumerate(polygon(24, 20) * 3):
+        place, _, fed = line.partition(" E")
+        e += float(fed.split()[0])
+        lines.append(f"{place} E{e:.5f} F3600" if mode == "M82" else line)
+        if k % 24 == 20:
+            back, on = (f"{e - 1:.5f}", f"{e:.5f}") if mode == "M82" else ("-1", "1")
+            lines += [f"G1 E{back} F2100", "G1 Z5.4 F600", "G1 Z5 F600", f"G1 E{on} F2100"]
+    original = tagged((HEAD + "\n".join(lines) + "\nM221 S90\nM400\nG1 X50 Y50 F6000\n").encode())
+    source.write_bytes(original)
+    machine = with_firmware(FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)}))
+    options = Options(method="shaper:mzv")
+    result = compensate_file(source, target, machine, options, cache_dir=tmp_path / "cache")
+    assert result.put_back == []
+    written = target.read_bytes()
+    assert differences(original, written, machine) == []
+    lost_mm, furthest_mm, reads_mm = in_single_precision(written)
+    assert abs(lost_mm) < 1e-4
+    assert furthest_mm < 30.0
+    assert reads_mm == pytest.approx(e, abs=2e-3)
+
+
+def in_single_precision(text: bytes) -> tuple[float, float, float]:
+    """What relative moves of a stream lose as floats add up, how far out, what E reads at last."""
+    at, relative, lost, furthest = np.float32(0.0), False, 0.0, 0.0
+    for line in text.decode().splitlines():
+        name, *words = line.split(";")[0].split() or [""]
+        relative = name == "M83" or (relative and name not in ("M82", "G90"))
+        for word in words:
+            if word[0] != "E" or name not in ("G1", "G92"):
+                continue
+            value = np.float32(word[1:])
+            if name == "G92" or not relative:
+                at = value
+                continue
+            if ";#" not in line:
+                furthest = max(furthest, abs(float(at)))
+                lost += float(np.float32(at + value)) - float(at) - float(word[1:])
+            at = np.float32(at + value)
+    return lost, furthest, float(at)

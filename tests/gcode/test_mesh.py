@@ -1,0 +1,119 @@
+"""A stream on a crooked bed: the firmware adds Z to every move, and Z's limits cap it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcode.firmware.encoding import UNITS_PER_MM, as_moves, limits_in_force
+from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
+from gcode.pieces import Piece
+from gcode.types import Phases
+from models.errors import ModelError
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.compensating import CompensatedPiece, PieceCompensator, deviation
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from tests.gcode.cutting import HEAD, pieces_of
+
+SLOPE = 0.005
+BODY = (
+    "G1 X90 Y60 E1 F9000\nG1 X20 Y20 E2\nG1 X21 Y60 E1\nG1 X90 Y21 E2\nG1 E-.8 F2100\n"
+    "G1 Z5.4 F600\nG1 X20 Y90 F12000\nG1 Z5 F600\nG1 E.8 F2100\nG1 X90 Y20 E3 F6000\n"
+    "G1 X20 Y20 E1\nG1 X20 Y90 E1\n"
+)
+
+
+SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
+
+
+def crooked(slope: float, kind: str = "klipper") -> Machine:
+    document = load_machine("ender3").model_dump(mode="json") | {"mesh_slope": slope}
+    if kind != "klipper":
+        document["firmware"] = json.loads((SECTIONS / f"{kind}.json").read_text())
+    return Machine.model_validate(document)
+
+
+def on_a_plane(machine: Machine, piece: Piece, made: CompensatedPiece, slope: float) -> Phases:
+    """Plan the written moves with Z = slope x added, as firmwares do behind the G-code."""
+    encoded = made.encoded
+    position = encoded.position / UNITS_PER_MM
+    points = np.vstack([encoded.begin / UNITS_PER_MM, position])
+    points[:, 2] += slope * points[:, 0]
+    ours = encoded.row < 0
+    own = np.where(ours, 1.0, piece.moves.speed_mm_s[encoded.row])
+    speed = np.where(ours, encoded.feedrate_mm_min / 60.0, own)
+    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits)
+    return plan_moves(as_moves(points[:-1], points[1:], speed, limits_id), limits, machine)
+
+
+def made_on(machine: Machine) -> tuple[Piece, CompensatedPiece]:
+    work = PieceCompensator(machine, Options())
+    piece = pieces_of(HEAD + BODY, machine)[1]
+    assert isinstance(piece, Piece)
+    work.compensator.reset(piece.moves.start_mm[0, :2])
+    return piece, work.compensate(piece)
+
+
+def seconds(phases: Phases) -> float:
+    return float(np.sum(phases.accel_s + phases.cruise_s + phases.decel_s))
+
+
+@pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])
+@pytest.mark.parametrize("slope", [SLOPE, -SLOPE, 0.4 * SLOPE])
+def test_a_tilted_plane_keeps_the_times(slope: float, kind: str) -> None:
+    machine = crooked(SLOPE, kind)
+    piece, made = made_on(machine)
+    level = made.encoded.phases
+    tilted = on_a_plane(machine, piece, made, slope)
+    # The way is longer by the square root of 1 + slope^2 where it climbs; no limit of Z binds.
+    longer = seconds(tilted) - seconds(level)
+    bound = 0.5 * slope**2 * seconds(level)
+    assert -1e-5 <= longer <= bound + 1e-5
+    late_mm = bound * float(np.max(level.cruise_mm_s))
+    assert deviation(made, tilted).max() <= deviation(made, level).max() + late_mm + 1e-3
+    np.testing.assert_allclose(tilted.direction[-1, :2], level.direction[-1, :2], atol=1e-4)
+
+
+def test_without_the_law_the_plane_costs_time() -> None:
+    level, crooked_machine = crooked(0.0), crooked(SLOPE)
+    piece, made = made_on(level)
+    unaware = seconds(on_a_plane(level, piece, made, SLOPE)) - seconds(made.encoded.phases)
+    piece, made = made_on(crooked_machine)
+    aware = seconds(on_a_plane(level, piece, made, SLOPE)) - seconds(made.encoded.phases)
+    assert unaware > 5.0 * abs(aware)
+
+
+def test_stream_limits_are_what_z_leaves() -> None:
+    machine = crooked(SLOPE)
+    planner = machine.firmware.planner
+    own = kit(machine).initial_limits()
+    stream = kit(machine).stream_limits(own)
+    assert stream.accel_mm_s2 == pytest.approx(planner.max_z_accel_mm_s2 / SLOPE)
+    assert stream.velocity_mm_s == min(
+        machine.command.velocity_mm_s, planner.max_z_velocity_mm_s / SLOPE
+    )
+
+
+def test_a_bed_too_crooked_for_z_is_refused(tmp_path) -> None:
+    machine = crooked(0.02)
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_text(HEAD + BODY)
+    with pytest.raises(ModelError, match=r"mesh_slope.*max_z_accel.*level the bed"):
+        compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+    assert not target.exists()
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_climbing_along_the_mesh_counts_as_climbing() -> None:
+    machine = crooked(SLOPE)
+    least = machine.firmware.planner.max_z_accel_mm_s2 / 30_000.0
+    travel = np.array([[10.0, 0.0, 9.9 * (least - SLOPE), 0.0], [10.0, 0.0, 9.9 * least, 0.0]])
+    assert kit(machine).too_steep(travel).tolist() == [False, True]
+    level = kit(machine.model_copy(update={"mesh_slope": 0.0}))
+    assert level.too_steep(travel).tolist() == [False, False]

@@ -1,0 +1,322 @@
+"""RepRapFirmware's encoder, read back with its planner, and its words with its interpreter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcode.errors import GcodeError
+from gcode.firmware.encoding import as_moves
+from gcode.firmware.planning import join_phases, plan_moves
+from gcode.firmware.registry import kit
+from gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
+from gcode.firmware.reprapfirmware.encoder import stream_limits
+from gcode.firmware.reprapfirmware.limits import RepRapLimits
+from gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from gcode.firmware.reprapfirmware.voice import RepRapVoice
+from gcode.interpreter import Interpreter
+from gcode.sampler import sample_phases
+from gcode.types import EventKind
+from models.firmware import RepRapFirmware
+from models.firmware.reprapfirmware import Drive, RepRapExtruder, RepRapShaper
+from models.machine import CommandLimits, Machine
+from models.store import load_machine
+from service.pipeline.compensating import CompensatedPiece, PieceCompensator, Unfit, deviation
+from service.pipeline.options import Options
+from service.pipeline.yardstick import BestShaper
+from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.test_encoder import BODIES
+
+ADVANCE_S = 0.04
+ADVANCED = "G1 X90 E2 F6000\nG1 X90 Y60 E1\nG1 X20 E3.5 F3000\nG1 Y20 E2\n"
+
+
+def firmware(steps_per_mm: float = 80.0, **changes: object) -> RepRapFirmware:
+    def drive(**given: float) -> Drive:
+        return Drive(
+            **{
+                "steps_per_mm": steps_per_mm,
+                "max_speed_mm_s": 500.0,
+                "max_accel_mm_s2": 5000.0,
+                "jerk_mm_s": 8.0,
+                **given,
+            }
+        )
+
+    return RepRapFirmware(
+        x=drive(),
+        y=drive(),
+        z=drive(steps_per_mm=800.0, max_speed_mm_s=20.0, max_accel_mm_s2=200.0, jerk_mm_s=1.0),
+        extruder=RepRapExtruder(max_accel_mm_s2=5000.0),
+        home_mm=(0.0, 0.0, 0.0),
+    ).model_copy(update=changes)
+
+
+def machine_of(
+    own: RepRapFirmware,
+    *,
+    advance_s: float = 0.0,
+    kinematics: Literal["cartesian", "corexy"] = "cartesian",
+) -> Machine:
+    changes = {"firmware": own, "pressure_advance_s": advance_s, "kinematics": kinematics}
+    return load_machine("ender3").model_copy(update=changes)
+
+
+def compensated(machine: Machine, body: str) -> CompensatedPiece:
+    piece = pieces_of(HEAD + body, machine)[1]
+    work = PieceCompensator(machine, Options(), BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0))
+    work.compensator.reset(piece.moves.start_mm[0, :2])
+    return work.compensate(piece)
+
+
+@pytest.mark.parametrize("name", sorted(BODIES))
+@pytest.mark.parametrize(
+    ("steps_per_mm", "kinematics"), [(80.0, "cartesian"), (160.0, "cartesian"), (160.0, "corexy")]
+)
+def test_executed_is_the_command(
+    name: str, steps_per_mm: float, kinematics: Literal["cartesian", "corexy"]
+) -> None:
+    made = compensated(machine_of(firmware(steps_per_mm), kinematics=kinematics), BODIES[name])
+    gap = deviation(made, made.encoded.phases)
+    step = 1.0 / steps_per_mm
+    tolerance = 1e-3 * Options().tolerance_um
+    # A low peak of speed that is cut off shifts what follows in time, by less than a step or so.
+    assert np.mean(gap[made.extruding] <= tolerance + 2.0 * step) > 0.98
+    assert np.max(gap[made.extruding]) <= 15e-3 + tolerance + step
+    np.testing.assert_allclose(
+        made.encoded.position[-1] * 1e-6, made.command_mm[:, -1], atol=2e-6 + step
+    )
+
+
+@pytest.mark.parametrize("kinematics", ["cartesian", "corexy"])
+def test_segments_end_on_whole_steps(kinematics: Literal["cartesian", "corexy"]) -> None:
+    machine = machine_of(firmware(), kinematics=kinematics)
+    made = compensated(machine, BODIES["corners"])
+    places = made.encoded.position[:-1, :3] * 1e-6
+    assert isinstance(machine.firmware, RepRapFirmware)
+    stands = on_steps(places, machine.firmware, kinematics)
+    assert np.max(np.abs(stands - places)) < 1e-6
+    # Nowhere so near to half a step that the firmware's single precision could round otherwise.
+    motors = places[:, 0] + places[:, 1] if kinematics == "corexy" else places[:, 0]
+    assert np.max(np.abs(80.0 * motors - np.rint(80.0 * motors))) < 0.01
+
+
+def test_filament_holds_the_advance_that_the_firmware_has_switched_off() -> None:
+    machine = machine_of(firmware(), advance_s=ADVANCE_S)
+    made = compensated(machine, ADVANCED)
+    plain = compensated(machine_of(firmware()), ADVANCED)
+    phases = made.encoded.phases
+    t = made.timeline.dt_s * np.arange(made.command_mm.shape[1])
+    executed, _ = sample_phases(phases, t)
+    planned = made.command_mm[3]
+    speed = np.gradient(planned, made.timeline.dt_s)
+    wanted = planned + ADVANCE_S * speed
+    # The advance reaches K v = .04 * 100 * .067 = .26 mm and is kept to some hundredths of that.
+    assert np.max(wanted - planned) > 0.1
+    assert np.sqrt(np.mean((executed[3] - wanted) ** 2)) < 5e-3
+    # It is given back: the file's own amount of filament is fed in all.
+    assert made.encoded.position[-1, 3] == plain.encoded.position[-1, 3]
+    # The plan itself minds the advance: 5 mm/s of the extruder at most / .04 s.
+    piece = pieces_of(HEAD + ADVANCED, machine)[1]
+    feeding = np.abs(piece.phases.direction[:, 3]) * piece.phases.accel_mm_s2
+    assert np.max(feeding) <= 5.0 / ADVANCE_S * 1.01
+
+
+def test_rests_run_under_the_files_own_limits() -> None:
+    """A retraction of .8 mm at 35 mm/s and 5000 mm/s2 takes .8 / 35 + 35 / 5000 s from rest."""
+    machine = machine_of(firmware())
+    piece = pieces_of(HEAD + BODIES["retraction"], machine)[1]
+    made = compensated(machine, BODIES["retraction"])
+    rows = np.flatnonzero(made.encoded.row >= 0)
+    phases = made.encoded.phases
+    lasts = (phases.accel_s + phases.cruise_s + phases.decel_s)[rows]
+    # Behind a rest the motion goes on with at most the stream's jerk of the extruder, 10 mm/s, so
+    # that up to 10 / 5000 s of its braking fall away.
+    longest = 0.8 / 35.0 + 35.0 / 5000.0
+    assert longest - 10.0 / 5000.0 <= lasts[0] <= longest + 1e-5
+    jerk = stream_limits(firmware(), CommandLimits()).jerk_e_mm_s
+    assert np.max(phases.end_mm_s[rows]) <= jerk + 1e-2
+    assert made.encoded.row[rows].tolist() == [
+        k for k, way in enumerate(piece.phases.direction) if not np.any(way[:3])
+    ]
+
+
+def test_a_queue_that_cannot_be_kept_filled_is_refused() -> None:
+    machine = machine_of(firmware(ring_length=6, prepare_least_s=0.2))
+    piece = pieces_of(HEAD + BODIES["corners"], machine)[1]
+    work = PieceCompensator(machine, Options(), BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0))
+    with pytest.raises(Unfit, match=r"M595 P|speed would step"):
+        work.compensate(piece)
+
+
+def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
+    # 7 moves must last 27 ms: none of them may be the 1 ms that a corner would like.
+    short = compensated(machine_of(firmware(ring_length=16)), BODIES["corners"])
+    phases = short.encoded.phases
+    total = np.cumsum(np.append(0.0, phases.accel_s + phases.cruise_s + phases.decel_s))
+    assert np.min(total[7:] - total[:-7]) >= 27e-3
+    long = compensated(machine_of(firmware(ring_length=100)), BODIES["corners"])
+    assert len(long.encoded.row) > len(short.encoded.row)
+    assert np.max(np.diff(phases.t_s) - np.diff(total)[:-1]) < 1e-9
+
+
+@pytest.mark.parametrize(("climb", "steep"), [(0.0, False), (0.9, False), (1.1, True)])
+def test_moves_that_climb_too_much_stay_as_they_are(climb: float, steep: bool) -> None:
+    machine = machine_of(firmware())
+    way = np.array([[8.0, 6.0, climb, 0.1]])
+    assert kit(machine).too_steep(way).tolist() == [steep]
+    # A bed mesh adds its slope: .05 of 10 mm is another .5 mm.
+    tilted = machine.model_copy(update={"mesh_slope": 0.05})
+    assert kit(tilted).too_steep(way).tolist() == [climb + 0.5 > 1.0]
+
+
+def test_words_set_the_limits_that_they_name() -> None:
+    own = replace(
+        RepRapLimits.of(firmware(), 0.0), jerk_x_mm_s=4.0, jerk_policy=1.0, min_speed_mm_s=0.3
+    )
+    voice = RepRapVoice(firmware(), ADVANCE_S)
+    for limits in (own, stream_limits(firmware(), CommandLimits())):
+        reader = Interpreter(machine_of(firmware(), advance_s=0.03))
+        blocks = [*reader.push(voice.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
+        row = blocks[0].limits[blocks[0].moves.limits_id[0]].as_row()
+        expected = replace(limits, pressure_advance_s=0.03).as_row()
+        assert row == pytest.approx(expected, abs=1e-6)
+
+
+def test_words_around_the_firmwares_own_shaper() -> None:
+    shaper = RepRapShaper(type="zvd", freq_hz=40.5, damping=0.12)
+    voice = RepRapVoice(firmware(shaper=shaper), ADVANCE_S)
+    assert voice.shaper_off == b'M593 P"none"\nM572 S0\n'
+    assert voice.shaper_on == b'M593 P"zvd" F40.5 S0.12\nM572 S0.04\n'
+    assert RepRapVoice(firmware(), 0.0).shaper_on == b'M593 P"none"\nM572 S0\n'
+    assert voice.acceleration(1500.0) == b"G1\nM201 X1500 Y1500\nM204 P1500 T1500\n"
+
+
+def test_limits_wait_until_the_move_before_them_is_planned() -> None:
+    """Behind a G1 without words, which is no move and stops none."""
+    voice, machine = RepRapVoice(firmware(), 0.0), machine_of(firmware())
+    raised = voice.limits(stream_limits(firmware(), CommandLimits()))
+    assert raised.startswith(b"G1\nM201 X")
+    blocks = Interpreter(machine).push(b"G1 X1 F600\n" + raised + b"G1 X2\n")
+    assert [len(block.moves) for block in blocks] == [2]
+    assert max(blocks[0].events.kind) < EventKind.STOP
+    assert blocks[0].moves.speed_mm_s.tolist() == [10.0, 10.0]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.02, 4.0), st.floats(1.5e-3, 0.03), st.sampled_from([0.0, 0.3, -1.0])),
+        min_size=1,
+        max_size=60,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_predicted_times_are_the_planners(steps: list[tuple[float, float, float]]) -> None:
+    """What the encoder predicts of a stream is what the firmware's own plan says."""
+    own = firmware(ring_length=1000)
+    limits = stream_limits(own, CommandLimits())
+    length, planned, turn = (np.array(column) for column in zip(*steps, strict=True))
+    # No faster than 200 mm/s, and not so slow that the least speed matters.
+    planned = np.clip(planned, length / 200.0, length / 2.0)
+    angle = np.cumsum(turn)
+    way = length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = np.zeros((len(length) + 1, 4))
+    places[1:, :2] = np.cumsum(way, axis=0)
+    unit = way / length[:, None]
+    bend = np.abs(np.diff(unit, axis=0)).max(axis=1, initial=0.0)
+    junction = np.append(0.0, limits.jerk_x_mm_s / np.maximum(bend, 1e-12))
+    share = np.abs(unit)
+    accel = np.minimum(
+        limits.travel_accel_mm_s2, limits.accel_x_mm_s2 / np.maximum(share.max(axis=1), 1e-9)
+    )
+    n = len(length)
+    feedrate, predicted = np.zeros(n), np.zeros(n)
+    assign_speeds(
+        np.ones(n, np.bool_),
+        length,
+        np.cumsum(planned),
+        planned,
+        np.full(n, 500.0),
+        accel,
+        junction,
+        np.zeros(n),
+        0.0,
+        10.0 / own.step_clock_hz,
+        feedrate,
+        predicted,
+    )
+    planner = RepRapPlanner(own, "cartesian")
+    moves = as_moves(places[:-1], places[1:], feedrate / 60.0, np.zeros(n, np.int32))
+    phases = join_phases([planner.push_moves(moves, [limits]), planner.flush()])
+    lasts = phases.accel_s + phases.cruise_s + phases.decel_s
+    # The stream is not braked for its end: the last moves are left out.
+    settled = np.flatnonzero(np.cumsum(length[::-1])[::-1] > 2.0)
+    assert np.max(np.abs(lasts - predicted)[settled], initial=0.0) < 5e-5
+
+
+@pytest.mark.parametrize("excess_mm_s", np.linspace(-1.0, 1.0, 41).round(3).tolist())
+def test_a_long_segment_a_little_faster_than_its_neighbours_is_in_time(excess_mm_s: float) -> None:
+    """10 clocks of 60 000 mm/s2 are .8 mm/s; .45 s of .4 mm/s too slow would be 180 um late."""
+    speed = np.array([36.0, 41.0, 39.2, 39.2 + excess_mm_s, 39.2, 34.0, 34.0, 34.0])
+    planned = np.array([5e-3, 5e-3, 8e-3, 0.45, 4e-3, 4e-3, 4e-3, 4e-3])
+    # A slanting move of a CoreXY machine accelerates less than one along X or Y.
+    accel = np.array([56e3, 56e3, 56e3, 60e3, 56e3, 56e3, 56e3, 56e3])
+    n = len(speed)
+    feedrate, predicted, length = np.zeros(n), np.zeros(n), speed * planned
+    assign_speeds(
+        np.ones(n, np.bool_),
+        length,
+        np.cumsum(planned),
+        planned,
+        np.full(n, 500.0),
+        accel,
+        np.full(n, 500.0),
+        np.zeros(n),
+        0.0,
+        10.0 / 750e3,
+        feedrate,
+        predicted,
+    )
+    late = np.cumsum(predicted)[:-1] - np.cumsum(planned)[:-1]
+    assert np.max(np.abs(late)) * 40.0 < 10e-3
+
+
+@given(st.lists(st.floats(1e-3, 5e-3), min_size=2, max_size=40), st.floats(1e-3, 4e-3))
+@settings(max_examples=40, deadline=None)
+def test_crowded_ends_are_kept_apart(lasts: list[float], least_s: float) -> None:
+    end_s = np.cumsum(lasts)
+    n = len(end_s)
+    final = np.zeros(n, np.bool_)
+    final[[n // 2, n - 1]] = True
+    begin_s = np.where(np.arange(n) <= n // 2, 0.0, end_s[n // 2])
+    keep = np.zeros(n, np.bool_)
+    keep_apart(end_s, np.ones(n, np.bool_), final, begin_s, least_s, keep)
+    assert np.all(keep[final])
+    kept = np.concatenate([[0.0], end_s[keep]])
+    short = np.diff(kept) < least_s - 1e-8
+    assert not np.any(short & ~final[keep])
+    # Nothing is dropped that is far enough from the one before.
+    last = 0.0
+    for k in range(n):
+        if k and final[k - 1]:
+            last = begin_s[k]
+        assert keep[k] == (final[k] or end_s[k] - last >= least_s - 1e-9)
+        last = end_s[k] if keep[k] else last
+
+
+def test_plan_moves_takes_the_kit() -> None:
+    machine = machine_of(firmware())
+    moves = as_moves(
+        np.zeros((1, 4)), np.array([[10.0, 0.0, 0.0, 0.0]]), np.array([50.0]), np.zeros(1, np.int32)
+    )
+    phases = plan_moves(moves, [kit(machine).initial_limits()], machine)
+    # 50 mm/s at 5000 mm/s2: 10 ms and .25 mm at both ends.
+    assert phases.cruise_s[0] == pytest.approx(9.5 / 50.0, abs=2e-6)
+    broken = replace(kit(machine).initial_limits(), accel_x_mm_s2=0.0)
+    with pytest.raises(GcodeError, match="above 0"):
+        plan_moves(moves, [broken], machine)

@@ -1,0 +1,43 @@
+"""One server for all tests here; and which slicers were not there, said loudly."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.integrations.running import Running
+from tests.integrations.slicers import NOT_HERE
+from tests.service.test_server import server
+
+_ODD_SERVER = Path(__file__).with_name("odd_server.py")
+
+
+@pytest.fixture(scope="session")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """The server with the pretended road, a process of its own."""
+    data = tmp_path_factory.mktemp("server")
+    with server([sys.executable, str(_ODD_SERVER)], data) as (client, _):
+        yield Running(client, data)
+
+
+@pytest.fixture
+def address(running: Running) -> str:
+    """Its address."""
+    return running.address
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    skipped = [
+        report
+        for report in terminalreporter.getreports("skipped")
+        if NOT_HERE in str(report.longrepr)
+    ]
+    if skipped:
+        terminalreporter.write_line(
+            f"NOT CHECKED: {len(skipped)} tests need a slicer (tests/integrations/get-slicers)",
+            yellow=True,
+            bold=True,
+        )

@@ -1,0 +1,76 @@
+"""The real server, with a pretended road and something odd before it: `odd_server.py DATA_DIR`.
+
+What is odd is told by the beginning of the path: /key wants the key "secret", with /short results
+break off, with /lost a part of the upload gets lost, /moved is somewhere else. All other paths are
+those of the real server.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+ODDITIES = ("key", "short", "lost", "moved")
+
+
+def odd(app):
+    async def application(scope, receive, send):
+        oddity, _, path = scope.get("path", "")[1:].partition("/")
+        if oddity not in ODDITIES:
+            await app(scope, receive, send)
+            return
+        scope = {**scope, "path": f"/{path}"}
+        given = dict(scope["headers"]).get(b"authorization")
+        if oddity == "key" and given != b"Bearer secret":
+            await answer(send, 401, {"detail": "This key is unknown here."})
+        elif oddity == "moved":
+            await answer(send, 308, {}, (b"location", b"http://elsewhere.invalid/"))
+        else:
+            await app(scope, receive, Changed(send, scope["path"], oddity))
+
+    return application
+
+
+class Changed:
+    def __init__(self, send, path, oddity):
+        self._send, self._path, self._oddity = send, path, oddity
+        self._start = None
+
+    async def __call__(self, message):
+        if self._oddity == "lost" and self._path == "/v1/jobs":
+            if message["type"] == "http.response.start":
+                self._start = message
+                return
+            body = json.loads(message["body"])
+            body["source_bytes"] -= 1
+            data = json.dumps(body).encode()
+            self._start["headers"] = [(b"content-length", str(len(data)).encode())]
+            await self._send(self._start)
+            message = {**message, "body": data}
+        if self._oddity == "short" and self._path.endswith("/result"):
+            if message["type"] == "http.response.body" and message.get("body"):
+                message = {**message, "body": message["body"][:-3], "more_body": False}
+            elif message["type"] == "http.response.body":
+                return
+        await self._send(message)
+
+
+async def answer(send, status, document, *headers):
+    data = json.dumps(document).encode()
+    length = (b"content-length", str(len(data)).encode())
+    await send({"type": "http.response.start", "status": status, "headers": [length, *headers]})
+    await send({"type": "http.response.body", "body": data})
+
+
+if __name__ == "__main__":
+    from unittest import mock
+
+    from service import server
+    from service.api import create_app
+    from service.settings import Settings
+    from tests.service.runners import pretend
+
+    def application(settings: Settings):
+        return odd(create_app(settings, runner=pretend))
+
+    with mock.patch.object(server, "create_app", application):
+        server.serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0)

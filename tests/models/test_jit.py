@@ -1,0 +1,90 @@
+"""Machine code that is kept on disk is never older than the sources it was made from."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from models import jit
+
+ROOT = Path(jit.__file__).parents[1]
+CALLER = """
+from models.jit import kernel
+from tools.inner import double
+from tools.numbers import OFFSET
+
+@kernel
+def outer(x: float) -> float:
+    return double(x) + OFFSET
+"""
+INNER = """
+from models.jit import kernel
+
+@kernel
+def double(x: float) -> float:
+    return FACTOR * x
+"""
+
+
+@pytest.fixture
+def tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "tools"
+    folder.mkdir()
+    (folder / "__init__.py").touch()
+    (folder / "caller.py").write_text(CALLER)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    # A change in the same second and of the same size leaves no other trace than its text.
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def load(factor: float, offset: float) -> ModuleType:
+        (folder / "inner.py").write_text(INNER.replace("FACTOR", f"{factor}"))
+        (folder / "numbers.py").write_text(f"OFFSET = {offset}\n")
+        for name in [name for name in sys.modules if name.split(".")[0] == "tools"]:
+            del sys.modules[name]
+        jit.source_digest.cache_clear()
+        jit._text_digest.cache_clear()
+        importlib.invalidate_caches()
+        return importlib.import_module("tools.caller")
+
+    yield load
+    for name in [name for name in sys.modules if name.split(".")[0] == "tools"]:
+        del sys.modules[name]
+
+
+def test_a_change_in_what_a_kernel_imports_is_noticed(tools) -> None:
+    assert tools(2.0, 1.0).outer(3.0) == 7.0
+    again = tools(2.0, 1.0)
+    assert again.outer(3.0) == 7.0
+    assert sum(again.outer.stats.cache_hits.values()) == 1
+    assert tools(5.0, 1.0).outer(3.0) == 16.0
+    assert tools(5.0, 2.0).outer(3.0) == 17.0
+
+
+def _kernel_modules() -> list[Path]:
+    names = ("models", "gcode", "compensation", "simulation", "service")
+    files = [file for name in names for file in (ROOT / name).rglob("*.py")]
+    return [file for file in files if "models.jit import" in file.read_text(encoding="utf-8")]
+
+
+def test_every_import_of_a_kernel_module_is_seen() -> None:
+    """The digest finds imports by their line alone: whole modules, at the start of a line."""
+    files = _kernel_modules()
+    assert len(files) > 20
+    for file in files:
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                modules = [node.module or ""]
+            elif isinstance(node, ast.Import):
+                modules = [alias.name for alias in node.names]
+            else:
+                continue
+            for module in modules:
+                assert not (ROOT / module.replace(".", "/")).is_dir(), (file, module)
+                if (ROOT / f"{module.replace('.', '/')}.py").is_file():
+                    assert module in jit._text_digest(file)[1], (file, module)
