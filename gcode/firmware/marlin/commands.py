@@ -1,8 +1,7 @@
 """Marlin's commands that Python carries out.
 
-Sources: Marlin/src/gcode: config/M200-M205.cpp (2.0.x, 2.1.x), config/M220.cpp, config/M221.cpp,
-geometry/G92.cpp (2.0.x, 2.1.x), feature/advance/M900.cpp (2.1.x); the others by Marlin's
-documentation, see docs/dialects.md.
+Sources: Marlin/src/gcode: config/M200-M205.cpp, config/M220.cpp, config/M221.cpp, geometry/G92.cpp,
+feature/advance/M900.cpp; which versions, and what was not read, stands in docs/dialects.md.
 """
 
 from __future__ import annotations
