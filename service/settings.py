@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.machines.settings import ENV_PREFIX, MachineSettings
@@ -15,33 +15,97 @@ __all__ = ["Settings", "is_loopback"]
 
 
 class Settings(MachineSettings, BaseSettings):
-    """Settings of one service.
+    """Settings of one process of the service.
+
+    One computer needs none of the first three: SQLite, a folder, and worker processes of its own.
+    With several, all three are elsewhere.
 
     Attributes
     ----------
     data_dir : Path
-        Database, uploads, results and machines; made on first use.
-    max_upload_bytes : int
-        A larger upload is refused with status 413.
+        Uploads on their way, and, unless they are elsewhere, database, results and machines.
+    database_url : str, optional
+        For instance ``postgresql+psycopg://user@host/stillpath``; by default SQLite in `data_dir`.
+    storage_url : str, optional
+        For instance ``s3://bucket/prefix``; by default a folder in `data_dir`.
+    scheduler : str, optional
+        Address of a Dask scheduler, for instance ``tcp://host:8786``; by default the service runs
+        workers of its own.
     workers : int
-        Worker processes; each handles one job at a time.
+        Processes of its own that do jobs; each handles one at a time.
     max_attempts : int
-        How often a job may be started before a dying worker fails it.
+        How often a job may lose its worker before it fails.
+    heartbeat_timeout_s : float
+        A worker that has been silent for so long is lost.
     cancel_grace_s : float
         How long a worker may take to obey a cancel before its process is ended.
-    allow_remote : bool
-        Serve other computers than this one. There are no keys yet: only behind something that
-        checks who is calling.
+    max_job_s, max_job_bytes : float, int
+        A job that takes longer, or whose process grows larger, fails.
+    max_upload_bytes : int
+        A larger upload is refused with status 413.
+    max_jobs_per_owner, max_bytes_per_owner : int
+        Jobs not yet over, and bytes of all jobs kept, that one owner may have.
+    requests_per_minute : int
+        Of one key, or of one address without a key; reading progress does not count.
+    keep_days : float
+        Jobs that are over are deleted after so long.
+    keys : bool, optional
+        Whether callers must show a key. By default they must unless the service is bound to
+        loopback.
+    first_key : str, optional
+        Made a key with all scopes at the first start, instead of a random one that is printed.
+    allowed_hosts : list of str
+        Names in the Host header that are answered besides those of this computer; ``*`` for all.
+    printers : Path, optional
+        TOML file of printers that results can be forwarded to.
+    webhook_targets : list of str
+        ``host`` or ``host:port`` that webhooks may be sent to.
+    webhook_secret : str, optional
+        Signs webhooks (HMAC-SHA256); without it there are none.
     """
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
     data_dir: Path = Path("stillpath-data")
-    max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30
+    database_url: str | None = None
+    storage_url: str | None = None
+    scheduler: str | None = None
     workers: Annotated[int, Field(ge=1, le=64)] = 1
     max_attempts: Annotated[int, Field(ge=1, le=10)] = 2
+    heartbeat_timeout_s: Annotated[float, Field(ge=2)] = 15.0
     cancel_grace_s: Annotated[float, Field(gt=0)] = 10.0
-    allow_remote: bool = False
+    max_job_s: Annotated[float, Field(gt=0)] = 4 * 3600.0
+    max_job_bytes: Annotated[int, Field(gt=0)] = 4 << 30
+    max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30
+    max_jobs_per_owner: Annotated[int, Field(ge=1)] = 1000
+    max_bytes_per_owner: Annotated[int, Field(gt=0)] = 100 << 30
+    requests_per_minute: Annotated[int, Field(ge=1)] = 1200
+    keep_days: Annotated[float, Field(gt=0)] = 30.0
+    keys: bool | None = None
+    first_key: SecretStr | None = None
+    allowed_hosts: list[str] = []
+    printers: Path | None = None
+    webhook_targets: list[str] = []
+    webhook_secret: SecretStr | None = None
+
+    @model_validator(mode="after")
+    def _together(self) -> Self:
+        """Refuse workers elsewhere that could not reach what lies here."""
+        if self.scheduler is not None:
+            missing = [
+                ENV_PREFIX + name.upper()
+                for name, url in (
+                    ("database_url", self.database_url),
+                    ("storage_url", self.storage_url),
+                )
+                if url is None or url.startswith(("sqlite", "file"))
+            ]
+            if missing:
+                raise ValueError(
+                    f"workers of the scheduler {self.scheduler} cannot reach this computer's files;"
+                    f" set {' and '.join(missing)} (PostgreSQL, S3) as well"
+                )
+        return self
 
 
 def is_loopback(host: str) -> bool:

@@ -1,0 +1,81 @@
+"""What the service asks of a storage of files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+__all__ = ["Stat", "Storage", "StorageError"]
+
+
+class StorageError(OSError):
+    """The storage does not answer, or refuses; trying again later may help."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stat:
+    """What is known of a file.
+
+    Attributes
+    ----------
+    key : str
+    size_bytes : int
+    modified_at : float
+        Seconds since the epoch.
+    """
+
+    key: str
+    size_bytes: int
+    modified_at: float
+
+
+class Storage(Protocol):
+    """Files by key, for instance ``jobs/ID/source/part.gcode``; a file is whole or not there.
+
+    Keys are made by the service, never by a caller: parts of letters, digits and what
+    `service.api.uploads.safe_name` lets through, joined by ``/``. Methods block; they are safe to
+    call from several threads. All raise `StorageError` where the storage does not answer.
+    """
+
+    def put(self, key: str, file: Path) -> None:
+        """Move a local file to `key`; it is durable when this returns.
+
+        `file` is gone afterwards. What lay at `key` is replaced at once.
+        """
+
+    def local(self, key: str) -> AbstractContextManager[Path]:
+        """Give a local file with the content of `key`, to be read only, for a `with` block.
+
+        Raises
+        ------
+        FileNotFoundError
+        """
+
+    def stat(self, key: str) -> Stat:
+        """Return what is known of a file.
+
+        Raises
+        ------
+        FileNotFoundError
+        """
+
+    def read(self, key: str, start: int, stop: int) -> Iterator[bytes]:
+        """Yield the bytes from `start` up to `stop` in chunks of at most 1 MiB.
+
+        Raises
+        ------
+        FileNotFoundError
+            At the first chunk.
+        """
+
+    def list(self, prefix: str) -> Iterator[Stat]:
+        """Yield the files whose key begins with `prefix`, which ends with ``/``."""
+
+    def delete(self, prefix: str) -> None:
+        """Delete the files, if any, whose key begins with `prefix`, which ends with ``/``."""
+
+    def check(self) -> None:
+        """Raise `StorageError` unless a file could be written now."""
