@@ -50,7 +50,7 @@ jobs = Table(
     Column("result_bytes", BigInteger),
     Column("result_sha256", String(64)),
     # The figures that lists show.
-    Column("summary", JSON),
+    Column("summary", JSON(none_as_null=True)),
     Column("state", String(16), nullable=False),
     Column("attempt", Integer, nullable=False, default=0),
     Column("losses", Integer, nullable=False, default=0),
@@ -58,7 +58,7 @@ jobs = Table(
     Column("stage", String(64), nullable=False),
     Column("progress", Float, nullable=False, default=0.0),
     Column("eta_s", Float),
-    Column("problem", JSON),
+    Column("problem", JSON(none_as_null=True)),
     Column("created_at", Float, nullable=False),
     Column("started_at", Float),
     Column("heartbeat_at", Float),
@@ -68,6 +68,7 @@ jobs = Table(
     Column("print_after", Boolean, nullable=False, default=False),
     Index("jobs_by_state", "state", "priority", "created_at"),
     Index("jobs_by_owner", "owner", "created_at"),
+    Index("jobs_by_age", "created_at"),
     Index("jobs_by_dedupe_key", "owner", "dedupe_key"),
 )
 """One row for each job that was accepted and not yet deleted."""
@@ -108,7 +109,7 @@ audit = Table(
     Column("remote", String(64)),
     Column("action", String(64), nullable=False),
     Column("subject", String(255)),
-    Column("details", JSON),
+    Column("details", JSON(none_as_null=True)),
 )
 """Who did what; rows are only ever added."""
 

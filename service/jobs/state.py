@@ -4,12 +4,15 @@
 
                 claimed                finished
     QUEUED ------------------> RUNNING ---------> DONE
-      ^                          |  |
-      |   lost, attempts left    |  |  failed, or lost once too often
-      +--------------------------+  +-------------------------------> FAILED
+     | ^                       | |  |
+     | |  lost, attempts left  | |  |  failed, or lost once too often
+     | +-----------------------+ |  +-------------------------------> FAILED
+     |                           |
+     +---------------------------+----------------------------------> CANCELLED
+                  cancelled
 
 A job may be deleted in every state. `attempt` is a fence: what a worker reports counts only for
-the attempt it was given.
+the attempt it was given, and only while that runs. That is also how a worker learns of a cancel.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from enum import StrEnum
 from typing import Any
 
 __all__ = [
+    "Cancelled",
     "Claimed",
     "Event",
     "Failed",
@@ -39,52 +43,93 @@ class JobState(StrEnum):
     RUNNING = "running"
     DONE = "done"
     FAILED = "failed"
+    CANCELLED = "cancelled"
 
     @property
     def is_final(self) -> bool:
         """Whether nothing more will happen."""
-        return self in (JobState.DONE, JobState.FAILED)
+        return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """One job as the store remembers it.
+    """One job as the store remembers it; the fields are the columns of the table `jobs`.
 
     Attributes
     ----------
     id : str
-    machine : str
-        Name of a machine; the document it stood for is kept in the job's folder.
+    owner : str
+        Whose job it is.
+    batch : str or None
+        What several jobs have in common, chosen by their owner.
+    machine, machine_revision : str
+        Name of a machine, and which state of it; the document is kept with the job's files.
     options : dict
         The fields of `service.pipeline.options.Options`.
+    dedupe_key : str
+        Equal for jobs that must have the same result: of input, machine, options and version.
+    priority : int
+        Higher ones go first.
     source_name, result_name : str
-        File names in the job's folder.
+        File names.
+    source_bytes, source_sha256 : int, str
+        Of the upload.
+    output : str or None
+        Prefix in the storage under which result and report lie; None until they do.
+    output_bytes, result_bytes, result_sha256 : int, int, str or None
+        Of everything under `output`, and of the result alone.
+    summary : dict or None
+        The figures that lists show.
     attempt : int
         How often the job was started; it only grows, so it is the fence for reports.
     losses : int
         How often its worker died with it.
+    worker : str or None
+        Who runs it, or ran it last.
+    stage, progress, eta_s : str, float, float or None
+        What the worker does, how much of the job is done (0 to 1), and how long it will take.
     problem : dict or None
         Why the job failed, as a problem document (RFC 9457).
-    created_at, started_at, finished_at : float or None
-        Seconds since the epoch.
+    created_at, started_at, heartbeat_at, finished_at : float or None
+        Seconds since the epoch. `heartbeat_at`: when the worker was last heard of.
+    webhook : str or None
+        Address that is told when the job is over.
+    printer, print_after : str or None, bool
+        Printer that the result is uploaded to, and whether it then starts to print.
     """
 
     id: str
+    owner: str
     machine: str
+    machine_revision: str
     options: dict[str, Any]
+    dedupe_key: str
     source_name: str
-    result_name: str
     source_bytes: int
+    source_sha256: str
+    result_name: str
     created_at: float
+    batch: str | None = None
+    priority: int = 0
+    output: str | None = None
+    output_bytes: int | None = None
+    result_bytes: int | None = None
+    result_sha256: str | None = None
+    summary: dict[str, Any] | None = None
     state: JobState = JobState.QUEUED
     attempt: int = 0
     losses: int = 0
+    worker: str | None = None
     stage: str = "waiting"
     progress: float = 0.0
     eta_s: float | None = None
     problem: dict[str, Any] | None = None
     started_at: float | None = None
+    heartbeat_at: float | None = None
     finished_at: float | None = None
+    webhook: str | None = None
+    printer: str | None = None
+    print_after: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +137,15 @@ class Claimed:
     """A worker takes the job."""
 
     at: float
+    worker: str
 
 
 @dataclass(frozen=True, slots=True)
 class Progressed:
-    """The worker says how far it is."""
+    """The worker says that it lives and how far it is."""
 
     attempt: int
+    at: float
     stage: str
     fraction: float
     eta_s: float | None
@@ -110,11 +157,16 @@ class Finished:
 
     attempt: int
     at: float
+    output: str
+    output_bytes: int
+    result_bytes: int
+    result_sha256: str
+    summary: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The input cannot be processed, or the road broke."""
+    """The input cannot be processed, a limit was reached, or the road broke."""
 
     attempt: int
     at: float
@@ -135,7 +187,14 @@ class Lost:
     blame: bool = True
 
 
-Event = Claimed | Progressed | Finished | Failed | Lost
+@dataclass(frozen=True, slots=True)
+class Cancelled:
+    """Somebody wants the job no more, whichever attempt it is in."""
+
+    at: float
+
+
+Event = Claimed | Progressed | Finished | Failed | Lost | Cancelled
 
 
 class Stale(Exception):
@@ -157,26 +216,39 @@ def advance(job: Job, event: Event) -> Job:
             job,
             state=JobState.RUNNING,
             attempt=job.attempt + 1,
+            worker=event.worker,
             stage="starting",
             progress=0.0,
             eta_s=None,
             started_at=event.at,
+            heartbeat_at=event.at,
         )
+    if isinstance(event, Cancelled):
+        if job.state.is_final:
+            raise Stale(f"job {job.id} is {job.state} already")
+        return _over(job, JobState.CANCELLED, event.at)
     if job.state is not JobState.RUNNING or job.attempt != event.attempt:
         raise Stale(f"job {job.id} is {job.state} in attempt {job.attempt}")
     match event:
         case Progressed():
             # Progress never runs backwards, whatever the stages think.
-            fraction = min(max(event.fraction, job.progress), 1.0)
-            return replace(job, stage=event.stage, progress=fraction, eta_s=event.eta_s)
-        case Finished():
+            fraction = max(min(event.fraction, 1.0), job.progress)
             return replace(
                 job,
-                state=JobState.DONE,
-                stage="done",
+                stage=event.stage,
+                progress=fraction,
+                eta_s=event.eta_s,
+                heartbeat_at=event.at,
+            )
+        case Finished():
+            return replace(
+                _over(job, JobState.DONE, event.at),
                 progress=1.0,
-                eta_s=None,
-                finished_at=event.at,
+                output=event.output,
+                output_bytes=event.output_bytes,
+                result_bytes=event.result_bytes,
+                result_sha256=event.result_sha256,
+                summary=event.summary,
             )
         case Failed():
             return _failed(job, event.problem, event.at)
@@ -191,14 +263,22 @@ def advance(job: Job, event: Event) -> Job:
 
 def _waiting(job: Job) -> Job:
     return replace(
-        job, state=JobState.QUEUED, stage="waiting", progress=0.0, eta_s=None, started_at=None
+        job,
+        state=JobState.QUEUED,
+        stage="waiting",
+        progress=0.0,
+        eta_s=None,
+        started_at=None,
+        heartbeat_at=None,
     )
+
+
+def _over(job: Job, state: JobState, at: float) -> Job:
+    return replace(job, state=state, stage=state.value, eta_s=None, finished_at=at)
 
 
 def _failed(job: Job, problem: dict[str, Any], at: float) -> Job:
-    return replace(
-        job, state=JobState.FAILED, stage="failed", eta_s=None, problem=problem, finished_at=at
-    )
+    return replace(_over(job, JobState.FAILED, at), problem=problem)
 
 
 def _lost_problem(job: Job, event: Lost) -> dict[str, Any]:

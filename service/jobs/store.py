@@ -1,228 +1,507 @@
-"""What the service remembers: jobs in SQLite, files in one folder per job."""
+"""The record of jobs, in SQLite or PostgreSQL. Files lie elsewhere (`service.storage`).
+
+Every change of a job goes through `service.jobs.state.advance` in one transaction; only `beat`,
+which every worker sends twice a second, is a single statement of the same meaning.
+"""
 
 from __future__ import annotations
 
+import base64
 import json
-import shutil
-import sqlite3
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, fields
-from pathlib import Path
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from sqlalchemy import (
+    Connection,
+    CursorResult,
+    Engine,
+    Row,
+    Select,
+    Subquery,
+    and_,
+    case,
+    delete,
+    func,
+    or_,
+    select,
+    text,
+    tuple_,
+    update,
+)
+
+from service.database import tables
+from service.database.engine import insert, reading, writing
 from service.jobs.state import Claimed, Event, Job, JobState, Stale, advance
 
-__all__ = ["JobFiles", "JobStore"]
+__all__ = ["BadCursor", "IdempotencyConflict", "JobStore", "Page", "Quota", "QuotaExceeded"]
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS jobs (
-    id           TEXT PRIMARY KEY,
-    machine      TEXT NOT NULL,
-    options      TEXT NOT NULL,
-    source_name  TEXT NOT NULL,
-    result_name  TEXT NOT NULL,
-    source_bytes INTEGER NOT NULL,
-    created_at   REAL NOT NULL,
-    state        TEXT NOT NULL,
-    attempt      INTEGER NOT NULL,
-    losses       INTEGER NOT NULL,
-    stage        TEXT NOT NULL,
-    progress     REAL NOT NULL,
-    eta_s        REAL,
-    problem      TEXT,
-    started_at   REAL,
-    finished_at  REAL
-);
-CREATE INDEX IF NOT EXISTS jobs_by_state ON jobs (state, created_at);
-"""
-_SCHEMA_VERSION = 1
-_COLUMNS = tuple(field.name for field in fields(Job))
-_AS_JSON = ("options", "problem")
+_JOBS = tables.jobs.c
+_FIELDS = tuple(field.name for field in fields(Job))
+_NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
+_OVER = tuple(state.value for state in JobState if state.is_final)
 
 
-class JobFiles:
-    """Where the files of one job lie.
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """What one owner may have: jobs that are not over, and bytes of all jobs that are kept."""
 
-    Parameters
-    ----------
-    root : Path
-        Folder of all jobs.
-    job_id : str
-    """
+    max_jobs: int
+    max_bytes: int
 
-    def __init__(self, root: Path, job_id: str) -> None:
-        self.folder = root / job_id
 
-    def source(self, name: str) -> Path:
-        """Return the place of the uploaded file."""
-        return self.folder / "source" / name
+class QuotaExceeded(Exception):
+    """The owner has too much already."""
 
-    @property
-    def machine(self) -> Path:
-        """Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`)."""
-        return self.folder / "machine.json"
 
-    def result(self, name: str) -> Path:
-        """Return the place of the written file."""
-        return self.folder / "result" / name
+class IdempotencyConflict(Exception):
+    """The idempotency key was used before, with another request."""
 
-    @property
-    def report(self) -> Path:
-        """Folder of report.html and report.json."""
-        return self.folder / "report"
+
+class BadCursor(ValueError):
+    """The cursor is not one that a page gave."""
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """Some jobs of a list, newest first, and where the next ones begin (None: the list ends)."""
+
+    jobs: list[Job]
+    next_cursor: str | None
 
 
 class JobStore:
-    """Jobs on disk; safe to use from several threads of one process.
-
-    Every change of a job goes through `service.jobs.state.advance` inside one transaction.
+    """The jobs in a database; safe to use from several threads, processes and computers.
 
     Parameters
     ----------
-    data_dir : Path
-        Made if it does not exist.
+    engine : sqlalchemy.Engine
+        From `service.database.engine.open_database`; whoever opened it closes it.
 
-    Raises
-    ------
-    sqlite3.DatabaseError
-        If the database cannot be opened or is of another version.
+    Notes
+    -----
+    Every method raises `service.database.engine.DatabaseAway` if the database does not answer.
     """
 
-    def __init__(self, data_dir: Path) -> None:
-        self.jobs_dir = data_dir / "jobs"
-        self.incoming_dir = data_dir / "incoming"
-        self.cache_dir = data_dir / "cache"
-        for folder in (self.jobs_dir, self.incoming_dir, self.cache_dir):
-            folder.mkdir(parents=True, exist_ok=True)
-        self._lock = threading.RLock()
-        self._connection = sqlite3.connect(
-            data_dir / "jobs.sqlite3", isolation_level=None, check_same_thread=False, timeout=30.0
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+
+    # Submitting
+
+    def add(
+        self,
+        job: Job,
+        *,
+        idempotency: tuple[str, str] | None = None,
+        limits: Quota | None = None,
+    ) -> Job:
+        """Remember a new job, whose input must be stored already.
+
+        Parameters
+        ----------
+        job : Job
+        idempotency : (key, fingerprint), optional
+            The caller's key, and a digest of the request that came with it.
+        limits : Quota, optional
+
+        Returns
+        -------
+        Job
+            `job`, or the one that the same request led to before.
+
+        Raises
+        ------
+        IdempotencyConflict
+            If the key is known with another fingerprint.
+        QuotaExceeded
+        """
+        with writing(self.engine) as connection:
+            if idempotency is not None:
+                earlier = _earlier(connection, job, *idempotency)
+                if earlier is not None:
+                    return earlier
+            if limits is not None:
+                _check_quota(connection, job, limits)
+            connection.execute(tables.jobs.insert().values(_to_row(job)))
+        return job
+
+    def submitted(self, owner: str, idempotency_key: str) -> tuple[str, Job | None] | None:
+        """Return the fingerprint that came with a key, and its job unless that was deleted."""
+        with reading(self.engine) as connection:
+            row = connection.execute(_submission(owner, idempotency_key)).one_or_none()
+            return row and (row.fingerprint, _get(connection, row.job_id))
+
+    def find_same(self, owner: str, dedupe_key: str) -> Job | None:
+        """Return the owner's newest job of a dedupe key: one that is done, else under way."""
+        order = case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state)
+        query = (
+            select(tables.jobs)
+            .where(_JOBS.owner == owner, _JOBS.dedupe_key == dedupe_key)
+            .where(_JOBS.state.in_(("done", *_NOT_OVER)))
+            .order_by(order, _JOBS.created_at.desc(), _JOBS.id.desc())
+            .limit(1)
         )
-        self._connection.row_factory = sqlite3.Row
-        self._connection.execute("PRAGMA journal_mode = WAL")
-        self._connection.execute("PRAGMA synchronous = FULL")
-        self._migrate()
+        return next(iter(self._jobs(query)), None)
 
-    def close(self) -> None:
-        """Close the database."""
-        with self._lock:
-            self._connection.close()
+    # Looking
 
-    def files(self, job_id: str) -> JobFiles:
-        """Return where the files of a job lie."""
-        return JobFiles(self.jobs_dir, job_id)
+    def get(self, job_id: str, owner: str | None = None) -> Job | None:
+        """Return a job, of this owner if one is given, or None."""
+        with reading(self.engine) as connection:
+            job = _get(connection, job_id)
+        return job if job is not None and owner in (None, job.owner) else None
 
-    def add(self, job: Job) -> None:
-        """Remember a new job; its input must already be stored."""
-        row = _to_row(job)
-        names, marks = ", ".join(row), ", ".join("?" * len(row))
-        with self._transaction() as connection:
-            connection.execute(f"INSERT INTO jobs ({names}) VALUES ({marks})", tuple(row.values()))
+    def many(self, ids: Iterable[str]) -> dict[str, Job]:
+        """Return those of the jobs that exist, by id."""
+        found = self._jobs(select(tables.jobs).where(_JOBS.id.in_(list(ids))))
+        return {job.id: job for job in found}
 
-    def get(self, job_id: str) -> Job | None:
-        """Return a job, or None."""
-        with self._lock:
-            row = self._connection.execute("SELECT * FROM jobs WHERE id = ?", (job_id,)).fetchone()
-        return None if row is None else _from_row(row)
+    def page(
+        self,
+        owner: str | None,
+        *,
+        states: Collection[JobState] = (),
+        batch: str | None = None,
+        limit: int,
+        cursor: str | None = None,
+    ) -> Page:
+        """Return jobs, newest first.
+
+        Parameters
+        ----------
+        owner : str or None
+            None: everybody's.
+        states, batch
+            Which jobs; by default all.
+        limit : int
+            How many at most.
+        cursor : str, optional
+            `next_cursor` of the page before. Jobs that were added since do not shift the pages.
+
+        Raises
+        ------
+        BadCursor
+        """
+        query = select(tables.jobs).order_by(_JOBS.created_at.desc(), _JOBS.id.desc())
+        if owner is not None:
+            query = query.where(_JOBS.owner == owner)
+        if states:
+            query = query.where(_JOBS.state.in_([state.value for state in states]))
+        if batch is not None:
+            query = query.where(_JOBS.batch == batch)
+        if cursor is not None:
+            query = query.where(tuple_(_JOBS.created_at, _JOBS.id) < tuple_(*_from_cursor(cursor)))
+        found = self._jobs(query.limit(limit + 1))
+        more = len(found) > limit
+        return Page(found[:limit], _to_cursor(found[limit - 1]) if more else None)
 
     def in_state(self, state: JobState) -> list[Job]:
         """Return all jobs in a state, oldest first."""
-        with self._lock:
-            rows = self._connection.execute(
-                "SELECT * FROM jobs WHERE state = ? ORDER BY created_at, id", (state.value,)
-            ).fetchall()
-        return [_from_row(row) for row in rows]
+        query = select(tables.jobs).where(_JOBS.state == state.value)
+        return self._jobs(query.order_by(_JOBS.created_at, _JOBS.id))
+
+    def counts(self) -> dict[JobState, int]:
+        """Return how many jobs are in each state."""
+        with reading(self.engine) as connection:
+            rows = connection.execute(select(_JOBS.state, func.count()).group_by(_JOBS.state)).all()
+        return dict.fromkeys(JobState, 0) | {JobState(state): count for state, count in rows}
+
+    def oldest_queued_at(self) -> float | None:
+        """Return when the job was submitted that has been waiting for the longest time."""
+        with reading(self.engine) as connection:
+            return connection.execute(
+                select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
+            ).scalar()
+
+    def usage(self, owner: str) -> tuple[int, int]:
+        """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
+        with reading(self.engine) as connection:
+            return _usage(connection, owner)
+
+    # The queue
+
+    def next_queued(self, limit: int, *, exclude: Collection[str] = ()) -> list[Job]:
+        """Return waiting jobs in the order in which they are to be started.
+
+        Higher priority first; then owners take turns, where a job that runs was its owner's turn;
+        then the older first. Jobs to `exclude` take their owners' turns but are not returned.
+        """
+        queue = _queue()
+        query = (
+            select(tables.jobs)
+            .join(queue, queue.c.id == _JOBS.id)
+            .where(_JOBS.id.not_in(list(exclude)))
+            .order_by(queue.c.place)
+            .limit(limit)
+        )
+        return self._jobs(query)
 
     def queue_position(self, job: Job) -> int:
-        """Return how many jobs will be started before this one."""
-        with self._lock:
-            (count,) = self._connection.execute(
-                "SELECT COUNT(*) FROM jobs WHERE state = ? AND (created_at, id) < (?, ?)",
-                (JobState.QUEUED.value, job.created_at, job.id),
-            ).fetchone()
-        return int(count)
+        """Return how many jobs will be started before this one; 0 if it does not wait."""
+        queue = _queue()
+        with reading(self.engine) as connection:
+            place = connection.execute(select(queue.c.place).where(queue.c.id == job.id)).scalar()
+        return int(place or 1) - 1
+
+    def queue_positions(self) -> dict[str, int]:
+        """Return the `queue_position` of every waiting job, by id."""
+        queue = _queue()
+        with reading(self.engine) as connection:
+            rows = connection.execute(select(queue.c.id, queue.c.place)).all()
+        return {job_id: place - 1 for job_id, place in rows}
+
+    # Changing
 
     def apply(self, job_id: str, event: Event) -> Job | None:
-        """Let `event` happen to a job; return the new job, or None if it is too late for it."""
-        with self._transaction() as connection:
-            job = self.get(job_id)
+        """Let `event` happen to a job.
+
+        The transaction that ends a job also notes down who is to be told of it.
+
+        Returns
+        -------
+        Job or None
+            The job afterwards; None if the job is gone, or it is too late for the event.
+        """
+        with writing(self.engine) as connection:
+            job = _get(connection, job_id, for_update=True)
             if job is None:
                 return None
             try:
-                job = advance(job, event)
+                after = advance(job, event)
             except Stale:
                 return None
-            row = _to_row(job)
-            row.pop("id")
-            places = ", ".join(f"{name} = ?" for name in row)
-            connection.execute(f"UPDATE jobs SET {places} WHERE id = ?", (*row.values(), job_id))
-        return job
+            before, row = _to_row(job), _to_row(after)
+            changed = {name: value for name, value in row.items() if value != before[name]}
+            connection.execute(update(tables.jobs).where(_JOBS.id == job_id).values(changed))
+            if after.state.is_final:
+                _note_deliveries(connection, after)
+        return after
 
-    def claim(self, at: float) -> Job | None:
-        """Start the oldest waiting job, or return None."""
-        with self._transaction():
-            waiting = self.in_state(JobState.QUEUED)
-            return self.apply(waiting[0].id, Claimed(at)) if waiting else None
+    def claim(self, job_id: str, at: float, worker: str) -> Job | None:
+        """Start a job unless it no longer waits; of several callers one gets it."""
+        return self.apply(job_id, Claimed(at, worker))
+
+    def beat(
+        self,
+        job_id: str,
+        attempt: int,
+        at: float,
+        stage: str,
+        fraction: float,
+        eta_s: float | None,
+    ) -> bool:
+        """Say that a worker lives and how far it is; False: it has lost the job and must stop.
+
+        The same as `apply` with `Progressed`, in one statement.
+        """
+        fraction = min(fraction, 1.0)
+        statement = (
+            update(tables.jobs)
+            .where(_JOBS.id == job_id, _JOBS.state == "running", _JOBS.attempt == attempt)
+            .values(
+                stage=stage,
+                progress=case((_JOBS.progress < fraction, fraction), else_=_JOBS.progress),
+                eta_s=eta_s,
+                heartbeat_at=at,
+            )
+        )
+        return self._count(statement) > 0
+
+    def silent(self, before: float) -> list[Job]:
+        """Return the running jobs whose worker was last heard of before a time."""
+        heard = func.coalesce(_JOBS.heartbeat_at, _JOBS.started_at, 0.0)
+        return self._jobs(select(tables.jobs).where(_JOBS.state == "running", heard < before))
+
+    # Deleting
 
     def forget(self, job_id: str) -> bool:
-        """Drop a job; its files go with `sweep`. Return whether it existed."""
-        with self._transaction() as connection:
-            return connection.execute("DELETE FROM jobs WHERE id = ?", (job_id,)).rowcount > 0
+        """Drop a job in whatever state. Return whether it existed.
 
-    def remove_files(self, job_id: str) -> None:
-        """Delete what a forgotten job left on disk."""
-        shutil.rmtree(self.files(job_id).folder, ignore_errors=True)
-
-    def sweep(self) -> None:
-        """Delete the files that belong to no job: broken uploads, forgotten jobs.
-
-        Only at the start of the service, while nothing is being uploaded.
+        If it runs, its worker's next report fails; its files go with the sweep.
         """
-        for leftover in self.incoming_dir.iterdir():
-            leftover.unlink(missing_ok=True)
-        for folder in self.jobs_dir.iterdir():
-            if self.get(folder.name) is None:
-                shutil.rmtree(folder, ignore_errors=True)
+        return self._count(delete(tables.jobs).where(_JOBS.id == job_id)) > 0
 
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock:
-            if self._connection.in_transaction:  # nested: the outer one commits
-                yield self._connection
-                return
-            self._connection.execute("BEGIN IMMEDIATE")
-            try:
-                yield self._connection
-            except BaseException:
-                self._connection.execute("ROLLBACK")
-                raise
-            self._connection.execute("COMMIT")
+    def forget_submissions(self, before: float) -> int:
+        """Drop the idempotency keys that came before a time; return how many."""
+        return self._count(
+            delete(tables.submissions).where(tables.submissions.c.created_at < before)
+        )
 
-    def _migrate(self) -> None:
-        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
-        if version not in (0, _SCHEMA_VERSION):
-            self._connection.close()
-            raise sqlite3.DatabaseError(
-                f"the job database has schema {version}, this version reads {_SCHEMA_VERSION}; "
-                "use another data directory or the version that wrote it"
+    def expired(self, before: float) -> list[Job]:
+        """Return the jobs that were over before a time, oldest first."""
+        query = select(tables.jobs).where(_JOBS.state.in_(_OVER), _JOBS.finished_at < before)
+        return self._jobs(query.order_by(_JOBS.finished_at))
+
+    # Leases
+
+    def lease(self, name: str, holder: str, seconds: float, now: float) -> bool:
+        """Take or renew the right to do what only one process may do.
+
+        Returns
+        -------
+        bool
+            Whether `holder` has it until `seconds` from `now`.
+        """
+        row = {"name": name, "holder": holder, "expires_at": now + seconds}
+        leases = tables.leases.c
+        with writing(self.engine) as connection:
+            statement = insert(connection, tables.leases).values(row)
+            taken = statement.on_conflict_do_update(
+                index_elements=["name"],
+                set_=row,
+                where=or_(leases.holder == holder, leases.expires_at <= now),
+            ).returning(leases.holder)
+            return connection.execute(taken).first() is not None
+
+    def release(self, name: str, holder: str) -> None:
+        """Give a lease back, if `holder` has it."""
+        leases = tables.leases.c
+        self._count(delete(tables.leases).where(leases.name == name, leases.holder == holder))
+
+    # Private
+
+    def _jobs(self, query: Select[Any]) -> list[Job]:
+        with reading(self.engine) as connection:
+            return [_from_row(row) for row in connection.execute(query)]
+
+    def _count(self, statement: Any) -> int:
+        with writing(self.engine) as connection:
+            result: CursorResult[Any] = connection.execute(statement)
+            return result.rowcount
+
+
+def _get(connection: Connection, job_id: str, *, for_update: bool = False) -> Job | None:
+    query = select(tables.jobs).where(_JOBS.id == job_id)
+    # SQLite needs no lock of a row: its transaction has locked the database.
+    row = connection.execute(query.with_for_update() if for_update else query).one_or_none()
+    return None if row is None else _from_row(row)
+
+
+def _queue() -> Subquery:
+    """Return id and place, from 1, of every waiting job in the order of dispatch."""
+    running = (
+        select(_JOBS.owner, func.count().label("jobs"))
+        .where(_JOBS.state == "running")
+        .group_by(_JOBS.owner)
+        .subquery("running")
+    )
+    age = (_JOBS.created_at, _JOBS.id)
+    own_turn = func.row_number().over(
+        partition_by=_JOBS.owner, order_by=(_JOBS.priority.desc(), *age)
+    )
+    waiting = (
+        select(*age, _JOBS.priority, (own_turn + func.coalesce(running.c.jobs, 0)).label("turn"))
+        .outerjoin_from(tables.jobs, running, running.c.owner == _JOBS.owner)
+        .where(_JOBS.state == "queued")
+        .subquery("waiting")
+    )
+    row = waiting.c
+    order = (row.priority.desc(), row.turn, row.created_at, row.id)
+    return select(row.id, func.row_number().over(order_by=order).label("place")).subquery("queue")
+
+
+def _submission(owner: str, key: str) -> Select[Any]:
+    row = tables.submissions.c
+    return select(tables.submissions).where(row.owner == owner, row.idempotency_key == key)
+
+
+def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Job | None:
+    """Return the job of the same request, or note down that `job` is the first one."""
+    row = {
+        "owner": job.owner,
+        "idempotency_key": key,
+        "fingerprint": fingerprint,
+        "job_id": job.id,
+        "created_at": job.created_at,
+    }
+    # If somebody else is about to insert the same key, this waits for that transaction.
+    statement = insert(connection, tables.submissions).values(row).on_conflict_do_nothing()
+    is_first = (
+        connection.execute(statement.returning(tables.submissions.c.job_id)).first() is not None
+    )
+    if is_first:
+        return None
+    known = connection.execute(_submission(job.owner, key).with_for_update()).one()
+    if known.fingerprint != fingerprint:
+        raise IdempotencyConflict(
+            f"the idempotency key {key!r:.80} came before with another request; take a new key for "
+            "a new request"
+        )
+    earlier = _get(connection, known.job_id)
+    if earlier is None:  # deleted meanwhile: the request counts anew
+        own = tables.submissions.c
+        connection.execute(
+            update(tables.submissions)
+            .where(and_(own.owner == job.owner, own.idempotency_key == key))
+            .values(row)
+        )
+    return earlier
+
+
+def _usage(connection: Connection, owner: str) -> tuple[int, int]:
+    not_over = func.count().filter(_JOBS.state.in_(_NOT_OVER))
+    kept = func.sum(_JOBS.source_bytes + func.coalesce(_JOBS.output_bytes, 0))
+    jobs, size = connection.execute(select(not_over, kept).where(_JOBS.owner == owner)).one()
+    return int(jobs), int(size or 0)
+
+
+def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
+    if connection.dialect.name == "postgresql":
+        # Submissions of one owner one after the other, so that none overlooks another.
+        lock = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 7))")
+        connection.execute(lock, {"owner": job.owner})
+    jobs, size = _usage(connection, job.owner)
+    if jobs >= limits.max_jobs:
+        raise QuotaExceeded(
+            f"{job.owner!r} has {jobs} jobs that are not over, the limit is {limits.max_jobs}; "
+            "wait for some or cancel them"
+        )
+    if size + job.source_bytes > limits.max_bytes:
+        raise QuotaExceeded(
+            f"{job.owner!r} keeps {size} bytes and this upload has {job.source_bytes}, the limit "
+            f"is {limits.max_bytes}; delete old jobs"
+        )
+
+
+def _note_deliveries(connection: Connection, job: Job) -> None:
+    due = {"webhook": job.webhook}
+    if job.state is JobState.DONE:
+        due["printer"] = job.printer
+    for kind, target in due.items():
+        if target is not None:
+            connection.execute(
+                tables.deliveries.insert().values(
+                    job_id=job.id,
+                    kind=kind,
+                    target=target,
+                    state="waiting",
+                    next_at=job.finished_at,
+                )
             )
-        self._connection.executescript(_SCHEMA)
-        self._connection.execute(f"PRAGMA user_version = {_SCHEMA_VERSION}")
 
 
 def _to_row(job: Job) -> dict[str, Any]:
-    row = asdict(job)
-    row["state"] = job.state.value
-    for name in _AS_JSON:
-        row[name] = None if row[name] is None else json.dumps(row[name], sort_keys=True)
-    return row
+    return asdict(job) | {"state": job.state.value}
 
 
-def _from_row(row: sqlite3.Row) -> Job:
-    values = {name: row[name] for name in _COLUMNS}
-    values["state"] = JobState(values["state"])
-    for name in _AS_JSON:
-        values[name] = None if values[name] is None else json.loads(values[name])
-    return Job(**values)
+def _from_row(row: Row[Any]) -> Job:
+    values = row._mapping
+    return Job(**{name: values[name] for name in _FIELDS} | {"state": JobState(values["state"])})
+
+
+def _to_cursor(job: Job) -> str:
+    content = json.dumps([job.created_at, job.id], separators=(",", ":"))
+    return base64.urlsafe_b64encode(content.encode()).decode().rstrip("=")
+
+
+def _from_cursor(cursor: str) -> Sequence[Any]:
+    try:
+        padded = cursor.encode("ascii") + b"=" * (-len(cursor) % 4)
+        created_at, job_id = json.loads(base64.urlsafe_b64decode(padded))
+        if type(created_at) not in (float, int) or type(job_id) is not str:
+            raise ValueError
+        return float(created_at), job_id
+    except (ValueError, TypeError, OverflowError):
+        raise BadCursor(
+            f"cursor {cursor!r:.80} is not one of a page; begin without a cursor"
+        ) from None

@@ -1,0 +1,249 @@
+"""Opens the database, brings its schema up to date, and says it plainly when it is away.
+
+``writing`` and ``reading`` are the two ways to it: one transaction for each `with` block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, func, inspect, select, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+
+from service.database.migrations import LATEST
+
+if TYPE_CHECKING:
+    from sqlalchemy import Table
+
+    from service.settings import Settings
+
+__all__ = [
+    "DatabaseAway",
+    "StoreError",
+    "database_url",
+    "insert",
+    "make_engine",
+    "migrate",
+    "open_database",
+    "reading",
+    "writing",
+]
+
+_FILE = "stillpath.sqlite3"
+_BUSY_TIMEOUT_MS = 30_000
+# Taken by whoever changes the schema; a number that nobody else in the database uses.
+_MIGRATION_LOCK = 0x57111_0000
+_ON_POSTGRESQL: dict[str, Any] = {
+    # A server that vanished is noticed before a worker counts as lost.
+    "connect_timeout": 5,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 10_000,
+}
+
+
+class StoreError(RuntimeError):
+    """The database cannot be used; the message says what to do."""
+
+
+class DatabaseAway(StoreError):
+    """The database does not answer, or not in time; trying again later may help."""
+
+
+def database_url(settings: Settings) -> URL:
+    """Return where the database is.
+
+    Raises
+    ------
+    StoreError
+        If it is neither SQLite nor PostgreSQL.
+    """
+    if settings.database_url is None:
+        return URL.create("sqlite", database=str(Path(settings.data_dir) / _FILE))
+    try:
+        url = make_url(settings.database_url)
+    except ArgumentError:
+        raise StoreError(
+            "STILLPATH_DATABASE_URL is not an address; write for instance "
+            "postgresql+psycopg://user@host/stillpath"
+        ) from None
+    if url.drivername in ("postgres", "postgresql"):
+        return url.set(drivername="postgresql+psycopg")
+    if url.drivername not in ("postgresql+psycopg", "sqlite"):
+        raise StoreError(
+            f"STILLPATH_DATABASE_URL begins with {url.drivername}; possible are postgresql+psycopg "
+            "and sqlite"
+        )
+    return url
+
+
+def open_database(settings: Settings) -> Engine:
+    """Return the database with the schema of this version, made or migrated if need be.
+
+    Several processes may do so at once. The caller closes it with ``dispose``.
+
+    Raises
+    ------
+    StoreError
+        If it cannot be reached, or was written by a newer version.
+    """
+    url = database_url(settings)
+    if url.get_backend_name() == "sqlite" and url.database:
+        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+    engine = make_engine(url)
+    try:
+        migrate(engine)
+        if (
+            settings.database_url is None
+            and (old := Path(settings.data_dir) / "jobs.sqlite3").exists()
+        ):
+            from service.database.old_jobs import take_over
+
+            take_over(old, engine)
+    except DBAPIError as error:
+        engine.dispose()
+        raise StoreError(
+            f"the database {_shown(engine)} cannot be opened: {_reason(error)}; "
+            "check STILLPATH_DATABASE_URL and STILLPATH_DATA_DIR, or restore a backup"
+        ) from error
+    except BaseException:
+        engine.dispose()
+        raise
+    return engine
+
+
+def make_engine(url: URL) -> Engine:
+    """Return an engine for a database as it is, without a look at its schema."""
+    if url.get_backend_name() == "sqlite":
+        engine = create_engine(url, pool_size=8, max_overflow=8)
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+    given = {name: value for name, value in _ON_POSTGRESQL.items() if name not in url.query}
+    return create_engine(
+        url, pool_size=8, max_overflow=8, pool_timeout=10, pool_pre_ping=True, connect_args=given
+    )
+
+
+def migrate(engine: Engine) -> None:
+    """Bring the schema to that of this version, in one transaction, beside others who do so.
+
+    Raises
+    ------
+    StoreError
+        If the database does not answer, or was written by a newer version.
+    """
+    with reading(engine) as connection:
+        if _version(connection) == LATEST:
+            return
+    # Only now: most starts have nothing to do, and this takes its time.
+    from alembic import command
+    from alembic.config import Config
+    from alembic.script import ScriptDirectory
+
+    config = Config()
+    config.set_main_option(
+        "script_location", str(Path(__file__).parent / "migrations").replace("%", "%%")
+    )
+    with writing(engine) as connection:
+        if engine.dialect.name == "postgresql":
+            connection.execute(select(func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
+        version = _version(connection)
+        known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
+        if version is not None and version not in known:
+            raise StoreError(
+                f"the database {_shown(engine)} has schema {version}, this version knows up to "
+                f"{LATEST}: a newer Stillpath wrote it; install that one, or restore a backup from "
+                "before"
+            )
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+@contextmanager
+def writing(engine: Engine) -> Iterator[Connection]:
+    """Give a connection for one transaction, which is undone if the block raises.
+
+    Raises
+    ------
+    DatabaseAway
+    """
+    with _plainly(engine), engine.begin() as connection:
+        yield connection
+
+
+@contextmanager
+def reading(engine: Engine) -> Iterator[Connection]:
+    """Give a connection for reading; writers do not wait for it.
+
+    Raises
+    ------
+    DatabaseAway
+    """
+    with _plainly(engine), engine.execution_options(stillpath_reading=True).begin() as connection:
+        yield connection
+
+
+def insert(connection: Connection, table: Table) -> Any:
+    """Return an INSERT that knows ``on_conflict_do_nothing`` and ``on_conflict_do_update``."""
+    if connection.dialect.name == "postgresql":
+        return postgresql.insert(table)
+    return sqlite.insert(table)
+
+
+@contextmanager
+def _plainly(engine: Engine) -> Iterator[None]:
+    try:
+        yield
+    except (OperationalError, InterfaceError, PoolTimeout) as error:
+        raise DatabaseAway(
+            f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "
+            "and has space left"
+        ) from error
+
+
+def _take_over_old_jobs(data_dir: Path, engine: Engine) -> None:
+    if (data_dir / "jobs.sqlite3").exists():
+        from service.database.old_jobs import take_over
+
+        take_over(data_dir, engine)
+
+
+def _prepare_sqlite(connection: Any, _: Any) -> None:
+    connection.isolation_level = None  # BEGIN is ours, below
+    for pragma in (
+        f"busy_timeout = {_BUSY_TIMEOUT_MS}",
+        "journal_mode = WAL",
+        "synchronous = FULL",
+        "foreign_keys = ON",
+    ):
+        connection.execute(f"PRAGMA {pragma}").close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    # A transaction that read first and then wants to write fails at once if somebody else wrote
+    # meanwhile; one that says so at its beginning waits for its turn.
+    is_reading = connection.get_execution_options().get("stillpath_reading", False)
+    connection.exec_driver_sql("BEGIN" if is_reading else "BEGIN IMMEDIATE")
+
+
+def _version(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(text("SELECT version_num FROM alembic_version")).scalar()
+
+
+def _shown(engine: Engine) -> str:
+    return engine.url.render_as_string(hide_password=True)
+
+
+def _reason(error: Exception) -> str:
+    original = getattr(error, "orig", None) or error
+    return " ".join(str(original).split())

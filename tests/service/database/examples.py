@@ -1,0 +1,34 @@
+"""Jobs to begin with."""
+
+from __future__ import annotations
+
+import uuid
+from typing import Any
+
+from service.jobs.state import Finished, Job
+
+__all__ = ["finished", "make_job"]
+
+
+def make_job(**fields: Any) -> Job:
+    """Return a job that nobody has seen yet."""
+    given = {
+        "id": uuid.uuid4().hex,
+        "owner": "anna",
+        "machine": "ender3",
+        "machine_revision": "0123456789ab",
+        "options": {"method": "fbf"},
+        "dedupe_key": "d" * 64,
+        "source_name": "part.gcode",
+        "source_bytes": 100,
+        "source_sha256": "5" * 64,
+        "result_name": "part.stillpath.gcode",
+        "created_at": 1000.0,
+    }
+    return Job(**(given | fields))
+
+
+def finished(job: Job, at: float = 2000.0) -> Finished:
+    """Return the event that ends a running job well."""
+    output = f"jobs/{job.id}/{job.attempt}"
+    return Finished(job.attempt, at, output, 70, 50, "7" * 64, {"before_um": 9.5})
