@@ -254,6 +254,8 @@ class Interpreter:
             text=self._text[begun:end],
         )
         self._first_move += n
+        if state.forget_rows():
+            self._limits, self._modal = [], []
         return block
 
     def _note_tables(self) -> None:

@@ -8,7 +8,7 @@ does not grow with the file and a fault costs little. Everything else is a *pass
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import TypeVar
 
@@ -23,6 +23,7 @@ from models.machine import Machine
 __all__ = ["Passage", "Piece", "Splitter"]
 
 T = TypeVar("T", Moves, Events, Phases)
+S = TypeVar("S", Moves, Events)
 
 WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of its way more than the second, is
@@ -42,7 +43,7 @@ class Passage:
     text_offset : int
         Where they start in the file; `byte_start` and `byte_end` columns are absolute.
     limits, modal : lists
-        The interpreter's tables.
+        Tables of the rows' `limits_id` and `modal_id`.
     limits_before, limits_after : Limits
         Planner limits in force before the first line, and behind the last.
     modal_before, modal_after : ModalState
@@ -103,6 +104,8 @@ class Splitter:
         self._text_offset = 0
         self._after_mark = False
         self._tables: tuple[list[Limits], list[ModalState]] = ([], [])
+        self._theirs: list[Limits] | None = None
+        self._front: tuple[list[Limits], list[ModalState]] = ([], [])
         self._limits_id = 0
         self._modal_id = 0
 
@@ -117,8 +120,17 @@ class Splitter:
             yield from self._cut(final=True)
 
     def _append(self, block: ProgramBlock) -> None:
-        self._tables = (block.limits, block.modal)
+        if block.limits is not self._theirs:
+            self._front = self._rows_in_use()
+            self._theirs = block.limits
         moves, events = block.moves, block.events
+        self._tables = block.limits, block.modal
+        limits, modal = self._front
+        if limits:
+            # What is held keeps its rows, and those of the interpreter's new tables follow.
+            self._tables = limits + block.limits, modal + block.modal
+            moves = _renumbered(moves, len(limits), len(modal))
+            events = _renumbered(events, len(limits), len(modal))
         local = _shifted(events, -block.first_move)
         raw = self._raw_moves(block, local)
         if self._moves is None or self._events is None:
@@ -132,6 +144,27 @@ class Splitter:
         # A block's text covers its lines and may begin before the end of what we hold.
         held = self._text_offset + len(self._text)
         self._text += block.text[held - block.text_offset :]
+
+    def _rows_in_use(self) -> tuple[list[Limits], list[ModalState]]:
+        """Return the rows of the tables that what is held needs, and number it by them."""
+        moves, events = self._moves, self._events
+        if self._theirs is None:
+            return [], []
+        limits_ids, modal_ids = (
+            [np.array([self._limits_id], np.int32)],
+            [np.array([self._modal_id], np.int32)],
+        )
+        if moves is not None and events is not None:
+            limits_ids += [moves.limits_id, events.limits_id]
+            modal_ids += [moves.modal_id, events.modal_id]
+        limits, limits_id = _numbered(np.concatenate(limits_ids))
+        modal, modal_id = _numbered(np.concatenate(modal_ids))
+        self._limits_id, self._modal_id = int(limits_id[0]), int(modal_id[0])
+        if moves is not None and events is not None:
+            n = 1 + len(moves)
+            self._moves = replace(moves, limits_id=limits_id[1:n], modal_id=modal_id[1:n])
+            self._events = replace(events, limits_id=limits_id[n:], modal_id=modal_id[n:])
+        return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
     def _barriers(self, events: Events) -> NDArray[np.bool_]:
         """Mark lines that end a piece: stops, G92 of more than E, other limits of a stream."""
@@ -354,6 +387,16 @@ def _joined(first: T, second: T) -> T:
             for f in fields(first)
         }
     )
+
+
+def _numbered(ids: NDArray[np.int32]) -> tuple[list[int], NDArray[np.int32]]:
+    """Return the different ids, and for each of `ids` its place among them."""
+    different, place = np.unique(ids, return_inverse=True)
+    return different.tolist(), place.astype(np.int32)
+
+
+def _renumbered(table: S, limits: int, modal: int) -> S:
+    return replace(table, limits_id=table.limits_id + limits, modal_id=table.modal_id + modal)
 
 
 def _shifted(events: Events, by: int) -> Events:

@@ -36,6 +36,9 @@ from models.machine import Machine
 __all__ = ["MachineState", "Names", "Retraction", "Saved"]
 
 _MEMOS = 8192
+_FIRST_ROWS = 256
+_MOST_ROWS = 4096
+"""Of a table; beyond it the rows are forgotten as soon as nobody needs them."""
 _LAYERS = 1024
 
 
@@ -117,8 +120,8 @@ class MachineState:
             raise ValueError(f"{len(row)} limits, more than {at.MAX_LIMITS}")
         self.rows = Rows.empty(0)
         self.tables = Tables(
-            *_new_table(len(row), 256),
-            *_new_table(at.MODAL_SIZE, 256),
+            *_new_table(len(row), _FIRST_ROWS),
+            *_new_table(at.MODAL_SIZE, _FIRST_ROWS),
             np.zeros(_MEMOS, np.int64),
             np.zeros(_MEMOS, np.int64),
             np.full((_MEMOS // 2, len(row)), np.nan),
@@ -342,6 +345,23 @@ class MachineState:
             tables = tables._replace(layer_z=np.concatenate([tables.layer_z, more]))
         self.tables = tables
 
+    def forget_rows(self) -> bool:
+        """Begin new tables of modes and limits if these are large; rows 0 are those in force.
+
+        All that was written must have been handed over. Return whether it was so.
+        """
+        i, tables = self.i, self.tables
+        if max(i[at.I_N_MODAL], i[at.I_N_LIMITS]) <= _MOST_ROWS:
+            return False
+        modal, modal_index = _begun(tables.modal[i[at.I_MODAL_ID]])
+        limits, limits_index = _begun(tables.limits[i[at.I_LIMITS_ID]])
+        i[at.I_N_MODAL] = i[at.I_N_LIMITS] = 1
+        i[at.I_MODAL_ID] = i[at.I_LIMITS_ID] = 0
+        self.tables = tables._replace(
+            modal=modal, modal_index=modal_index, limits=limits, limits_index=limits_index
+        )
+        return True
+
 
 class Names:
     """Names numbered as they come."""
@@ -364,6 +384,13 @@ def _nobody(command: Command) -> int:
 
 def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     return np.zeros((rows, columns)), np.full(4 * rows, -1, np.int32)
+
+
+def _begun(row: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    rows, index = _new_table(len(row), _FIRST_ROWS)
+    rows[0] = row
+    intern_row(rows, index, 0)
+    return rows, index
 
 
 def _grown(rows: NDArray[np.float64], count: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

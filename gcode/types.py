@@ -148,8 +148,9 @@ class Events:
 class ProgramBlock:
     """One block of an interpreted file.
 
-    `limits` and `modal` are the interpreter's append-only tables: ids stay valid for the whole
-    file. `text` holds the bytes from `text_offset` on, and covers every line of the block.
+    `limits` and `modal` are the interpreter's tables. They only grow, and blocks share them, until
+    they are large: then both are begun anew, and ids of the blocks before mean nothing in them.
+    `text` holds the bytes from `text_offset` on, and covers every line of the block.
     """
 
     first_move: int

@@ -8,7 +8,7 @@ from __future__ import annotations
 from enum import Enum
 from pathlib import Path
 
-__all__ = ["Kind", "kind_named", "sniff"]
+__all__ = ["Kind", "kind_named", "kind_of", "sniff"]
 
 
 class Kind(Enum):
@@ -38,7 +38,12 @@ _SUFFIXES = {
 def sniff(path: Path) -> Kind:
     """Return what a file is, by its magic number; text if it has none."""
     with path.open("rb") as file:
-        return _MAGICS.get(file.read(4), Kind.TEXT)
+        return kind_of(file.read(4))
+
+
+def kind_of(head: bytes) -> Kind:
+    """Return what a file is that begins with these four bytes; text if they are no magic number."""
+    return _MAGICS.get(head[:4], Kind.TEXT)
 
 
 def kind_named(path: Path) -> Kind | None:

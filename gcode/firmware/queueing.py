@@ -35,6 +35,8 @@ class QueuePlanner(ABC):
         self._begun = False
         self._time_s = 0.0
         self._limits = np.empty((0, 0))
+        self._table: Sequence[Limits] = ()
+        """What `_limits` holds as an array."""
 
     @property
     def time_s(self) -> float:
@@ -63,7 +65,8 @@ class QueuePlanner(ABC):
         Parameters
         ----------
         limits : sequence of Limits
-            The table of `Moves.limits_id`; it may only grow.
+            The table of `Moves.limits_id`: the one of the last moves, which may have grown, or
+            another.
         """
         return self._plan(moves, 0, len(moves), limits)
 
@@ -90,7 +93,8 @@ class QueuePlanner(ABC):
         n = end - begun
         if n == 0:
             return
-        if len(limits) != len(self._limits):
+        if limits is not self._table or len(limits) != len(self._limits):
+            self._table = limits
             self._limits = np.array([limit.as_row() for limit in limits])
         if self._count + n > len(self._queue):
             larger = np.empty((2 * (self._count + n), self._queue.shape[1]))

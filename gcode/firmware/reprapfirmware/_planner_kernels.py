@@ -29,14 +29,15 @@ Q_TRAVEL = 9  # x y z e that the motors move, per mm of path
 Q_ACCEL = 13
 Q_SPEED = 14  # highest cruise speed
 Q_KIND = 15  # bits: feeds filament along X Y, moves X or Y, moves the extruder otherwise
-Q_LIMITS = 16
+Q_POLICY = 16  # M566 P
 Q_INDEX = 17
 Q_IN, Q_TOP, Q_OUT = 18, 19, 20  # speeds
 Q_UP, Q_DOWN = 21, 22  # ways of acceleration and deceleration, mm
 Q_TARGET = 23  # at which the next move would like to start
 Q_LASTS = 24
 Q_BEGINS = 25
-Q_SIZE = 26
+Q_JERK = 26  # x y z e
+Q_SIZE = 30
 
 PRINTS, MOVES_XY, FEEDS_OTHERWISE = 1, 2, 4
 
@@ -127,7 +128,7 @@ def append(
         row[Q_ACCEL] = accel
         row[Q_SPEED] = cruise
         row[Q_KIND] = kind
-        row[Q_LIMITS] = limits_id[m]
+        row[Q_POLICY] = limit[L_POLICY]
         row[Q_INDEX] = first_index + m
         # The extruder's fractions of a step are carried on, so it is left as it is.
         for k in range(3):
@@ -136,6 +137,8 @@ def append(
             if row[Q_TRAVEL + k] == 0.0:
                 # Not a step, but still a move of this axis: it does not count as a rest.
                 row[Q_TRAVEL + k] = _NO_STEP * way[k] / path
+        for k in range(4):
+            row[Q_JERK + k] = limit[L_JERK + k]
         row[Q_START + 3] = start[m, 3]
         row[Q_TRAVEL + 3] = way[3] / path
         count += 1
@@ -162,7 +165,6 @@ def run(
     queue: Any,
     count: int,
     state: Any,
-    limits: Any,
     facts: Any,
     final: bool,
 ) -> None:
@@ -184,7 +186,7 @@ def run(
                 if not final:
                     return
                 break
-            _enter(queue, state, limits)
+            _enter(queue, state)
         held = int(state[S_HELD])
         while frozen < held and 2 * (frozen - over) < ring:
             row = queue[frozen]
@@ -228,45 +230,45 @@ def _takes_more(queue: Any, state: Any, ring: int) -> bool:
 
 
 @kernel
-def _enter(queue: Any, state: Any, limits: Any) -> None:
+def _enter(queue: Any, state: Any) -> None:
     """Put the next move into the ring and let the moves before it run on into it."""
     frozen, new = int(state[S_FROZEN]), int(state[S_HELD])
     row = queue[new]
-    limit = limits[int(row[Q_LIMITS])]
     row[Q_IN] = 0.0
     row[Q_OUT] = 0.0
     row[Q_LASTS] = 0.0
     if new > frozen:
         before = queue[new - 1]
-        if limit[L_POLICY] != 0.0 or before[Q_KIND] == row[Q_KIND]:
+        if row[Q_POLICY] != 0.0 or before[Q_KIND] == row[Q_KIND]:
             brake = sqrt(2.0 * row[Q_ACCEL] * row[Q_PATH])
             before[Q_TARGET] = min(brake, row[Q_SPEED])
-            _look_ahead(queue, frozen, new - 1, limit, state)
+            _look_ahead(queue, frozen, new - 1, state)
             row[Q_IN] = before[Q_OUT]
     _shape(row, state)
     state[S_HELD] = new + 1
 
 
 @kernel
-def _look_ahead(queue: Any, first: int, last: int, limit: Any, state: Any) -> None:
+def _look_ahead(queue: Any, first: int, last: int, state: Any) -> None:
     """Raise the speed at the end of row `last` to its target, and those before it as needed.
 
     Rows before `first` are frozen. The search goes back as long as moves do nothing but brake; the
-    speeds at the ends never fall again.
+    speeds at the ends never fall again. The limits are those of the move that enters, row last + 1.
     """
     j = last
+    entering = queue[last + 1]
     while True:
         row = queue[j]
         row[Q_TARGET] = min(row[Q_TARGET], row[Q_SPEED])
         if row[Q_TOP] < row[Q_SPEED]:
-            if j > first and _brakes(row) and _may_rise(queue[j - 1], row, limit):
-                _respect_jerk(queue, j, limit)
+            if j > first and _brakes(row) and _may_rise(queue[j - 1], row, entering):
+                _respect_jerk(queue, j, entering)
                 could = sqrt(row[Q_TARGET] ** 2 + 2.0 * row[Q_ACCEL] * row[Q_PATH])
                 queue[j - 1, Q_TARGET] = min(could, row[Q_SPEED])
                 j -= 1
                 continue
             _respect_reach(row)
-        _respect_jerk(queue, j, limit)
+        _respect_jerk(queue, j, entering)
         break
     for i in range(j, last + 1):
         row = queue[i]
@@ -287,11 +289,11 @@ def _brakes(row: Any) -> bool:
 
 
 @kernel(inline=True)
-def _may_rise(before: Any, row: Any, limit: Any) -> bool:
+def _may_rise(before: Any, row: Any, entering: Any) -> bool:
     """Tell whether the look-ahead goes on from a move to the open one before it."""
     if before[Q_DOWN] == 0.0:
         return False
-    if limit[L_POLICY] != 0.0:
+    if entering[Q_POLICY] != 0.0:
         return True
     kind, kind_before = int(row[Q_KIND]), int(before[Q_KIND])
     if (kind ^ kind_before) & MOVES_XY:
@@ -308,13 +310,13 @@ def _respect_reach(row: Any) -> None:
 
 
 @kernel
-def _respect_jerk(queue: Any, j: int, limit: Any) -> None:
+def _respect_jerk(queue: Any, j: int, entering: Any) -> None:
     """No higher target than one at which every drive's speed steps by no more than its jerk."""
     row, after = queue[j], queue[j + 1]
     for k in range(4):
         step = abs(row[Q_DIRECTION + k] - after[Q_DIRECTION + k])
-        if step * row[Q_TARGET] > limit[L_JERK + k]:
-            row[Q_TARGET] = limit[L_JERK + k] / step
+        if step * row[Q_TARGET] > entering[Q_JERK + k]:
+            row[Q_TARGET] = entering[Q_JERK + k] / step
 
 
 @kernel

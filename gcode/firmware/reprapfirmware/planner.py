@@ -119,7 +119,7 @@ class RepRapPlanner(QueuePlanner):
 
     def _take(self, *, final: bool) -> Phases:
         if self._count:
-            kernels.run(self._queue, self._count, self._state, self._limits, self._facts, final)
+            kernels.run(self._queue, self._count, self._state, self._facts, final)
         frozen = int(self._state[kernels.S_FROZEN])
         settled = frozen - self._emitted
         phases = empty_phases(settled)
