@@ -213,6 +213,11 @@ class JobStore:
                 select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
             ).scalar()
 
+    def ended_between(self, after: float, until: float) -> list[Job]:
+        """Return the jobs that ended after a time and not later than another."""
+        ended = (_JOBS.finished_at > after, _JOBS.finished_at <= until)
+        return self._jobs(select(tables.jobs).where(_JOBS.state.in_(_OVER), *ended))
+
     def usage(self, owner: str) -> tuple[int, int]:
         """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
         with reading(self.engine) as connection:
