@@ -5,20 +5,27 @@ from __future__ import annotations
 import sys
 
 import structlog
+from structlog.typing import Processor
+
+from service.security.masking import mask_secrets
 
 __all__ = ["configure_logging"]
 
 
 def configure_logging() -> None:
     """Set up structlog for a process of the service."""
-    person = sys.stderr.isatty()
+    renderer: Processor = structlog.processors.JSONRenderer()
+    if sys.stderr.isatty():
+        renderer = structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback)
     structlog.configure(
         processors=[
             structlog.contextvars.merge_contextvars,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.dev.ConsoleRenderer() if person else structlog.processors.dict_tracebacks,
-            *([] if person else [structlog.processors.JSONRenderer()]),
+            # Text without the values of variables, and then nothing after the mask but output.
+            structlog.processors.format_exc_info,
+            mask_secrets,
+            renderer,
         ],
         logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
     )

@@ -1,28 +1,158 @@
-"""What a route asks of its caller: one of `Reader`, `Submitter` and `Admin` as a parameter."""
+"""What a route asks of its caller: `Reader`, `Submitter` or `Admin` as a parameter.
+
+`Watcher` is a reader whose requests are not counted, for whoever follows a job; `Uploader` is a
+submitter who holds one of his places for uploads until he is answered; `Operator` is an admin, or
+somebody on this computer.
+"""
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Annotated, NoReturn
 
 from fastapi import Depends, Request
+from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
-from service.security.callers import LOCAL, Caller
+from service.api.limits import Limits, name_of
+from service.api.problems import Problem
+from service.database.engine import DatabaseAway
+from service.security.audit import AuditLog
+from service.security.callers import LOCAL, Caller, Scope
+from service.security.keys import KeyStore
+from service.settings import is_loopback
 
-__all__ = ["Admin", "Reader", "Submitter"]
+__all__ = ["Admin", "Operator", "Reader", "Submitter", "Uploader", "Watcher"]
+
+_ABOUT = "A key of this service (`sp_...`). Not needed where the service answers its own computer."
+_CHALLENGE = 'Bearer realm="stillpath"'
+
+_Bearer = Annotated[
+    HTTPAuthorizationCredentials | None,
+    Depends(HTTPBearer(auto_error=False, scheme_name="bearer", description=_ABOUT)),
+]
+_Header = Annotated[
+    str | None,
+    Depends(
+        APIKeyHeader(name="X-Api-Key", auto_error=False, scheme_name="key", description=_ABOUT)
+    ),
+]
 
 
-def _reader(_: Request) -> Caller:
-    return LOCAL
+def _shown(bearer: _Bearer, header: _Header) -> str | None:
+    return bearer.credentials if bearer is not None else header
 
 
-def _submitter(_: Request) -> Caller:
-    return LOCAL
+_Shown = Annotated[str | None, Depends(_shown)]
 
 
-def _admin(_: Request) -> Caller:
-    return LOCAL
+# Every one of these looks into the database, so that they are plain functions: run in a thread.
+
+
+def _reader(request: Request, shown: _Shown) -> Caller:
+    return _allowed(request, shown, Scope.READ)
+
+
+def _watcher(request: Request, shown: _Shown) -> Caller:
+    return _allowed(request, shown, Scope.READ, counted=False)
+
+
+def _submitter(request: Request, shown: _Shown) -> Caller:
+    return _allowed(request, shown, Scope.SUBMIT)
+
+
+def _admin(request: Request, shown: _Shown) -> Caller:
+    return _allowed(request, shown, Scope.ADMIN)
+
+
+def _operator(request: Request, shown: _Shown) -> Caller:
+    remote = _remote(request)
+    if shown is None and is_loopback(remote or ""):
+        return _local(remote)
+    return _allowed(request, shown, Scope.ADMIN)
 
 
 Reader = Annotated[Caller, Depends(_reader)]
+Watcher = Annotated[Caller, Depends(_watcher)]
 Submitter = Annotated[Caller, Depends(_submitter)]
 Admin = Annotated[Caller, Depends(_admin)]
+Operator = Annotated[Caller, Depends(_operator)]
+
+
+def _uploader(request: Request, caller: Submitter) -> Iterator[Caller]:
+    limits: Limits = request.app.state.limits
+    with limits.uploading(caller):
+        yield caller
+
+
+Uploader = Annotated[Caller, Depends(_uploader)]
+
+
+def _allowed(request: Request, shown: str | None, scope: Scope, *, counted: bool = True) -> Caller:
+    """Return who is calling, or raise `Problem`: 401 for a wrong key, 403 for one too small."""
+    caller = _caller(request, shown)
+    if counted:
+        limits: Limits = request.app.state.limits
+        limits.take(name_of(caller))
+    if not caller.may(scope):
+        _deny(
+            request,
+            caller,
+            403,
+            "Not allowed",
+            f"This needs a key with scope {scope.value!r}; the key {caller.key_id} has "
+            f"{', '.join(sorted(caller.scopes))}.",
+        )
+    return caller
+
+
+def _caller(request: Request, shown: str | None) -> Caller:
+    remote = _remote(request)
+    if shown is None:
+        if not request.app.state.keys_required:
+            return _local(remote)
+        _turn_away(
+            request,
+            Caller("-", frozenset(), remote=remote),
+            "No key came with the request. Send one as 'Authorization: Bearer sp_...' or "
+            "'X-Api-Key: sp_...'; `stillpath keys create` makes one.",
+        )
+    keys: KeyStore = request.app.state.keys
+    key = keys.find(shown)
+    if key is None:
+        _turn_away(
+            request,
+            Caller("-", frozenset(), remote=remote),
+            "This service does not know the key that came with the request.",
+        )
+    refusal = key.refusal(time.time())
+    if refusal is not None:
+        # Counted by address: an ended key must not be a way around that.
+        who = Caller(key.owner, frozenset(), remote=remote)
+        _turn_away(request, who, f"{refusal} Ask for a new one.")
+    with suppress(DatabaseAway):  # that the hour cannot be written down turns nobody away
+        keys.used(key)
+    return key.caller(remote)
+
+
+def _turn_away(request: Request, who: Caller, detail: str) -> NoReturn:
+    limits: Limits = request.app.state.limits
+    limits.take(name_of(who))
+    _deny(request, who, 401, "Unknown caller", detail)
+
+
+def _deny(request: Request, who: Caller, status: int, title: str, detail: str) -> NoReturn:
+    audit: AuditLog = request.app.state.audit
+    route = getattr(request.scope.get("route"), "path", request.url.path)
+    audit.denied(who, f"{request.method} {route}", f"{status} {title}")
+    headers = {"WWW-Authenticate": _CHALLENGE} if status == 401 else {}
+    raise Problem(status, title, detail, headers=headers)
+
+
+def _local(remote: str | None) -> Caller:
+    return Caller(LOCAL.owner, LOCAL.scopes, remote=remote)
+
+
+def _remote(request: Request) -> str | None:
+    return None if request.client is None else request.client.host

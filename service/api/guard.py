@@ -1,58 +1,146 @@
-"""Keeps foreign web pages out of a service that trusts its computer.
+"""Keeps foreign web pages out, and tells browsers what pages of ours may do.
 
-A browser on the same computer can be made to send requests here by any page it shows. Two checks
-stop that: the Host header must name this computer (against DNS rebinding), and a request that
-changes something must not come from another origin.
+A browser can be made to send requests here by any page it shows. Where callers need no key, three
+checks stop that: the Host header must name this computer (against DNS rebinding), a request that
+changes something must not come from another origin, and other sites may link here but load nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from urllib.parse import urlsplit
 
-from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.problems import problem_response
-from service.jobs.problems import problem
-from service.settings import is_loopback
+from service.api.limits import limited_receive, too_long
+from service.api.problems import Problem, problem_response
+from service.settings import Settings, is_loopback
 
-__all__ = ["Guard"]
+__all__ = ["Guard", "hosts_of"]
 
 _SAFE = ("GET", "HEAD", "OPTIONS")
+# What asks for these by itself, a load balancer for instance, names the host as it likes.
+_HEALTH = ("/healthz", "/readyz")
+_FORWARDED = ("forwarded", "x-forwarded-for", "x-real-ip")
+# For pages without a policy of their own: their own script and style, and nothing from anywhere.
+_PAGE_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; "
+    "form-action 'none'; base-uri 'none'; frame-ancestors 'self'"
+)
+_OTHER_POLICY = "default-src 'none'; frame-ancestors 'none'; sandbox"
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    # Kept by the browser of whoever asked, and asked about again each time.
+    "Cache-Control": "private, no-cache",
+}
+
+
+def hosts_of(settings: Settings, keys_required: bool) -> Sequence[str]:
+    """Return the names in the Host header that are answered besides those of this computer.
+
+    With keys any name will do, unless names are set: a page of somebody else has no key.
+    """
+    if keys_required and not settings.allowed_hosts:
+        return ("*",)
+    return tuple(settings.allowed_hosts)
 
 
 class Guard:
-    """ASGI middleware with the two checks.
+    """ASGI middleware with the checks and the headers.
 
     Parameters
     ----------
     app : ASGI application
-    allow_remote : bool
-        The service is meant for other computers too: any Host is right.
+    allowed_hosts : sequence of str
+        From `hosts_of`.
+    trusts_all : bool
+        Callers need no key. Then what a proxy passes on is refused: it would lend its own place
+        on this computer to everybody.
     """
 
-    def __init__(self, app: ASGIApp, *, allow_remote: bool) -> None:
+    def __init__(
+        self, app: ASGIApp, *, allowed_hosts: Sequence[str] = (), trusts_all: bool = True
+    ) -> None:
         self._app = app
-        self._allow_remote = allow_remote
+        self._hosts = frozenset(host.lower() for host in allowed_hosts)
+        self._trusts_all = trusts_all
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:  # noqa: D102 - ASGI
-        if scope["type"] == "http":
-            headers = Headers(scope=scope)
-            host = headers.get("host", "")
-            refused = self._refusal(scope["method"], host, headers.get("origin"))
-            if refused is not None:
-                answer = problem_response(problem(403, "Refused", refused))
-                await answer(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
 
-    def _refusal(self, method: str, host: str, origin: str | None) -> str | None:
-        name = urlsplit(f"//{host}").hostname or ""
-        if not self._allow_remote and not is_loopback(name):
-            return (
-                f"The Host header names {name!r}, but this service answers for its own computer "
-                "only. Call it as localhost, or start it with --allow-remote."
-            )
-        if method in _SAFE or origin is None or urlsplit(origin).netloc == host:
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                _complete(MutableHeaders(scope=message))
+            await send(message)
+
+        refused = too_long(scope) or self._refusal(scope)
+        if refused is None:
+            await self._app(scope, limited_receive(scope, receive), sent)
+        else:
+            answer = problem_response(refused.document, refused.headers)
+            await answer(scope, receive, sent)
+
+    def _refusal(self, scope: Scope) -> Problem | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        why = None
+        if scope["path"] not in _HEALTH:
+            why = self._wrong_host(host)
+        why = why or self._passed_on(headers) or _foreign(scope["method"], host, headers)
+        return None if why is None else Problem(403, "Refused", why)
+
+    def _wrong_host(self, host: str) -> str | None:
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").lower()
+        except ValueError:
+            name = ""
+        if "*" in self._hosts or name in self._hosts or is_loopback(name):
             return None
-        return f"The request comes from another site ({origin}). Use this service's own page."
+        return (
+            f"The Host header names {name[:80]!r}, which this service does not answer to. Call it "
+            "as localhost, or add the name to STILLPATH_ALLOWED_HOSTS."
+        )
+
+    def _passed_on(self, headers: Headers) -> str | None:
+        if self._trusts_all and any(name in headers for name in _FORWARDED):
+            return (
+                "A proxy passed this request on, but this service asks nobody for a key. Set "
+                "STILLPATH_KEYS=true behind a proxy."
+            )
+        return None
+
+
+def _foreign(method: str, host: str, headers: Headers) -> str | None:
+    origin = headers.get("origin")
+    if method not in _SAFE:
+        if origin is None or _origin_host(origin) == host.lower():
+            return None
+        return f"The request comes from another site ({origin[:80]}). Use this service's own page."
+    # See "resource isolation policy": browsers say since 2023 where a request comes from.
+    if (
+        headers.get("sec-fetch-site") == "cross-site"
+        and headers.get("sec-fetch-mode") != "navigate"
+    ):
+        return "Another site's page tries to load this. Open it by itself."
+    return None
+
+
+def _origin_host(origin: str) -> str:
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
+def _complete(headers: MutableHeaders) -> None:
+    is_page = headers.get("content-type", "").startswith("text/html")
+    headers.setdefault("Content-Security-Policy", _PAGE_POLICY if is_page else _OTHER_POLICY)
+    for name, value in _HEADERS.items():
+        headers.setdefault(name, value)

@@ -1,0 +1,208 @@
+"""Routes of keys and of the audit log, for admins."""
+
+from __future__ import annotations
+
+import time
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.api.access import Admin
+from service.api.problems import Problem, responses
+from service.security.audit import AuditEntry, AuditLog, record
+from service.security.callers import Scope
+from service.security.keys import OWNER_PATTERN, Key, KeyRefused, KeyStore
+
+__all__ = ["router"]
+
+_DAY_S = 86400.0
+_NO_STORE = {"Cache-Control": "no-store"}
+
+router = APIRouter(prefix="/v1", tags=["keys"])
+
+
+class KeyWish(BaseModel):
+    """What a new key shall be."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={
+            "examples": [
+                {
+                    "name": "slicer in the workshop",
+                    "owner": "ada",
+                    "scopes": ["read", "submit"],
+                    "expires_in_days": 365,
+                }
+            ]
+        },
+    )
+
+    name: str = Field(min_length=1, max_length=120, description="What it is for.")
+    owner: str = Field(pattern=OWNER_PATTERN, description="Whose jobs its jobs are.")
+    scopes: list[Scope] = Field(min_length=1, max_length=8)
+    expires_in_days: float | None = Field(
+        default=None, gt=0, le=36500, allow_inf_nan=False, description="By default never."
+    )
+
+
+class KeyView(BaseModel):
+    """A key as lists show it."""
+
+    id: str = Field(description="Names the key; it opens nothing.")
+    name: str
+    owner: str
+    scopes: list[Scope]
+    created_at: datetime
+    expires_at: datetime | None
+    revoked_at: datetime | None
+    used_at: datetime | None = Field(description="Last use; may be a minute behind.")
+
+    @classmethod
+    def of(cls, key: Key) -> KeyView:
+        """Return the view of a key."""
+        return cls(**_fields(key))
+
+
+class NewKey(KeyView):
+    """A key that was just made."""
+
+    key: str = Field(description="The key itself. It is not kept and cannot be shown again.")
+
+
+class AuditView(BaseModel):
+    """A row of the audit log."""
+
+    id: int
+    at: datetime
+    owner: str = Field(description="Who; `-` if nobody knows.")
+    key_id: str | None
+    remote: str | None
+    action: str
+    subject: str | None
+    details: dict[str, Any]
+
+    @classmethod
+    def of(cls, entry: AuditEntry) -> AuditView:
+        """Return the view of a row."""
+        return cls(
+            id=entry.id,
+            at=datetime.fromtimestamp(entry.at, UTC),
+            owner=entry.owner,
+            key_id=entry.key_id,
+            remote=entry.remote,
+            action=entry.action,
+            subject=entry.subject,
+            details=entry.details,
+        )
+
+
+class AuditPage(BaseModel):
+    """Some rows of the audit log, the newest first."""
+
+    entries: list[AuditView]
+    next_before: int | None = Field(
+        description="`before` of the next page; null: this is the last."
+    )
+
+
+@router.get("/keys", responses=responses(401, 403, 429), summary="List the keys")
+def list_keys(request: Request, caller: Admin) -> list[KeyView]:
+    """Return every key that was ever made, the oldest first; not the keys themselves."""
+    del caller
+    return [KeyView.of(key) for key in _keys(request).list()]
+
+
+@router.post(
+    "/keys",
+    status_code=201,
+    responses=responses(401, 403, 413, 422, 429),
+    summary="Make a key",
+)
+def create_key(request: Request, response: Response, wish: KeyWish, caller: Admin) -> NewKey:
+    """Make a key and show it, this once."""
+    days = wish.expires_in_days
+    try:
+        key, secret = _keys(request).create(
+            name=wish.name,
+            owner=wish.owner,
+            scopes=wish.scopes,
+            expires_at=None if days is None else time.time() + days * _DAY_S,
+        )
+    except KeyRefused as error:
+        raise Problem(422, "No such key can be", str(error)) from None
+    record(
+        request,
+        caller,
+        "key.create",
+        key.id,
+        owner=key.owner,
+        name=key.name,
+        scopes=sorted(key.scopes),
+    )
+    response.headers.update(_NO_STORE)
+    return NewKey(**_fields(key), key=secret)
+
+
+@router.delete(
+    "/keys/{key_id}",
+    status_code=204,
+    responses=responses(401, 403, 404, 429),
+    summary="Revoke a key",
+)
+def revoke_key(request: Request, key_id: str, caller: Admin) -> Response:
+    """End a key at once and for good. It stays in the list."""
+    key = _keys(request).revoke(key_id)
+    if key is None:
+        raise Problem(404, "No such key", f"There is no key {key_id[:32]!r}; GET /v1/keys.")
+    record(request, caller, "key.revoke", key.id, owner=key.owner, name=key.name)
+    return Response(status_code=204)
+
+
+@router.get(
+    "/audit", tags=["audit"], responses=responses(401, 403, 422, 429), summary="Who did what"
+)
+def read_audit(
+    request: Request,
+    caller: Admin,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    before: Annotated[
+        int | None, Query(ge=1, le=2**53, description="`next_before` of the page before.")
+    ] = None,
+    action: Annotated[
+        str | None, Query(max_length=64, description="For instance `submit` or `denied`.")
+    ] = None,
+) -> AuditPage:
+    """Return rows of the audit log, the newest first."""
+    del caller
+    log: AuditLog = request.app.state.audit
+    found = log.page(limit=limit + 1, before=before, action=action)
+    shown = found[:limit]
+    return AuditPage(
+        entries=[AuditView.of(entry) for entry in shown],
+        next_before=shown[-1].id if len(found) > limit else None,
+    )
+
+
+def _keys(request: Request) -> KeyStore:
+    keys: KeyStore = request.app.state.keys
+    return keys
+
+
+def _fields(key: Key) -> dict[str, Any]:
+    return {
+        "id": key.id,
+        "name": key.name,
+        "owner": key.owner,
+        "scopes": sorted(key.scopes),
+        "created_at": _moment(key.created_at),
+        "expires_at": _moment(key.expires_at),
+        "revoked_at": _moment(key.revoked_at),
+        "used_at": _moment(key.used_at),
+    }
+
+
+def _moment(seconds: float | None) -> datetime | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

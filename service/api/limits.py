@@ -1,0 +1,188 @@
+"""How much one caller may ask for: requests, uploads at once, sizes of requests."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from starlette.exceptions import HTTPException
+
+from service.api.problems import Problem
+
+if TYPE_CHECKING:
+    from starlette.types import Message, Receive, Scope
+
+    from service.security.callers import Caller
+
+__all__ = ["COUNTED", "Limits", "limited_receive", "name_of", "too_long"]
+
+COUNTED = "stillpath.body_counted"
+"""Key of the ASGI scope that a route sets which counts the bytes of its body itself."""
+
+_MOST_UPLOADS = 32
+_MOST_BUCKETS = 10_000
+_LONGEST_URL_BYTES = 8 << 10
+_LARGEST_HEADERS_BYTES = 32 << 10
+_MOST_HEADERS = 100
+_LARGEST_DOCUMENT_BYTES = 4 << 20
+
+
+class Limits:
+    """Counts what callers ask of this process.
+
+    Requests are counted by a token bucket for each key, or for each address without a valid key;
+    it holds a minute's worth, so that a burst passes and a stream does not.
+
+    Parameters
+    ----------
+    requests_per_minute : int
+    uploads : int
+        That one caller may have on their way at once.
+    clock : callable
+        Seconds, from anywhere.
+    """
+
+    def __init__(
+        self,
+        requests_per_minute: int,
+        *,
+        uploads: int = _MOST_UPLOADS,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._size = float(requests_per_minute)
+        self._per_s = requests_per_minute / 60.0
+        self._uploads = uploads
+        self._clock = clock
+        self._lock = threading.Lock()
+        # What is left, and when that was; a bucket that nobody remembers is full.
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._uploading: dict[str, int] = {}
+
+    def take(self, who: str) -> None:
+        """Count one request.
+
+        Parameters
+        ----------
+        who : str
+            From `name_of`.
+
+        Raises
+        ------
+        Problem
+            429, if there were too many.
+        """
+        now = self._clock()
+        with self._lock:
+            left, at = self._buckets.pop(who, (self._size, now))
+            left = min(self._size, left + (now - at) * self._per_s)
+            granted = left >= 1.0
+            self._buckets[who] = (left - 1.0 if granted else left, now)
+            if len(self._buckets) > _MOST_BUCKETS:
+                self._buckets.popitem(last=False)
+        if not granted:
+            wait_s = math.ceil((1.0 - left) / self._per_s)
+            raise Problem(
+                429,
+                "Too many requests",
+                f"More than {self._size:.0f} requests in a minute (STILLPATH_REQUESTS_PER_MINUTE). "
+                f"Try again in {wait_s} s; to watch a job, use its events, which do not count.",
+                headers={"Retry-After": str(wait_s)},
+            )
+
+    @contextmanager
+    def uploading(self, caller: Caller) -> Iterator[None]:
+        """Hold one of the caller's places for uploads.
+
+        Raises
+        ------
+        Problem
+            429, if all are taken.
+        """
+        who = name_of(caller)
+        with self._lock:
+            running = self._uploading.get(who, 0)
+            if running < self._uploads:
+                self._uploading[who] = running + 1
+        if running >= self._uploads:
+            raise Problem(
+                429,
+                "Too many uploads at once",
+                f"{running} uploads of yours are on their way, the limit. Wait for one to end.",
+                headers={"Retry-After": "1", "Connection": "close"},
+            )
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._uploading[who] -= 1
+                if not self._uploading[who]:
+                    del self._uploading[who]
+
+
+def name_of(caller: Caller) -> str:
+    """Return by which name a caller's requests are counted: the key's, or the address's."""
+    return f"key {caller.key_id}" if caller.key_id is not None else _network(caller.remote)
+
+
+def too_long(scope: Scope) -> Problem | None:
+    """Return what is wrong with the size of a request's first lines, if anything is."""
+    url_bytes = len(scope.get("raw_path") or b"") + len(scope.get("query_string", b""))
+    if url_bytes > _LONGEST_URL_BYTES:
+        return Problem(
+            414,
+            "URL too long",
+            f"The URL has {url_bytes} bytes; the limit is {_LONGEST_URL_BYTES}.",
+        )
+    headers = scope["headers"]
+    size_bytes = sum(len(name) + len(value) for name, value in headers)
+    if size_bytes > _LARGEST_HEADERS_BYTES or len(headers) > _MOST_HEADERS:
+        return Problem(
+            431,
+            "Headers too large",
+            f"The request has {len(headers)} headers of {size_bytes} bytes together; the limits "
+            f"are {_MOST_HEADERS} and {_LARGEST_HEADERS_BYTES}.",
+        )
+    return None
+
+
+def limited_receive(scope: Scope, receive: Receive) -> Receive:
+    """Return `receive` with a limit, for routes that read their body as one document.
+
+    A route that streams its body sets `COUNTED` in the scope, and has limits of its own.
+    """
+    size_bytes = 0
+
+    async def received() -> Message:
+        nonlocal size_bytes
+        message = await receive()
+        if message["type"] == "http.request" and not scope.get(COUNTED):
+            size_bytes += len(message.get("body", b""))
+            if size_bytes > _LARGEST_DOCUMENT_BYTES:
+                raise HTTPException(
+                    413,
+                    f"The document is larger than {_LARGEST_DOCUMENT_BYTES} bytes, the limit.",
+                    headers={"Connection": "close"},
+                )
+        return message
+
+    return received
+
+
+def _network(remote: str | None) -> str:
+    """Return the address; of IPv6 the network, because one computer has all of it."""
+    try:
+        address = ipaddress.ip_address(remote or "")
+    except ValueError:
+        return remote or "unknown"
+    if isinstance(address, ipaddress.IPv6Address):
+        mapped = address.ipv4_mapped
+        if mapped is not None:
+            return str(mapped)
+        return str(ipaddress.ip_network((address, 64), strict=False))
+    return str(address)

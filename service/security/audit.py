@@ -1,0 +1,162 @@
+"""The record of who did what. Rows are only ever added."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import structlog
+from sqlalchemy import Engine, insert, select
+
+from service.database.engine import DatabaseAway, reading, writing
+from service.database.tables import audit
+from service.security.callers import Caller
+
+if TYPE_CHECKING:
+    from fastapi import Request
+
+__all__ = ["AuditEntry", "AuditLog", "record"]
+
+_DENIED_SECONDS = 60.0
+_DENIED_KEPT = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class AuditEntry:
+    """One row.
+
+    Attributes
+    ----------
+    id : int
+        Grows; the cursor of pages.
+    at : float
+        Seconds since the epoch.
+    owner : str
+        Who; ``-`` if nobody knows.
+    key_id : str or None
+        By which key; None: on this computer, without one.
+    remote : str or None
+        Address of the other side.
+    action : str
+        For instance ``submit``, ``cancel``, ``delete``, ``machine.change``, ``key.revoke``,
+        ``denied``.
+    subject : str or None
+        What it was done to: the id of a job or key, the name of a machine, a route.
+    details : dict
+        For instance the machine's revision and the source's sha256.
+    """
+
+    id: int
+    at: float
+    owner: str
+    key_id: str | None
+    remote: str | None
+    action: str
+    subject: str | None
+    details: dict[str, Any]
+
+
+class AuditLog:
+    """The audit log in the database.
+
+    Parameters
+    ----------
+    engine : Engine
+    clock : callable
+        Seconds since the epoch.
+    """
+
+    def __init__(self, engine: Engine, *, clock: Callable[[], float] = time.time) -> None:
+        self._engine = engine
+        self._clock = clock
+        self._denied: OrderedDict[tuple[str | None, ...], float] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def add(self, caller: Caller, action: str, subject: str | None, **details: Any) -> None:
+        """Write a row.
+
+        Raises
+        ------
+        DatabaseAway
+        """
+        row = {
+            "at": self._clock(),
+            "owner": caller.owner,
+            "key_id": caller.key_id,
+            "remote": None if caller.remote is None else caller.remote[:64],
+            "action": action[:64],
+            "subject": None if subject is None else subject[:255],
+            "details": details or None,
+        }
+        with writing(self._engine) as connection:
+            connection.execute(insert(audit).values(row))
+
+    def note(self, caller: Caller, action: str, subject: str | None, **details: Any) -> None:
+        """Write a row, and the same into the log.
+
+        What was done is done, so that a database that does not answer is logged, not raised.
+        """
+        log = structlog.get_logger("audit").bind(
+            owner=caller.owner,
+            key_id=caller.key_id,
+            remote=caller.remote,
+            subject=subject,
+            details=details,
+        )
+        try:
+            self.add(caller, action, subject, **details)
+        except DatabaseAway as error:
+            log.error("audit row lost", action=action, reason=str(error))
+        else:
+            log.info("audit", action=action)
+
+    def denied(self, caller: Caller, route: str, why: str) -> None:
+        """Write that somebody was turned away; of one address and reason once a minute.
+
+        Without that limit anybody could fill the disk with rows.
+        """
+        what = (caller.remote, caller.key_id, why)
+        now = self._clock()
+        with self._lock:
+            if now - self._denied.get(what, 0.0) < _DENIED_SECONDS:
+                return
+            self._denied[what] = now
+            self._denied.move_to_end(what)
+            if len(self._denied) > _DENIED_KEPT:
+                self._denied.popitem(last=False)
+        self.note(caller, "denied", route, why=why)
+
+    def page(
+        self, *, limit: int = 100, before: int | None = None, action: str | None = None
+    ) -> list[AuditEntry]:
+        """Return rows, the newest first.
+
+        Parameters
+        ----------
+        limit : int
+            At most so many.
+        before : int, optional
+            Only rows whose id is smaller.
+        action : str, optional
+            Only rows of this action.
+        """
+        query = select(audit).order_by(audit.c.id.desc()).limit(limit)
+        if before is not None:
+            query = query.where(audit.c.id < before)
+        if action is not None:
+            query = query.where(audit.c.action == action)
+        with reading(self._engine) as connection:
+            rows = connection.execute(query).mappings().all()
+        return [AuditEntry(**{**row, "details": row["details"] or {}}) for row in rows]
+
+
+def record(
+    request: Request, caller: Caller, action: str, subject: str | None = None, **details: Any
+) -> None:
+    """Write what a request did into the audit log. Blocks: async routes call it in a thread."""
+    log: AuditLog = request.app.state.audit
+    log.note(caller, action, subject, **details)

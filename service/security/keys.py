@@ -1,0 +1,275 @@
+"""API keys: random, kept as digests, with scopes, an expiry and an end."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import secrets
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from pydantic import SecretStr
+from sqlalchemy import Engine, RowMapping, insert, select, update
+from sqlalchemy.exc import IntegrityError
+
+from service.database.engine import reading, writing
+from service.database.tables import keys
+from service.security.callers import Caller, Scope
+from service.settings import Settings, is_loopback
+
+__all__ = [
+    "KEY_PREFIX",
+    "OWNER_PATTERN",
+    "Key",
+    "KeyRefused",
+    "KeyStore",
+    "UnsafeBinding",
+    "announce_first_key",
+    "keys_needed",
+]
+
+KEY_PREFIX = "sp_"
+OWNER_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
+_FORM = re.compile(rf"{KEY_PREFIX}[A-Za-z0-9_-]{{32,128}}")
+_FIRST = "first"
+# Of a key's last use no more is kept than this, so that reading does not become writing.
+_USE_SECONDS = 60.0
+
+
+class UnsafeBinding(ValueError):
+    """The service would answer other computers without asking for a key."""
+
+
+class KeyRefused(ValueError):
+    """A key or what is asked of it has the wrong form."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What is known of a key; the key itself is not.
+
+    Attributes
+    ----------
+    id : str
+        Names the key in lists and in the audit log; it opens nothing.
+    owner : str
+        Whose jobs its jobs are; several keys may have one owner.
+    name : str
+        What it is for, for a person.
+    scopes : frozenset of Scope
+    created_at, expires_at, revoked_at, used_at : float or None
+        Seconds since the epoch; `used_at` may be a minute behind.
+    """
+
+    id: str
+    owner: str
+    name: str
+    scopes: frozenset[Scope]
+    created_at: float
+    expires_at: float | None = None
+    revoked_at: float | None = None
+    used_at: float | None = None
+
+    def refusal(self, now: float) -> str | None:
+        """Return why the key no longer opens anything, or None."""
+        if self.revoked_at is not None:
+            return f"The key {self.id} was revoked."
+        if self.expires_at is not None and self.expires_at <= now:
+            return f"The key {self.id} has expired."
+        return None
+
+    def caller(self, remote: str | None) -> Caller:
+        """Return who shows this key."""
+        return Caller(self.owner, self.scopes, key_id=self.id, remote=remote)
+
+
+class KeyStore:
+    """The keys in the database.
+
+    A key has 192 random bits, so that a plain SHA-256 of it needs neither salt nor stretching, and
+    looking the digest up tells nobody how much of a guess was right.
+
+    Parameters
+    ----------
+    engine : Engine
+    clock : callable
+        Seconds since the epoch.
+    """
+
+    def __init__(self, engine: Engine, *, clock: Callable[[], float] = time.time) -> None:
+        self._engine = engine
+        self._clock = clock
+
+    def create(
+        self,
+        *,
+        name: str,
+        owner: str,
+        scopes: Iterable[Scope],
+        expires_at: float | None = None,
+    ) -> tuple[Key, str]:
+        """Make a key.
+
+        Returns
+        -------
+        Key, str
+            The second is the key itself; it is not kept and cannot be shown again.
+
+        Raises
+        ------
+        KeyRefused
+        """
+        secret = KEY_PREFIX + secrets.token_urlsafe(24)
+        return self._add(secrets.token_hex(6), secret, name, owner, scopes, expires_at), secret
+
+    def create_first(self, secret: str | None = None) -> str | None:
+        """Make the first key, with all scopes, unless there is or was one already.
+
+        Parameters
+        ----------
+        secret : str, optional
+            The key to take; by default a random one.
+
+        Returns
+        -------
+        str or None
+            The key, or None if there are keys. Of several processes that try, one gets it.
+
+        Raises
+        ------
+        KeyRefused
+            If `secret` does not look like a key.
+        """
+        if secret is not None and _FORM.fullmatch(secret) is None:
+            raise KeyRefused(
+                f"the first key must be {KEY_PREFIX!r} and at least 32 characters of A-Z a-z 0-9 _ "
+                "-; python -c \"import secrets; print('sp_' + secrets.token_urlsafe(24))\" makes "
+                "one (STILLPATH_FIRST_KEY)"
+            )
+        with reading(self._engine) as connection:
+            if connection.execute(select(keys.c.id).limit(1)).first() is not None:
+                return None
+        secret = secret or KEY_PREFIX + secrets.token_urlsafe(24)
+        try:
+            self._add(_FIRST, secret, "first key", "admin", Scope, None)
+        except IntegrityError:
+            return None
+        return secret
+
+    def find(self, secret: str) -> Key | None:
+        """Return the key that `secret` is, whether it still opens anything or not."""
+        if _FORM.fullmatch(secret) is None:
+            return None
+        query = select(keys).where(keys.c.sha256 == _digest(secret))
+        with reading(self._engine) as connection:
+            row = connection.execute(query).mappings().first()
+        return None if row is None else _key(row)
+
+    def used(self, key: Key) -> None:
+        """Note that a key was used, at most once a minute."""
+        now = self._clock()
+        if key.used_at is not None and now - key.used_at < _USE_SECONDS:
+            return
+        with writing(self._engine) as connection:
+            connection.execute(update(keys).where(keys.c.id == key.id).values(used_at=now))
+
+    def list(self) -> list[Key]:
+        """Return all keys, the oldest first."""
+        query = select(keys).order_by(keys.c.created_at, keys.c.id)
+        with reading(self._engine) as connection:
+            return [_key(row) for row in connection.execute(query).mappings()]
+
+    def revoke(self, key_id: str) -> Key | None:
+        """End a key at once and for good; return it, or None if there is none of that id."""
+        with writing(self._engine) as connection:
+            connection.execute(
+                update(keys)
+                .where(keys.c.id == key_id, keys.c.revoked_at.is_(None))
+                .values(revoked_at=self._clock())
+            )
+            row = connection.execute(select(keys).where(keys.c.id == key_id)).mappings().first()
+        return None if row is None else _key(row)
+
+    def _add(
+        self,
+        key_id: str,
+        secret: str,
+        name: str,
+        owner: str,
+        scopes: Iterable[Scope],
+        expires_at: float | None,
+    ) -> Key:
+        key = Key(key_id, owner, name, frozenset(scopes), self._clock(), expires_at)
+        _check(key)
+        row = {
+            "id": key.id,
+            "owner": key.owner,
+            "name": key.name,
+            "sha256": _digest(secret),
+            "scopes": " ".join(sorted(key.scopes)),
+            "created_at": key.created_at,
+            "expires_at": key.expires_at,
+        }
+        with writing(self._engine) as connection:
+            connection.execute(insert(keys).values(row))
+        return key
+
+
+def keys_needed(settings: Settings, host: str) -> bool:
+    """Return whether callers of a service bound to `host` must show a key.
+
+    Raises
+    ------
+    UnsafeBinding
+        If keys are switched off for an address that other computers can reach.
+    """
+    local = is_loopback(host)
+    if settings.keys is None:
+        return not local
+    if not settings.keys and not local:
+        raise UnsafeBinding(
+            f"{host} can be reached from other computers, and keys are switched off "
+            "(STILLPATH_KEYS). Bind 127.0.0.1, or leave keys on"
+        )
+    return settings.keys
+
+
+def announce_first_key(store: KeyStore, given: SecretStr | None) -> None:
+    """Make the first key if there is none, and print it on stdout unless it was given.
+
+    Raises
+    ------
+    KeyRefused
+        If the given one does not look like a key.
+    """
+    made = store.create_first(None if given is None else given.get_secret_value())
+    if made is not None and given is None:
+        # Straight to whoever started the service: a log would keep it.
+        sys.stdout.write(f"stillpath: first key, with all scopes, shown this once: {made}\n")
+        sys.stdout.flush()
+
+
+def _check(key: Key) -> None:
+    if re.fullmatch(OWNER_PATTERN, key.owner) is None:
+        raise KeyRefused(
+            f"owner {key.owner[:80]!r}: give 1 to 64 letters, digits or . _ @ - that begin with a "
+            "letter or digit"
+        )
+    if not 1 <= len(key.name) <= 120 or not key.name.isprintable():
+        raise KeyRefused(f"name {key.name[:80]!r}: give 1 to 120 printable characters")
+    if not key.scopes:
+        raise KeyRefused(f"a key without scopes opens nothing; there is {', '.join(Scope)}")
+    if key.expires_at is not None and key.expires_at <= key.created_at:
+        raise KeyRefused("the key would have expired already; give a later moment")
+
+
+def _digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def _key(row: RowMapping) -> Key:
+    values = dict(row)
+    del values["sha256"]
+    return Key(**values | {"scopes": frozenset(Scope(name) for name in row["scopes"].split())})
