@@ -123,11 +123,9 @@ def _foreign(method: str, host: str, headers: Headers) -> str | None:
         if origin is None or _origin_host(origin) == host.lower():
             return None
         return f"The request comes from another site ({origin[:80]}). Use this service's own page."
-    # See "resource isolation policy": browsers say since 2023 where a request comes from.
-    if (
-        headers.get("sec-fetch-site") == "cross-site"
-        and headers.get("sec-fetch-mode") != "navigate"
-    ):
+    # A "resource isolation policy": browsers say where a request comes from, and what for.
+    site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
+    if site == "cross-site" and mode != "navigate":
         return "Another site's page tries to load this. Open it by itself."
     return None
 

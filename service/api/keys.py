@@ -103,9 +103,7 @@ class AuditPage(BaseModel):
     """Some rows of the audit log, the newest first."""
 
     entries: list[AuditView]
-    next_before: int | None = Field(
-        description="`before` of the next page; null: this is the last."
-    )
+    next_before: int | None = Field(description="`before` of the next page; null: that was all.")
 
 
 @router.get("/keys", responses=responses(401, 403, 429), summary="List the keys")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -106,8 +106,8 @@ def first(data_dir: DataDir = None) -> None:
         secret = _store(engine).create_first()
     if secret is None:
         raise ModelError(
-            "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` makes "
-            "another"
+            "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` "
+            "makes another"
         )
     typer.echo(secret)
 
@@ -193,7 +193,7 @@ def _moment(seconds: float | None) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+def _print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
     """Print columns by tabs where a program reads, as a table on a terminal."""
     import sys
 
