@@ -1,23 +1,425 @@
-from service.jobs.store import JobStore
-from tests.service.database.examples import finished, make_job
+"""The record of jobs, on both databases."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sqlalchemy import Engine, select, text
+
+from service.database.engine import reading, writing
+from service.database.tables import deliveries
+from service.jobs.state import (
+    Cancelled,
+    Event,
+    Failed,
+    Job,
+    JobState,
+    Lost,
+    Progressed,
+    Stale,
+    advance,
+)
+from service.jobs.store import (
+    BadCursor,
+    IdempotencyConflict,
+    JobStore,
+    Quota,
+    QuotaExceeded,
+)
+from tests.service.database.examples import events, finished, make_job
+
+# The database is one for all examples; every example takes jobs and owners of its own.
+many_examples = settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
-def test_smoke(engine):
-    store = JobStore(engine)
-    job = store.add(make_job(webhook="http://x", printer="p"))
-    assert store.get(job.id) == job
-    run = store.claim(job.id, 1500.0, "w")
-    assert store.beat(job.id, 1, 1501.0, "compensating", 0.5, 3.0)
-    assert not store.beat(job.id, 2, 1501.0, "compensating", 0.5, 3.0)
-    assert store.apply(job.id, finished(run)).summary == {"before_um": 9.5}
-    assert store.find_same("anna", job.dedupe_key).id == job.id
-    assert store.lease("a", "x", 5, 0)
-    assert not store.lease("a", "y", 5, 1)
-    assert store.lease("a", "y", 5, 5)
-    print(
-        store.usage("anna"),
-        store.counts(),
-        store.next_queued(5),
-        store.page("anna", limit=3),
-        store.queue_positions(),
+@pytest.fixture
+def store(engine: Engine) -> JobStore:
+    return JobStore(engine)
+
+
+def run(store: JobStore, job: Job, at: float = 1500.0) -> Job:
+    claimed = store.claim(job.id, at, "worker-1")
+    assert claimed is not None
+    return claimed
+
+
+def due(store: JobStore, job: Job) -> dict[str, tuple[str, str, float]]:
+    with reading(store.engine) as connection:
+        rows = connection.execute(select(deliveries).where(deliveries.c.job_id == job.id)).all()
+    return {row.kind: (row.target, row.state, row.next_at) for row in rows}
+
+
+# One job
+
+
+def test_a_job_comes_back_as_it_was(store: JobStore):
+    job = store.add(
+        make_job(
+            options={"method": "fbf", "axes": ["x", "y"], "limit": 0.1 + 0.2, "name": "Größe 😀"},
+            created_at=1790000000.123456789,
+            webhook="https://farm.example/hook",
+            print_after=True,
+            priority=-3,
+            source_bytes=1 << 40,
+            batch="monday",
+        )
     )
+    assert store.get(job.id) == job
+    assert store.get(job.id, "anna") == job
+    assert store.get(job.id, "bob") is None
+    assert store.get("none") is None
+    done = store.apply(job.id, finished(run(store, job)))
+    assert done is not None
+    assert store.get(job.id) == done
+    assert store.many([job.id, "none"]) == {job.id: done}
+    assert store.many([]) == {}
+
+
+@many_examples
+@given(sequence=st.lists(events(), max_size=12))
+def test_the_store_does_what_the_states_say(store: JobStore, sequence: list[Event]):
+    job = store.add(make_job())
+    for event in sequence:
+        try:
+            after = advance(job, event)
+        except Stale:
+            assert store.apply(job.id, event) is None
+        else:
+            assert store.apply(job.id, event) == after
+            job = after
+        assert store.get(job.id) == job
+    store.forget(job.id)
+
+
+@many_examples
+@given(sequence=st.lists(events(), max_size=12))
+def test_a_beat_is_a_progress_in_one_statement(store: JobStore, sequence: list[Event]):
+    one, two = store.add(make_job()), store.add(make_job())
+    for event in sequence:
+        after = store.apply(one.id, event)
+        if isinstance(event, Progressed):
+            beat = store.beat(
+                two.id, event.attempt, event.at, event.stage, event.fraction, event.eta_s
+            )
+            assert beat == (after is not None)
+        else:
+            store.apply(two.id, event)
+    first, second = store.get(one.id), store.get(two.id)
+    assert first is not None
+    assert second is not None
+    for name in ("state", "attempt", "stage", "progress", "eta_s", "heartbeat_at"):
+        assert getattr(first, name) == getattr(second, name)
+
+
+def test_whoever_lost_the_job_is_told_to_stop(store: JobStore):
+    job = run(store, store.add(make_job()))
+    assert store.beat(job.id, 1, 1501.0, "reading", 0.1, None)
+    store.apply(job.id, Cancelled(1502.0))
+    assert not store.beat(job.id, 1, 1503.0, "reading", 0.2, None)
+    other = run(store, store.add(make_job()))
+    assert store.forget(other.id)
+    assert not store.forget(other.id)
+    assert not store.beat(other.id, 1, 1503.0, "reading", 0.2, None)
+    assert store.apply(other.id, finished(other)) is None
+
+
+def test_what_is_silent(store: JobStore):
+    early, late = (store.add(make_job()) for _ in range(2))
+    store.add(make_job())
+    run(store, early, 1500.0)
+    run(store, late, 1500.0)
+    store.beat(late.id, 1, 1510.0, "reading", 0.0, None)
+    assert store.silent(1500.0) == []
+    assert [job.id for job in store.silent(1510.0)] == [early.id]
+    assert {job.id for job in store.silent(1511.0)} == {early.id, late.id}
+
+
+# Submitting
+
+
+def test_the_same_request_leads_to_the_same_job(store: JobStore):
+    first = store.add(make_job(), idempotency=("key", "print"))
+    assert store.add(make_job(), idempotency=("key", "print")) == first
+    with pytest.raises(IdempotencyConflict, match="'key'"):
+        store.add(make_job(), idempotency=("key", "other"))
+    bobs = store.add(make_job(owner="bob"), idempotency=("key", "other"))
+    assert bobs.owner == "bob"
+    assert store.submitted("anna", "key") == ("print", first)
+    assert store.submitted("anna", "new") is None
+    assert sum(store.counts().values()) == 2
+    done = store.apply(first.id, finished(run(store, first)))
+    assert store.add(make_job(), idempotency=("key", "print")) == done
+
+
+def test_a_request_whose_job_was_deleted_counts_anew(store: JobStore):
+    first = store.add(make_job(), idempotency=("key", "print"))
+    store.forget(first.id)
+    assert store.submitted("anna", "key") == ("print", None)
+    second = store.add(make_job(created_at=2000.0), idempotency=("key", "print"))
+    assert second.id != first.id
+    assert store.submitted("anna", "key") == ("print", second)
+    assert store.forget_submissions(2000.0) == 0
+    assert store.forget_submissions(2001.0) == 1
+    assert store.submitted("anna", "key") is None
+
+
+def test_a_quota_of_jobs(store: JobStore):
+    limits = Quota(max_jobs=2, max_bytes=10**9)
+    first = store.add(make_job(), limits=limits)
+    store.add(make_job(), limits=limits)
+    with pytest.raises(QuotaExceeded, match=r"'anna' has 2 jobs .* limit is 2"):
+        store.add(make_job(), idempotency=("key", "print"), limits=limits)
+    # What was refused has left nothing behind.
+    assert store.submitted("anna", "key") is None
+    store.add(make_job(owner="bob"), limits=limits)
+    store.apply(first.id, Cancelled(1500.0))
+    store.add(make_job(), limits=limits)
+    assert store.usage("anna") == (2, 300)
+
+
+def test_a_quota_of_bytes(store: JobStore):
+    limits = Quota(max_jobs=10, max_bytes=300)
+    first = store.add(make_job(), limits=limits)
+    store.apply(first.id, finished(run(store, first)))
+    assert store.usage("anna") == (0, 170)
+    store.add(make_job(), limits=limits)
+    with pytest.raises(QuotaExceeded, match=r"270 bytes .* 100, .* 300"):
+        store.add(make_job(), limits=limits)
+    store.forget(first.id)
+    store.add(make_job(), limits=limits)
+    assert store.usage("nobody") == (0, 0)
+
+
+def test_the_request_that_came_before_is_answered_beyond_the_quota_too(store: JobStore):
+    limits = Quota(max_jobs=1, max_bytes=10**9)
+    first = store.add(make_job(), idempotency=("key", "print"), limits=limits)
+    assert store.add(make_job(), idempotency=("key", "print"), limits=limits) == first
+
+
+def test_the_same_job(store: JobStore):
+    key = "k" * 64
+
+    def add(at: float) -> Job:
+        return store.add(make_job(dedupe_key=key, created_at=at))
+
+    assert store.find_same("anna", key) is None
+    failed, cancelled = run(store, add(1001.0)), add(1002.0)
+    store.apply(failed.id, Failed(1, 1600.0, {}))
+    store.apply(cancelled.id, Cancelled(1600.0))
+    assert store.find_same("anna", key) is None
+    queued = add(1003.0)
+    assert store.find_same("anna", key) == queued
+    running = run(store, add(1000.0))
+    assert store.find_same("anna", key) == running
+    for at in (998.0, 999.0):
+        store.apply((done := add(at)).id, finished(run(store, done)))
+    assert store.find_same("anna", key) == store.get(done.id)
+    assert store.find_same("bob", key) is None
+
+
+# Lists
+
+
+def test_pages_are_newest_first_and_do_not_shift(store: JobStore):
+    # Several at the same moment: the order must be whole all the same.
+    jobs = [store.add(make_job(created_at=1000.0 + n // 3)) for n in range(10)]
+    store.add(make_job(owner="bob"))
+    newest_first = sorted(jobs, key=lambda job: (job.created_at, job.id), reverse=True)
+    found, cursor = [], None
+    for _ in range(4):
+        page = store.page("anna", limit=3, cursor=cursor)
+        found += page.jobs
+        cursor = page.next_cursor
+        store.add(make_job(created_at=9999.0))
+    assert cursor is None
+    assert found == newest_first
+    assert len(store.page(None, limit=100).jobs) == 15
+
+
+def test_a_page_of_some(store: JobStore):
+    first = store.add(make_job(batch="monday"))
+    second = store.add(make_job(batch="monday"))
+    third = run(store, store.add(make_job()))
+    store.apply(second.id, Cancelled(1500.0))
+    assert store.page("anna", states=[JobState.QUEUED], limit=5).jobs == [first]
+    over = [JobState.RUNNING, JobState.CANCELLED]
+    assert {j.id for j in store.page("anna", states=over, limit=5).jobs} == {second.id, third.id}
+    assert {j.id for j in store.page("anna", batch="monday", limit=5).jobs} == {first.id, second.id}
+    assert store.page("anna", limit=3).next_cursor is None
+
+
+@pytest.mark.parametrize(
+    "cursor", ["", "x", "ä", "WzEsMl0", "e30", "W251bGwsImEiXQ", "WzFlOTk5OSwgMV0", "=" * 9]
+)
+def test_a_cursor_that_no_page_gave(store: JobStore, cursor: str):
+    with pytest.raises(BadCursor, match="without a cursor"):
+        store.page("anna", limit=1, cursor=cursor)
+
+
+def test_counting(store: JobStore):
+    assert store.counts() == dict.fromkeys(JobState, 0)
+    assert store.oldest_queued_at() is None
+    jobs = [store.add(make_job(created_at=1000.0 + n)) for n in range(4)]
+    run(store, jobs[0])
+    store.apply(jobs[3].id, Cancelled(1500.0))
+    assert store.counts() == dict.fromkeys(JobState, 0) | {
+        JobState.QUEUED: 2,
+        JobState.RUNNING: 1,
+        JobState.CANCELLED: 1,
+    }
+    assert store.oldest_queued_at() == 1001.0
+    assert [job.id for job in store.in_state(JobState.QUEUED)] == [jobs[1].id, jobs[2].id]
+
+
+def test_what_has_been_kept_long_enough(store: JobStore):
+    jobs = [store.add(make_job()) for _ in range(4)]
+    for job, at in zip(jobs[:3], (3000.0, 2000.0, 4000.0), strict=True):
+        store.apply(job.id, Cancelled(at))
+    assert [job.id for job in store.expired(4000.0)] == [jobs[1].id, jobs[0].id]
+
+
+# The queue
+
+
+def test_owners_take_turns(store: JobStore):
+    annas = [store.add(make_job(created_at=1000.0 + n)).id for n in range(3)]
+    bobs = [store.add(make_job(owner="bob", created_at=1010.0 + n)).id for n in range(2)]
+    carls = store.add(make_job(owner="carl", created_at=1020.0)).id
+    order = [annas[0], bobs[0], carls, annas[1], bobs[1], annas[2]]
+    assert [job.id for job in store.next_queued(9)] == order
+    assert [job.id for job in store.next_queued(2)] == order[:2]
+    # A running job was its owner's turn.
+    assert store.claim(annas[0], 1500.0, "w") is not None
+    order = [bobs[0], carls, annas[1], bobs[1], annas[2]]
+    assert [job.id for job in store.next_queued(9)] == order
+    # What is left out keeps its turn.
+    left = [job.id for job in store.next_queued(9, exclude=[bobs[0], carls])]
+    assert left == [annas[1], bobs[1], annas[2]]
+    positions = {job.id: store.queue_position(job) for job in store.next_queued(9)}
+    assert positions == {job_id: n for n, job_id in enumerate(order)}
+    assert store.queue_positions() == positions
+    running = store.get(annas[0])
+    assert running is not None
+    assert store.queue_position(running) == 0
+
+
+def test_priority_comes_first(store: JobStore):
+    low, high, later = (
+        store.add(make_job(priority=priority, created_at=at))
+        for priority, at in ((0, 1000.0), (5, 1001.0), (0, 1002.0))
+    )
+    bobs = store.add(make_job(owner="bob", created_at=1003.0))
+    # Anna's urgent job was her turn.
+    assert store.next_queued(9) == [high, bobs, low, later]
+
+
+waiting = st.lists(
+    st.tuples(st.sampled_from("abc"), st.integers(-1, 1), st.integers(0, 5)), max_size=12
+)
+
+
+@many_examples
+@given(waiting=waiting, running=st.lists(st.sampled_from("abcd"), max_size=4))
+def test_the_order_is_that_of_one_choice_after_the_other(
+    store: JobStore, waiting: list[tuple[str, int, int]], running: list[str]
+):
+    for owner in running:
+        run(store, store.add(make_job(owner=owner)))
+    jobs = [store.add(make_job(owner=o, priority=p, created_at=float(c))) for o, p, c in waiting]
+    turns = {owner: running.count(owner) for owner in "abcd"}
+    left, expected = list(jobs), []
+    while left:
+        heads = {
+            owner: min(
+                (job for job in left if job.owner == owner),
+                key=lambda job: (-job.priority, job.created_at, job.id),
+            )
+            for owner in {job.owner for job in left}
+        }
+        chosen = min(
+            heads.values(),
+            key=lambda job: (-job.priority, turns[job.owner], job.created_at, job.id),
+        )
+        turns[chosen.owner] += 1
+        left.remove(chosen)
+        expected.append(chosen.id)
+    assert [job.id for job in store.next_queued(99)] == expected
+    # Starting some does not change the order of the others.
+    for job_id in expected[:3]:
+        store.claim(job_id, 1500.0, "w")
+    assert [job.id for job in store.next_queued(99)] == expected[3:]
+    for job in store.page(None, limit=99).jobs:
+        store.forget(job.id)
+
+
+# Deliveries
+
+
+@pytest.mark.parametrize(
+    ("event", "kinds"),
+    [
+        ("finished", {"webhook", "printer"}),
+        (Failed(1, 2000.0, {}), {"webhook"}),
+        (Lost(1, 2000.0, "killed", 1), {"webhook"}),
+        (Cancelled(2000.0), {"webhook"}),
+        (Lost(1, 2000.0, "killed", 2), set()),
+        (Progressed(1, 2000.0, "a", 0.5, None), set()),
+    ],
+)
+def test_who_is_told_of_the_end(store: JobStore, event, kinds: set[str]):
+    job = run(store, store.add(make_job(webhook="https://farm.example", printer="left")))
+    assert due(store, job) == {}
+    assert store.apply(job.id, finished(job) if event == "finished" else event) is not None
+    all_ = {
+        "webhook": ("https://farm.example", "waiting", 2000.0),
+        "printer": ("left", "waiting", 2000.0),
+    }
+    assert due(store, job) == {kind: all_[kind] for kind in kinds}
+    store.forget(job.id)
+    assert due(store, job) == {}
+
+
+def test_nobody_asked_to_be_told(store: JobStore):
+    job = run(store, store.add(make_job()))
+    store.apply(job.id, finished(job))
+    assert due(store, job) == {}
+
+
+def test_a_job_does_not_end_without_its_deliveries(store: JobStore):
+    job = run(store, store.add(make_job(webhook="https://farm.example")))
+    with writing(store.engine) as connection:
+        connection.execute(text("ALTER TABLE deliveries RENAME TO elsewhere"))
+    with pytest.raises(Exception, match="deliveries"):
+        store.apply(job.id, finished(job))
+    with writing(store.engine) as connection:
+        connection.execute(text("ALTER TABLE elsewhere RENAME TO deliveries"))
+    assert store.get(job.id) == job
+    assert store.apply(job.id, finished(job)) is not None
+    assert set(due(store, job)) == {"webhook"}
+
+
+# Leases
+
+
+def test_a_lease(store: JobStore):
+    assert store.lease("reconciler", "one", 5.0, 1000.0)
+    assert not store.lease("reconciler", "two", 5.0, 1004.9)
+    assert store.lease("sweep", "two", 5.0, 1004.9)
+    assert store.lease("reconciler", "one", 5.0, 1004.9)
+    assert not store.lease("reconciler", "two", 5.0, 1009.8)
+    assert store.lease("reconciler", "two", 5.0, 1009.9)
+    assert not store.lease("reconciler", "one", 5.0, 1010.0)
+    store.release("reconciler", "one")
+    assert not store.lease("reconciler", "one", 5.0, 1010.0)
+    store.release("reconciler", "two")
+    assert store.lease("reconciler", "one", 5.0, 1010.0)
+
+
+def test_what_fails_leaves_nothing(store: JobStore):
+    job = store.add(make_job())
+    with pytest.raises(Exception, match=r"(?i)unique"):
+        store.add(job, idempotency=("key", "print"))
+    assert store.submitted("anna", "key") is None
