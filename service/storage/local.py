@@ -1,0 +1,163 @@
+"""Files of jobs in a folder of this computer."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from service.storage.base import Stat, StorageError
+from service.storage.keys import check_key, check_prefix
+
+__all__ = ["LocalStorage"]
+
+_CHUNK_BYTES = 1 << 20
+_FRESH = ".fresh"
+"""Folder of files that are being copied here; no key begins with it."""
+_ATTEMPTS = 5
+_PROBE = b"stillpath" * 512
+
+
+class LocalStorage:
+    """A `service.storage.base.Storage` in a folder: a key is a path below it.
+
+    Parameters
+    ----------
+    root : Path
+        Made if it does not exist.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        with _explained():
+            _make_folder(root / _FRESH)
+
+    def put(self, key: str, file: Path) -> None:
+        """Move a local file to `key`; see `Storage.put`."""
+        target = self._path(key)
+        with _explained():
+            _sync(file)
+            try:
+                self._publish(file, target)
+            except OSError as error:
+                if error.errno != errno.EXDEV:
+                    raise
+                self._copy(file, target)  # from another disk
+
+    @contextlib.contextmanager
+    def local(self, key: str) -> Iterator[Path]:
+        """Give the file of `key` itself; see `Storage.local`."""
+        yield self._file(key)
+
+    def stat(self, key: str) -> Stat:
+        """Return what is known of a file; see `Storage.stat`."""
+        with _explained():
+            status = self._file(key).stat()
+        return Stat(key, status.st_size, status.st_mtime)
+
+    def read(self, key: str, start: int, stop: int) -> Iterator[bytes]:
+        """Yield the bytes from `start` up to `stop`; see `Storage.read`."""
+        with _explained(), self._file(key).open("rb") as file:
+            file.seek(start)
+            while start < stop and (chunk := file.read(min(_CHUNK_BYTES, stop - start))):
+                start += len(chunk)
+                yield chunk
+
+    def list(self, prefix: str) -> Iterator[Stat]:
+        """Yield the files below `prefix`; see `Storage.list`."""
+        check_prefix(prefix)
+        for folder, _, names in os.walk(self._root / prefix):
+            for name in names:
+                path = Path(folder, name)
+                with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
+                    status = path.stat()
+                    key = path.relative_to(self._root).as_posix()
+                    yield Stat(key, status.st_size, status.st_mtime)
+
+    def delete(self, prefix: str) -> None:
+        """Delete the files below `prefix`; see `Storage.delete`."""
+        check_prefix(prefix)
+        with _explained(), contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            shutil.rmtree(self._root / prefix)
+
+    def check(self) -> None:
+        """Write a file of some kB and delete it; see `Storage.check`."""
+        with _explained(), tempfile.TemporaryFile(dir=self._root / _FRESH) as file:
+            file.write(_PROBE)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _path(self, key: str) -> Path:
+        check_key(key)
+        if key.split("/", 1)[0] == _FRESH:
+            raise ValueError(f"{key!r}: no key begins with {_FRESH}")
+        return self._root / key
+
+    def _file(self, key: str) -> Path:
+        path = self._path(key)
+        if not path.is_file():
+            raise FileNotFoundError(errno.ENOENT, "there is no such file in the storage", key)
+        return path
+
+    def _publish(self, file: Path, target: Path) -> None:
+        for attempt in range(_ATTEMPTS):
+            _make_folder(target.parent)
+            try:
+                file.replace(target)
+            except FileNotFoundError:
+                # Somebody deletes this prefix just now, and took the folder away.
+                if attempt == _ATTEMPTS - 1 or not file.exists():
+                    raise
+            else:
+                _sync(target.parent)
+                return
+
+    def _copy(self, file: Path, target: Path) -> None:
+        handle, name = tempfile.mkstemp(dir=self._root / _FRESH)
+        os.close(handle)
+        fresh = Path(name)
+        try:
+            shutil.copyfile(file, fresh)
+            _sync(fresh)
+            self._publish(fresh, target)
+        except BaseException:
+            fresh.unlink(missing_ok=True)
+            raise
+        file.unlink()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and those above it, each durable in the one above."""
+    if folder.is_dir():
+        return
+    if folder.parent != folder:
+        _make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    _sync(folder.parent)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file or the names in a folder are on the disk."""
+    if os.name == "nt" and path.is_dir():
+        return  # Windows opens no folders
+    # Windows syncs only what may be written to.
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _explained() -> Iterator[None]:
+    """Turn the disk's trouble into `StorageError`; a file that is missing stays as it is."""
+    try:
+        yield
+    except (FileNotFoundError, StorageError):
+        raise
+    except OSError as error:
+        raise StorageError(error.errno, error.strerror, error.filename) from error
