@@ -16,11 +16,13 @@ import typer
 
 from service.controllers import commands as controllers
 from service.environment import prepare_environment
+from service.farm import commands as farm
 from service.identification import commands as identification
 from service.interruption import Interrupted
 from service.machines import commands as machines
 from service.proof import commands as proof
 from service.scanning import commands as scanning
+from service.security import commands as security
 
 __all__ = ["app", "main", "run"]
 
@@ -311,6 +313,8 @@ identification.register(app)
 proof.register(app)
 controllers.register(app)
 scanning.register(app)
+security.register(app)
+farm.register(app)
 
 
 def _options(**values: Any) -> Any:

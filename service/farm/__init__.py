@@ -1,0 +1,1 @@
+"""Many files at once: a batch with one summary, and a folder that is watched."""
