@@ -2,14 +2,14 @@
 
 Every channel is the nominal plant's answer to the motion that the firmware executes, measured
 against the same planned path; plants that follow a schedule are those of the moment. Memory stays
-bounded: errors go into tallies, into bins of time that double when they run out, and into a limited
-number of layers with a limited number of points.
+bounded: errors go into tallies, into bins of time that double when they run out, and into tiles of
+layers that are given away.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +19,27 @@ from gcode.types import Moves
 from models.machine import Machine
 from models.schedule import EMPTY, OperatingPoint
 from service.pipeline.band import BandContent
-from service.pipeline.result import Channel, ErrorFigures, GroupFigures, LayerView, Track
+from service.pipeline.layer_views import LayerViews
+from service.pipeline.layers import LayerRecorder, LayerTile
+from service.pipeline.result import (
+    AxisSpectrum,
+    Channel,
+    ErrorFigures,
+    GroupFigures,
+    LayerView,
+    Track,
+)
+from service.pipeline.spectra import ErrorSpectra
 from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 from simulation.scheduled import MachineStream
 
-__all__ = ["Measurement", "MotionSamples", "part_of"]
+__all__ = ["Measurement", "MotionSamples", "channel_names", "part_of"]
 
 Array = NDArray[np.float64]
 
 STRIDE = 6
 """Contour errors are measured at every sixth sample: they change over tens of samples."""
-_LAYERS_SHOWN = 24
-_POINTS_PER_LAYER = 2500
 _TRACK_BINS = 400
 
 
@@ -48,6 +56,8 @@ class MotionSamples:
     row : ndarray of int64, shape (n,)
         Row of `moves` that each sample belongs to.
     moves : Moves
+    first_move : int
+        Number of the first of them in the file.
     """
 
     path_mm: Array
@@ -56,6 +66,7 @@ class MotionSamples:
     extruding: NDArray[np.bool_]
     row: NDArray[np.int64]
     moves: Moves
+    first_move: int = 0
 
     def __len__(self) -> int:
         return int(self.path_mm.shape[1])
@@ -72,26 +83,37 @@ class Measurement:
         The yardstick.
     compensated : bool
         Whether there is a channel `after` beside `before` and `shaper`.
+    take_layer : callable, optional
+        Is given every layer as soon as it is measured; channels as `channel_names` has them.
     """
 
     def __init__(
-        self, machine: Machine, dt_s: float, shaper: BestShaper, *, compensated: bool
+        self,
+        machine: Machine,
+        dt_s: float,
+        shaper: BestShaper,
+        *,
+        compensated: bool,
+        take_layer: Callable[[LayerTile], None] | None = None,
     ) -> None:
         self._dt_s = dt_s
         self._machine = machine
         self._point = EMPTY
         self._band = BandContent(machine, dt_s)
-        self._names = ("before", "after", "shaper") if compensated else ("before", "shaper")
+        self._names = channel_names(compensated=compensated)
         self._meter = MotionMeter(dt_s, stride=STRIDE, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._streams: dict[str, MachineStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(self._names))
-        self._views = _Views(self._names)
+        self._spectra = ErrorSpectra(machine, dt_s, self._names)
+        self._views = LayerViews(self._names)
+        takers = [self._views.add] + ([take_layer] if take_layer else [])
+        self._tiles = LayerRecorder(len(self._names), STRIDE * dt_s, takers)
         self._count = 0
         self._waiting: list[_Points] = []
-        self._fresh = True
+        self._fresh = self._jumped = True
         self._last: MotionSamples | None = None
 
     def operate_at(self, point: OperatingPoint) -> None:
@@ -104,7 +126,10 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = part_of(samples, len(samples) - 1, len(samples))
-            self._waiting.append(_Points.of(samples, slice(-self._count % STRIDE, None, STRIDE)))
+            points = _Points.of(samples, slice(-self._count % STRIDE, None, STRIDE))
+            if len(points):
+                self._waiting.append(replace(points, jumped=self._jumped))
+                self._jumped = False
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
             self._measure(self._shaper.push(samples))
@@ -124,6 +149,7 @@ class Measurement:
                 extruding=np.zeros(samples, dtype=bool),
                 row=last.row[rows],
                 moves=last.moves,
+                first_move=last.first_move,
             )
         )
         return position
@@ -132,13 +158,15 @@ class Measurement:
         """Say that the position is lost: the machine stands still when motion goes on."""
         self._measure(self._shaper.flush())
         self._band.jump()
-        self._fresh = True
+        self._spectra.jump()
+        self._fresh = self._jumped = True
         self._last = None
 
     def finish(self) -> None:
         """Say that the motion has ended."""
         self._measure(self._shaper.flush())
         self._note(self._meter.flush())
+        self._tiles.finish()
 
     def _measure(self, shaped: _Shaped | None) -> None:
         if shaped is None:
@@ -152,8 +180,11 @@ class Measurement:
                 stream.stand()
         self._fresh = False
         commands = {"before": shaped.path_mm, "after": shaped.executed_mm, "shaper": shaped.command}
-        answers = [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
-        self._note(self._meter.push(shaped.path_mm, np.stack(answers), shaped.extruding))
+        answers = np.stack(
+            [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
+        )
+        self._spectra.add(shaped.path_mm, answers, shaped.extruding)
+        self._note(self._meter.push(shaped.path_mm, answers, shaped.extruding))
 
     def _note(self, errors: ContourErrors) -> None:
         done = 0
@@ -167,9 +198,19 @@ class Measurement:
                 points = points.part(slice(count))
             else:
                 del self._waiting[0]
-            self._layers.add(found, points.layer, points.extruding)
-            self._features.add(found, points.feature, points.extruding)
-            self._views.add(points, found)
+            moves, row = points.moves, points.row
+            self._layers.add(found, moves.layer[row], points.extruding)
+            self._features.add(found, moves.feature[row], points.extruding)
+            self._tiles.add(
+                points.path_mm,
+                points.z_mm,
+                points.extruding,
+                row,
+                moves,
+                points.first_move,
+                found,
+                jumped=points.jumped,
+            )
         self._track.add(errors, self._dt_s)
 
     def channels(self) -> list[Channel]:
@@ -227,6 +268,15 @@ class Measurement:
         """Return the layers to draw."""
         return self._views.views()
 
+    def spectra(self) -> list[AxisSpectrum]:
+        """Return the spectra of the error along X and Y."""
+        return self._spectra.spectra()
+
+
+def channel_names(*, compensated: bool) -> tuple[str, ...]:
+    """Return the names of what is measured, in the order of all tables of channels."""
+    return ("before", "after", "shaper") if compensated else ("before", "shaper")
+
 
 @dataclass(frozen=True, slots=True)
 class _Points:
@@ -235,20 +285,20 @@ class _Points:
     path_mm: Array
     z_mm: Array
     extruding: NDArray[np.bool_]
-    line: NDArray[np.int64]
-    layer: NDArray[np.int32]
-    feature: NDArray[np.int32]
+    row: NDArray[np.int64]
+    moves: Moves
+    first_move: int
+    jumped: bool = False
 
     @classmethod
     def of(cls, samples: MotionSamples, which: slice) -> _Points:
-        row, moves = samples.row[which], samples.moves
         return cls(
             samples.path_mm[:, which].copy(),
             samples.z_mm[which].copy(),
             samples.extruding[which].copy(),
-            moves.line[row],
-            moves.layer[row],
-            moves.feature[row],
+            samples.row[which].copy(),
+            samples.moves,
+            samples.first_move,
         )
 
     def part(self, which: slice) -> _Points:
@@ -256,9 +306,10 @@ class _Points:
             self.path_mm[:, which],
             self.z_mm[which],
             self.extruding[which],
-            self.line[which],
-            self.layer[which],
-            self.feature[which],
+            self.row[which],
+            self.moves,
+            self.first_move,
+            self.jumped and not which.start,
         )
 
     def __len__(self) -> int:
@@ -355,73 +406,6 @@ class _Bins:
         return [[round(float(v), 3) for v in 1e3 * np.sqrt(row[: self._used])] for row in mean]
 
 
-class _Views:
-    """Paths of some layers with their errors, thinned out as the print grows."""
-
-    def __init__(self, names: Sequence[str]) -> None:
-        self._names = list(names)
-        self._every = 1
-        self._layers: dict[int, _View] = {}
-
-    def add(self, points: _Points, error_mm: Array) -> None:
-        layer = points.layer
-        for number in np.unique(layer[layer >= 0]).tolist():
-            if number % self._every:
-                continue
-            view = self._layers.setdefault(number, _View(self._names))
-            view.add(points, error_mm, np.flatnonzero(layer == number))
-        while len(self._layers) > 2 * _LAYERS_SHOWN:
-            self._every *= 2
-            self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
-
-    def views(self) -> list[LayerView]:
-        numbers = sorted(k for k, v in self._layers.items() if v.count > 1)
-        if len(numbers) > _LAYERS_SHOWN:
-            pick = np.linspace(0, len(numbers) - 1, _LAYERS_SHOWN).round().astype(int)
-            numbers = [numbers[i] for i in pick]
-        return [self._layers[k].view(k) for k in numbers]
-
-
-class _View:
-    def __init__(self, names: Sequence[str]) -> None:
-        self._step = 2
-        self._rows: list[Array] = []
-        self._names = list(names)
-        self.count = 0
-
-    def add(self, points: _Points, error_mm: Array, chosen: NDArray[np.int64]) -> None:
-        at = chosen[:: self._step]
-        rows = np.stack(
-            [
-                *points.path_mm[:, at],
-                points.z_mm[at],
-                points.extruding[at].astype(float),
-                points.line[at].astype(float),
-                *(1e3 * error_mm[:, at]),
-            ]
-        )
-        self._rows.append(rows)
-        self.count += rows.shape[1]
-        while self.count > 2 * _POINTS_PER_LAYER:
-            self._rows = [np.hstack(self._rows)[:, ::2]]
-            self._step *= 2
-            self.count = self._rows[0].shape[1]
-
-    def view(self, layer: int) -> LayerView:
-        rows = np.hstack(self._rows)
-        extruding = rows[3] > 0.5
-        z = rows[2][extruding] if np.any(extruding) else rows[2]
-        return LayerView(
-            layer=layer,
-            z_mm=round(float(np.median(z)), 4),
-            x_mm=np.round(rows[0], 3).tolist(),
-            y_mm=np.round(rows[1], 3).tolist(),
-            extruding=extruding.tolist(),
-            line=rows[4].astype(int).tolist(),
-            contour_um={n: np.round(rows[5 + i], 2).tolist() for i, n in enumerate(self._names)},
-        )
-
-
 def _figures(contour: Tally, tracking: Tally) -> ErrorFigures:
     return ErrorFigures(
         contour_rms_um=1e3 * contour.rms,
@@ -440,4 +424,5 @@ def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
         samples.extruding[start:stop],
         samples.row[start:stop],
         samples.moves,
+        samples.first_move,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import shutil
 import tempfile
@@ -26,7 +27,8 @@ from models.machine import Machine
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir, replacing
-from service.pipeline.measure import Measurement, MotionSamples
+from service.pipeline.layer_files import written_layers
+from service.pipeline.measure import Measurement, MotionSamples, channel_names
 from service.pipeline.operating import Operation
 from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
@@ -130,6 +132,7 @@ def simulate_file(
     dialect: DialectName | None = None,
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
+    layers: Path | None = None,
 ) -> Result:
     """Predict the vibration of a file as it is, and with the best firmware shaper.
 
@@ -138,25 +141,38 @@ def simulate_file(
     clock = StageClock()
     with clock.stage("yardstick"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-    measurement = Measurement(machine, DT_S, shaper, compensated=False)
     motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
     extruding_s = 0.0
     peak_velocity = 0.0
-    for part in motion:
-        if part.jumped:
-            measurement.jump()
-        with clock.stage("measure"):
-            samples = part.motion()
-            moves = part.own_moves()
-            measurement.operate_at(operation.at(moves))
-            measurement.add(samples)
-            operation.passed(moves)
-        extruding_s += DT_S * float(np.sum(samples.extruding))
-        if len(samples) > 1:
-            step = np.hypot(*np.diff(samples.path_mm))
-            peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
-    measurement.finish()
+    with contextlib.ExitStack() as files:
+        writer = None
+        if layers is not None:
+            names = channel_names(compensated=False)
+            writer = files.enter_context(written_layers(layers, names))
+        measurement = Measurement(
+            machine,
+            DT_S,
+            shaper,
+            compensated=False,
+            take_layer=writer.add if writer else None,
+        )
+        for part in motion:
+            if part.jumped:
+                measurement.jump()
+            with clock.stage("measure"):
+                samples = part.motion()
+                moves = part.own_moves()
+                measurement.operate_at(operation.at(moves))
+                measurement.add(samples)
+                operation.passed(moves)
+            extruding_s += DT_S * float(np.sum(samples.extruding))
+            if len(samples) > 1:
+                step = np.hypot(*np.diff(samples.path_mm))
+                peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
+        measurement.finish()
+        if writer is not None:
+            writer.finish(motion.feature_names)
     size = source.stat().st_size
     return Result(
         version=__version__,
@@ -191,6 +207,7 @@ def simulate_file(
         layers=measurement.layers(),
         features=measurement.features(motion.feature_names),
         track=measurement.track(),
+        spectra=measurement.spectra(),
         layer_views=measurement.layer_views(),
         stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
     )
@@ -224,6 +241,7 @@ class _Part:
             extruding=feeds[row] & self.samples.moving,
             row=row,
             moves=moves,
+            first_move=self.first_move,
         )
 
 

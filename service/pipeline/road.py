@@ -7,6 +7,7 @@ with what it should do; a piece that fails leaves as it came. All figures come f
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import hashlib
 import io
@@ -42,7 +43,8 @@ from service.pipeline.compensating import (
     deviation,
 )
 from service.pipeline.files import default_cache_dir, replacing
-from service.pipeline.measure import Measurement, MotionSamples, part_of
+from service.pipeline.layer_files import LayerWriter, written_layers
+from service.pipeline.measure import Measurement, MotionSamples, channel_names, part_of
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options
@@ -73,6 +75,7 @@ def compensate_file(
     *,
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
+    layers: Path | None = None,
 ) -> Result:
     """Compensate a print file.
 
@@ -88,6 +91,8 @@ def compensate_file(
         Where the tuned shaper of a machine revision is kept.
     progress : callable, optional
         Called now and then; may raise `Cancelled`.
+    layers : Path, optional
+        Folder for layers.json and layers.bin (`service.pipeline.layer_files`).
 
     Returns
     -------
@@ -104,6 +109,7 @@ def compensate_file(
     """
     unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
     with (
+        contextlib.ExitStack() as files,
         replacing(target) as temporary,
         open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
     ):
@@ -112,7 +118,12 @@ def compensate_file(
             tempfile.TemporaryFile(dir=target.parent) as spool,
         ):
             facts = container.facts()
-            job = _Job(container.text, spool, machine, options, cache_dir, progress)
+            writer = None
+            if layers is not None:
+                writer = files.enter_context(
+                    written_layers(layers, channel_names(compensated=True))
+                )
+            job = _Job(container.text, spool, machine, options, cache_dir, progress, writer)
             result = job.run(source.name, facts)
             spool.seek(0)
             job.retiming.copy(spool, text, job.delay_s)
@@ -139,7 +150,9 @@ class _Job:
         options: Options,
         cache_dir: Path | None,
         progress: ProgressCallback | None,
+        layers: LayerWriter | None = None,
     ) -> None:
+        self._layers = layers
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._progress = progress
@@ -165,7 +178,13 @@ class _Job:
         self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._operation = Operation(machine)
-        self._measurement = Measurement(machine, DT_S, self._shaper, compensated=True)
+        self._measurement = Measurement(
+            machine,
+            DT_S,
+            self._shaper,
+            compensated=True,
+            take_layer=layers.add if layers else None,
+        )
         if self._changes:
             self._writer = StreamWriter(self._kit, self._stamp())
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
@@ -195,6 +214,8 @@ class _Job:
         if self._changes:
             self._emit(self._writer.end(self._sum.newline, self._checker.extruder_mm))
         self._measurement.finish()
+        if self._layers is not None:
+            self._layers.finish(self._reader.feature_names)
         self._say("done", 1.0)
         return self._result(name, size, facts)
 
@@ -256,7 +277,7 @@ class _Job:
         with self._clock.stage("measure"):
             planned, position, row, extruding = as_executed(made, piece.phases, executed)
             last = len(row) - 1
-            samples = _samples(piece, row, planned, position, extruding)
+            samples = self._samples(piece, row, planned, position, extruding)
             # The last sample of an item is the first one of the next.
             self._measurement.add(part_of(samples, 0, last))
         late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
@@ -322,8 +343,27 @@ class _Job:
             moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
             extruding = moving & (phases.direction[row, 3] > 0.0)
             at = phases.move_index[row]
-            self._measurement.add(_samples(passage, at, position, position, extruding))
+            self._measurement.add(self._samples(passage, at, position, position, extruding))
             self._observe(position[:2])
+
+    def _samples(
+        self,
+        item: Piece | Passage,
+        row: np.ndarray,
+        planned: np.ndarray,
+        executed: np.ndarray,
+        extruding: np.ndarray,
+    ) -> MotionSamples:
+        """Return the samples of an item whose moves have been counted."""
+        return MotionSamples(
+            path_mm=planned[:2],
+            executed_mm=executed[:2],
+            z_mm=planned[2],
+            extruding=extruding,
+            row=row,
+            moves=item.moves,
+            first_move=self._sum.moves - len(item.moves),
+        )
 
     def _stand(self, dwell_s: float) -> None:
         """Let the machine stand where it is."""
@@ -459,6 +499,7 @@ class _Job:
             layers=measured.layers(),
             features=measured.features(self._reader.feature_names),
             track=measured.track(),
+            spectra=measured.spectra(),
             layer_views=measured.layer_views(),
             stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
         )
@@ -555,23 +596,6 @@ def _feeding(phases: Phases) -> np.ndarray:
     direction = phases.direction
     moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
     return np.asarray(moves_xy & (direction[:, 3] > 0.0))
-
-
-def _samples(
-    item: Piece | Passage,
-    row: np.ndarray,
-    planned: np.ndarray,
-    executed: np.ndarray,
-    extruding: np.ndarray,
-) -> MotionSamples:
-    return MotionSamples(
-        path_mm=planned[:2],
-        executed_mm=executed[:2],
-        z_mm=planned[2],
-        extruding=extruding,
-        row=row,
-        moves=item.moves,
-    )
 
 
 def _move_rows(passage: Passage, first: int, last: int) -> Moves:
