@@ -121,7 +121,7 @@ deliveries = Table(
     # webhook or printer
     Column("kind", String(16), nullable=False),
     Column("target", Text, nullable=False),
-    # waiting, done or failed
+    # waiting, sending (claimed until next_at), done or failed
     Column("state", String(16), nullable=False, index=True),
     Column("attempts", Integer, nullable=False, default=0),
     Column("next_at", Float, nullable=False),

@@ -1,0 +1,129 @@
+"""One POST to a checked address: no redirects, no proxies, and an honest end."""
+
+from __future__ import annotations
+
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from service.deliveries.targets import Target, Unresolved, addresses_of
+from service.version import __version__
+
+if TYPE_CHECKING:
+    import httpx2
+
+__all__ = ["Reply", "Unanswered", "Unreached", "post"]
+
+_CONNECT_S = 10.0
+_LONGEST_REPLY_BYTES = 4096
+
+
+class Unreached(Exception):
+    """Nothing was sent: nobody listens there, or the name is unknown."""
+
+
+class Unanswered(Exception):
+    """Something was sent, and nobody knows what came of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What came back; of the body only the beginning."""
+
+    status: int
+    text: str
+
+
+def post(
+    target: Target,
+    *,
+    headers: Mapping[str, str],
+    content: bytes | None = None,
+    fields: Mapping[str, str] | None = None,
+    file: tuple[str, BinaryIO] | None = None,
+    loopback: bool = False,
+    timeout_s: float = 10.0,
+) -> Reply:
+    """Send one request.
+
+    Parameters
+    ----------
+    target : Target
+    headers : mapping
+    content : bytes, optional
+        The body; or else a form of
+    fields : mapping, optional
+        and
+    file : tuple of (name, open file), optional
+        which is streamed.
+    loopback : bool
+        Whether the target may be this computer though its name does not say so.
+    timeout_s : float
+        How long the other side may be silent.
+
+    Raises
+    ------
+    TargetRefused
+        If the address is one that nothing is sent to.
+    Unreached, Unanswered
+    """
+    import httpx2
+
+    try:
+        addresses = addresses_of(target, loopback=loopback)
+    except Unresolved as error:
+        raise Unreached(str(error)) from None
+    body: dict[str, Any] = {"content": content}
+    if file is not None:
+        name, stream = file
+        body = {
+            "data": dict(fields or {}),
+            "files": {"file": (name, stream, "application/octet-stream")},
+        }
+    # The environment's proxies would connect to where the name leads them.
+    with httpx2.Client(
+        trust_env=False,
+        follow_redirects=False,
+        verify=ssl.create_default_context(),
+        timeout=httpx2.Timeout(timeout_s, connect=_CONNECT_S),
+        headers={"User-Agent": f"stillpath/{__version__}", "Accept-Encoding": "identity"},
+    ) as client:
+        for address in addresses:
+            if file is not None:
+                file[1].seek(0)
+            # To the address that was checked; the name goes into Host, and TLS asks for it.
+            request = client.build_request(
+                "POST",
+                httpx2.URL(
+                    scheme=target.scheme,
+                    host=address,
+                    port=target.port,
+                    raw_path=target.path.encode(),
+                ),
+                headers={**headers, "Host": target.authority},
+                extensions={"sni_hostname": target.host},
+                **body,
+            )
+            try:
+                return _sent(client, request)
+            except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout) as error:
+                reason = f"{target} cannot be reached: {error or type(error).__name__}"
+            except httpx2.HTTPError as error:
+                raise Unanswered(
+                    f"{target} did not answer: {error or type(error).__name__}"
+                ) from error
+    raise Unreached(reason)
+
+
+def _sent(client: httpx2.Client, request: httpx2.Request) -> Reply:
+    response = client.send(request, stream=True)
+    try:
+        start = b""
+        for chunk in response.iter_raw():
+            start += chunk
+            if len(start) >= _LONGEST_REPLY_BYTES:
+                break
+    finally:
+        response.close()
+    return Reply(response.status_code, start[:_LONGEST_REPLY_BYTES].decode("utf-8", "replace"))

@@ -1,0 +1,177 @@
+"""Printers that results are uploaded to: their file, and how Moonraker and OctoPrint want it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+
+from service.deliveries.posting import Reply, post
+from service.deliveries.targets import TargetRefused, read_url
+from service.pipeline.options import Options
+
+__all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
+
+_METHOD = Options.model_json_schema()["properties"]["method"]["pattern"]
+# A small computer reads a large file through before it answers.
+_TIMEOUT_S = 300.0
+
+
+class PrinterFileError(ValueError):
+    """The file of printers cannot be used."""
+
+
+class Printer(BaseModel):
+    """A section ``[printer.NAME]`` of the file.
+
+    Attributes
+    ----------
+    name : str
+    kind : str
+        Which words it understands.
+    url : str
+        Where its Moonraker or OctoPrint is.
+    api_key : str, optional
+        That it asks for.
+    machine : str
+        Of the model that files for this printer are made with.
+    method, tolerance_um : optional
+        Likewise, where the upload does not say.
+    start : bool
+        Whether an upload may start a print. By default somebody must look at the printer first.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    kind: Literal["moonraker", "octoprint"]
+    url: str
+    api_key: SecretStr | None = None
+    machine: Annotated[str, Field(min_length=1, max_length=255)]
+    method: Annotated[str, Field(pattern=_METHOD)] | None = None
+    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] | None = None
+    start: bool = False
+
+    @field_validator("url")
+    @classmethod
+    def _plain(cls, url: str) -> str:
+        target = read_url(url)
+        if "?" in target.path:
+            raise ValueError("the address has a query (?...); give it without")
+        return url.rstrip("/")
+
+
+def load_printers(path: Path | None) -> dict[str, Printer]:
+    """Return the printers of a file by name; none without a file.
+
+    Raises
+    ------
+    PrinterFileError
+    """
+    if path is None:
+        return {}
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise PrinterFileError(f"{path} (STILLPATH_PRINTERS) cannot be read: {error}") from error
+    sections = content.pop("printer", {})
+    if content or not isinstance(sections, dict):
+        raise PrinterFileError(f"{path}: there may be sections [printer.NAME] only")
+    return {name: _printer(path, name, section) for name, section in sections.items()}
+
+
+def printer_for(printers: Mapping[str, Printer], name: str, *, start: bool = False) -> Printer:
+    """Return a printer that a job asks for.
+
+    Raises
+    ------
+    TargetRefused
+        If there is none of that name, or it must not be started and `start` asks for that.
+    """
+    printer = printers.get(name)
+    if printer is None:
+        known = ", ".join(sorted(printers)) or "none"
+        raise TargetRefused(f"no printer is called {name[:64]!r}; known: {known}")
+    if start and not printer.start:
+        raise TargetRefused(
+            f"prints on {name} are not started from here; start it at the printer, or set "
+            f"start = true in [printer.{name}]"
+        )
+    return printer
+
+
+def upload(
+    printer: Printer, file: Path, name: str, *, sha256: str | None, start: bool = False
+) -> Reply:
+    """Upload a file to a printer, streaming.
+
+    Parameters
+    ----------
+    printer : Printer
+    file : Path
+    name : str
+        What the printer shall call it; one there of the same name is replaced.
+    sha256 : str, optional
+        Of the file; Moonraker checks it.
+    start : bool
+        Whether the printer shall print it now.
+
+    Raises
+    ------
+    TargetRefused, Unreached, Unanswered
+        See `service.deliveries.posting.post`.
+    """
+    fields = {"print": "true" if start else "false"}
+    if printer.kind == "moonraker":
+        path = "/server/files/upload"
+        fields["root"] = "gcodes"
+        if sha256 is not None:
+            fields["checksum"] = sha256
+    else:
+        path = "/api/files/local"
+        fields["select"] = fields["print"]
+    headers = {}
+    if printer.api_key is not None:
+        headers["X-Api-Key"] = printer.api_key.get_secret_value()
+    with file.open("rb") as stream:
+        return post(
+            read_url(printer.url + path),
+            headers=headers,
+            fields=fields,
+            file=(name, stream),
+            loopback=True,  # whoever wrote the file of printers meant it
+            timeout_s=_TIMEOUT_S,
+        )
+
+
+def what_started(printer: Printer, reply: Reply) -> str | None:
+    """Return why a printer that was asked to print did not begin, as far as it says so."""
+    if printer.kind != "moonraker":
+        return None
+    try:
+        told: Any = json.loads(reply.text)
+    except ValueError:
+        return None
+    if not isinstance(told, dict) or told.get("print_started", True) is True:
+        return None
+    if told.get("print_queued"):
+        return "uploaded; the printer put it into its queue"
+    return "uploaded, but the printer did not begin to print; it may be busy or not ready"
+
+
+def _printer(path: Path, name: str, section: Any) -> Printer:
+    if not isinstance(section, dict):
+        raise PrinterFileError(f"{path}: printer.{name} is no section")
+    try:
+        return Printer(**{**section, "name": name})
+    except ValidationError as error:
+        # Without what was given: it may be the key.
+        first = error.errors(include_input=False, include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise PrinterFileError(f"{path}: [printer.{name}] {place}: {first['msg']}") from None
+    except TypeError as error:
+        raise PrinterFileError(f"{path}: [printer.{name}]: {error}") from None

@@ -1,0 +1,130 @@
+"""The table of deliveries: what is due, who sends it now, and what became of it.
+
+::
+
+    waiting --claimed--> sending --> done
+       ^                    |  +---> failed
+       +---- tried again ---+
+
+A claim lasts until `next_at` and is prolonged while something is sent; the number of attempts is
+its fence. So several processes may send, each delivery is sent by one at a time, and one whose
+sender was killed is taken up by another.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from sqlalchemy import Engine, select, update
+
+from service.database.engine import reading, writing
+from service.database.tables import deliveries
+
+__all__ = ["Delivery", "claim", "deliveries_of", "prolong", "settle"]
+
+_AT_ONCE = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """One row.
+
+    Attributes
+    ----------
+    id : int
+    job_id : str
+    kind : str
+        ``webhook`` or ``printer``.
+    target : str
+        Address, or name of the printer.
+    state : str
+        ``waiting``, ``sending``, ``done`` or ``failed``.
+    attempts : int
+        How often it was begun.
+    next_at : float
+        Seconds since the epoch: when it is tried next, or until when its sender has claimed it.
+    error : str or None
+        What went wrong the last time.
+    """
+
+    id: int
+    job_id: str
+    kind: str
+    target: str
+    state: str
+    attempts: int
+    next_at: float
+    error: str | None
+
+
+def deliveries_of(engine: Engine, job_ids: Iterable[str]) -> dict[str, list[Delivery]]:
+    """Return what goes out for jobs, by their ids."""
+    wanted = list(dict.fromkeys(job_ids))
+    found: defaultdict[str, list[Delivery]] = defaultdict(list)
+    for start in range(0, len(wanted), _AT_ONCE):
+        query = (
+            select(deliveries)
+            .where(deliveries.c.job_id.in_(wanted[start : start + _AT_ONCE]))
+            .order_by(deliveries.c.id)
+        )
+        with reading(engine) as connection:
+            for row in connection.execute(query).mappings():
+                found[row["job_id"]].append(Delivery(**row))
+    return dict(found)
+
+
+def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] | None:
+    """Take the delivery that has been due for longest.
+
+    Returns
+    -------
+    Delivery, bool
+        As claimed; and whether an earlier attempt ended without a word, so that nobody knows
+        whether it arrived. None: nothing is due.
+    """
+    due = (
+        select(deliveries)
+        .where(deliveries.c.state.in_(("waiting", "sending")), deliveries.c.next_at <= now)
+        .order_by(deliveries.c.next_at, deliveries.c.id)
+        .limit(1)
+    )
+    with reading(engine) as connection:
+        row = connection.execute(due).mappings().first()
+    if row is None:
+        return None
+    before = Delivery(**row)
+    after = replace(before, state="sending", attempts=before.attempts + 1, next_at=until)
+    if not _changed(engine, before, after):
+        return None  # another process was quicker; there will be a next time
+    return after, before.state == "sending"
+
+
+def prolong(engine: Engine, claimed: Delivery, *, until: float) -> bool:
+    """Keep a claim; False: it is lost, or the job was deleted."""
+    return _changed(engine, claimed, replace(claimed, next_at=until))
+
+
+def settle(
+    engine: Engine, claimed: Delivery, state: str, *, next_at: float, error: str | None = None
+) -> bool:
+    """Write down what became of a claimed delivery; False: it is no longer ours."""
+    text = None if error is None else error[:2000]
+    return _changed(engine, claimed, replace(claimed, state=state, next_at=next_at, error=text))
+
+
+def _changed(engine: Engine, before: Delivery, after: Delivery) -> bool:
+    statement = (
+        update(deliveries)
+        .where(
+            deliveries.c.id == before.id,
+            deliveries.c.state == before.state,
+            deliveries.c.attempts == before.attempts,
+        )
+        .values(
+            state=after.state, attempts=after.attempts, next_at=after.next_at, error=after.error
+        )
+    )
+    with writing(engine) as connection:
+        return connection.execute(statement).rowcount == 1

@@ -1,0 +1,229 @@
+"""Sends what is due: a thread that claims, and a few that send."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping
+
+import structlog
+from sqlalchemy import Engine
+
+from service.database.engine import DatabaseAway
+from service.deliveries import rows
+from service.deliveries.posting import Reply, Unanswered, Unreached
+from service.deliveries.printers import Printer, printer_for, upload, what_started
+from service.deliveries.rows import Delivery
+from service.deliveries.targets import TargetRefused, check_webhook
+from service.deliveries.webhooks import send_webhook
+from service.jobs.state import Job
+from service.jobs.store import JobStore
+from service.settings import Settings
+from service.storage.base import Storage, StorageError
+
+__all__ = ["Sender"]
+
+_AT_ONCE = 4
+_STOP_S = 5.0
+_GROWTH = 3.0
+_LONGEST_WAIT_S = 6 * 3600.0
+# Asking again would be answered in the same way.
+_IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
+
+
+class Sender:
+    """Sends webhooks, and results to printers.
+
+    Every process of the service may have one; a claim on the row decides who sends what. What
+    cannot be delivered is tried again after 5 s, 15 s, 45 s, ... 6 h, ten times in all. A webhook
+    may arrive twice. An upload that shall start a print is never repeated unless it certainly did
+    not arrive: a second print could begin on top of the first.
+
+    Parameters
+    ----------
+    engine : Engine
+    store : JobStore
+    storage : Storage
+    settings : Settings
+    printers : mapping
+        From `service.deliveries.printers.load_printers`.
+    first_wait_s : float
+        Before the second attempt; each further one takes three times as long.
+    attempts : int
+    claim_s : float
+        After how long without a word the sender of a delivery counts as dead.
+    poll_s : float
+        How often the table is looked at.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        store: JobStore,
+        storage: Storage,
+        settings: Settings,
+        printers: Mapping[str, Printer],
+        *,
+        first_wait_s: float = 5.0,
+        attempts: int = 10,
+        claim_s: float = 60.0,
+        poll_s: float = 1.0,
+    ) -> None:
+        self._engine = engine
+        self._store = store
+        self._storage = storage
+        self._settings = settings
+        self._printers = printers
+        self._first_wait_s = first_wait_s
+        self._attempts = attempts
+        self._claim_s = claim_s
+        self._poll_s = poll_s
+        self._log = structlog.get_logger("deliveries")
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._main: threading.Thread | None = None
+        # What is being sent, and until when it is claimed; touched by the main thread only.
+        self._sending: dict[threading.Thread, tuple[Delivery, float]] = {}
+
+    def start(self) -> None:
+        """Begin to send."""
+        self._main = threading.Thread(target=self._run, name="deliveries", daemon=True)
+        self._main.start()
+
+    def stop(self) -> None:
+        """Send nothing more; wait a moment for what is on its way.
+
+        What takes longer is left to the next start, as if the process had been killed.
+        """
+        self._stopping.set()
+        self._wake.set()
+        if self._main is not None:
+            self._main.join()
+        deadline = time.monotonic() + _STOP_S
+        for thread in self._sending:
+            thread.join(max(0.0, deadline - time.monotonic()))
+
+    def notify(self) -> None:
+        """Look at the table now."""
+        self._wake.set()
+
+    def _run(self) -> None:
+        away = False
+        while not self._stopping.is_set():
+            try:
+                self._keep_claims()
+                claimed = len(self._sending) < _AT_ONCE and self._claim()
+                away = False
+            except DatabaseAway as error:
+                if not away:
+                    self._log.warning("no deliveries for now", reason=str(error))
+                away, claimed = True, False
+            if not claimed:
+                self._wake.wait(self._poll_s)
+                self._wake.clear()
+
+    def _keep_claims(self) -> None:
+        now = time.time()
+        for thread, (claimed, until) in list(self._sending.items()):
+            if not thread.is_alive():
+                del self._sending[thread]
+            elif until - now < self._claim_s / 2:
+                until = now + self._claim_s
+                rows.prolong(self._engine, claimed, until=until)
+                self._sending[thread] = (claimed, until)
+
+    def _claim(self) -> bool:
+        now = time.time()
+        until = now + self._claim_s
+        found = rows.claim(self._engine, now=now, until=until)
+        if found is None:
+            return False
+        thread = threading.Thread(
+            target=self._deliver, args=found, name=f"delivery-{found[0].id}", daemon=True
+        )
+        self._sending[thread] = (found[0], until)
+        thread.start()
+        return True
+
+    def _deliver(self, claimed: Delivery, unknown_before: bool) -> None:
+        """Send one delivery and write down what became of it."""
+        log = self._log.bind(
+            job=claimed.job_id, delivery=claimed.id, kind=claimed.kind, attempt=claimed.attempts
+        )
+        try:
+            state, error = self._outcome(claimed, unknown_before)
+        except Exception as broken:
+            log.error("delivery broke", exc_info=broken)
+            state, error = "waiting", "the service broke; its log holds the details"
+        wait_s = 0.0
+        if state == "waiting":
+            wait_s = min(self._first_wait_s * _GROWTH ** (claimed.attempts - 1), _LONGEST_WAIT_S)
+            if claimed.attempts >= self._attempts:
+                state, error = "failed", f"{error}; given up after {claimed.attempts} attempts"
+        log.info("delivery", state=state, reason=error)
+        self._settle(claimed, state, time.time() + wait_s, error)
+
+    def _settle(self, claimed: Delivery, state: str, next_at: float, error: str | None) -> None:
+        """Write it down, for as long as the claim holds if the database is away."""
+        deadline = time.monotonic() + self._claim_s
+        while True:
+            try:
+                rows.settle(self._engine, claimed, state, next_at=next_at, error=error)
+                return
+            except DatabaseAway:
+                if time.monotonic() > deadline or self._stopping.wait(1.0):
+                    return
+
+    def _outcome(self, claimed: Delivery, unknown_before: bool) -> tuple[str, str | None]:
+        """Send, and return the row's next state and error."""
+        job = self._store.get(claimed.job_id)
+        if job is None:
+            return "failed", "the job was deleted"
+        starts = claimed.kind == "printer" and job.print_after
+        if starts and unknown_before:
+            return "failed", _unknown("the service was stopped while it sent")
+        try:
+            if claimed.kind == "webhook":
+                return _judged(self._send_webhook(claimed, job))
+            return self._send_to_printer(job, claimed.target)
+        except TargetRefused as error:
+            return "failed", str(error)
+        except FileNotFoundError:
+            return "failed", "the result is gone"
+        except (Unreached, StorageError) as error:
+            return "waiting", str(error)
+        except Unanswered as error:
+            return ("failed", _unknown(str(error))) if starts else ("waiting", str(error))
+
+    def _send_webhook(self, claimed: Delivery, job: Job) -> Reply:
+        target = check_webhook(claimed.target, self._settings)
+        secret = self._settings.webhook_secret
+        assert secret is not None  # check_webhook has seen to it
+        return send_webhook(
+            job, target, secret.get_secret_value(), delivery=claimed.id, now=time.time()
+        )
+
+    def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
+        printer = printer_for(self._printers, name, start=job.print_after)
+        with self._storage.local(f"{job.output}/result/{job.result_name}") as file:
+            reply = upload(
+                printer, file, job.result_name, sha256=job.result_sha256, start=job.print_after
+            )
+        state, error = _judged(reply)
+        if state == "done" and job.print_after:
+            error = what_started(printer, reply)
+        return state, error
+
+
+def _judged(reply: Reply) -> tuple[str, str | None]:
+    if 200 <= reply.status < 300:
+        return "done", None
+    said = " ".join(reply.text.split())[:300]
+    error = f"answered with status {reply.status}" + (f": {said}" if said else "")
+    if 300 <= reply.status < 400:
+        return "failed", f"answered with status {reply.status}; redirects are not followed"
+    return ("failed" if reply.status in _IN_VAIN else "waiting"), error
+
+
+def _unknown(why: str) -> str:
+    return f"{why}; the print may have been started or not, so it is not tried again: look at it"
