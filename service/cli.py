@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from service.backup import commands as backup
 from service.controllers import commands as controllers
 from service.environment import prepare_environment
 from service.farm import commands as farm
@@ -21,8 +22,11 @@ from service.identification import commands as identification
 from service.interruption import Interrupted
 from service.machines import commands as machines
 from service.proof import commands as proof
+from service.remote import KeyOption, ServerOption, compensate_on_server
+from service.remote import register as register_jobs
 from service.scanning import commands as scanning
 from service.security import commands as security
+from service.trajectories import register as register_trajectories
 
 __all__ = ["app", "main", "run"]
 
@@ -63,7 +67,10 @@ DialectOption = Annotated[
     ),
 ]
 ReportOption = Annotated[
-    Path | None, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
+    Path | None,
+    typer.Option(
+        "--report", metavar="DIR", help="Folder for report.html and .json, layers.json and .bin."
+    ),
 ]
 
 
@@ -98,6 +105,10 @@ def run(arguments: list[str]) -> int:
         if not _is_ours(error):
             raise
         return _fail(str(error), 2)
+    except Exception as error:  # of a service that was asked: it knows how bad it is
+        if not hasattr(error, "exit_code"):
+            raise
+        return _fail(str(error), error.exit_code)
 
 
 @app.callback(invoke_without_command=True)
@@ -152,6 +163,8 @@ def compensate(
         typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),
     ] = False,
     report: ReportOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
@@ -170,13 +183,20 @@ def compensate(
     _check_input(source)
     target = _check_output(output or source)
     _check_folder(report)
+    if server:
+        compensate_on_server(
+            source, target, machine, options, server=server, key=key, report=report
+        )
+        return
     found = _machine(machine)
 
     from service.console import print_result, progress_shown
     from service.pipeline.road import compensate_file
 
     with progress_shown("stillpath") as progress:
-        result = compensate_file(source, target, found.machine, options, progress=progress)
+        result = compensate_file(
+            source, target, found.machine, options, progress=progress, layers=report
+        )
     result.warnings.extend(found.warnings)
     _write_report(result, report)
     print_result(result)
@@ -220,7 +240,12 @@ def simulate(
     source: Input,
     machine: MachineOption,
     report: Annotated[
-        Path, typer.Option("--report", metavar="DIR", help="Folder for report.html and .json.")
+        Path,
+        typer.Option(
+            "--report",
+            metavar="DIR",
+            help="Folder for report.html and .json, layers.json and .bin.",
+        ),
     ],
     plate: PlateOption = None,
     dialect: DialectOption = None,
@@ -236,7 +261,12 @@ def simulate(
 
     with progress_shown("stillpath") as progress:
         result = simulate_file(
-            source, found.machine, plate=plate, dialect=read_as, progress=progress
+            source,
+            found.machine,
+            plate=plate,
+            dialect=read_as,
+            progress=progress,
+            layers=report,
         )
     result.warnings.extend(found.warnings)
     _write_report(result, report)
@@ -313,8 +343,11 @@ identification.register(app)
 proof.register(app)
 controllers.register(app)
 scanning.register(app)
+register_trajectories(app)
 security.register(app)
 farm.register(app)
+backup.register(app)
+register_jobs(app)
 
 
 def _options(**values: Any) -> Any:

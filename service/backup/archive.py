@@ -1,0 +1,311 @@
+"""One tar file with database, results and machines, taken while the service works.
+
+The database comes first, by SQLite's own online backup; then the files that its rows name, which
+never change once a row names them; then everything else. A job that was deleted meanwhile is taken
+out of the copy, so that no row is without its files. The manifest closes the archive: a file that
+is broken off has none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import io
+import os
+import shutil
+import sqlite3
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from service.exclusive import exclusive
+from service.pipeline.files import replacing
+from service.version import __version__
+
+__all__ = ["BackupError", "Manifest", "back_up", "restore"]
+
+DATABASE = "stillpath.sqlite3"
+_OLD_DATABASE = "jobs.sqlite3"
+_MANIFEST = "backup.json"
+_RESTORING = ".restoring"
+_LOCK = "service.lock"
+_PASSING = frozenset({"incoming", "scratch", "cache", "jobs", _LOCK})
+"""What is no data at the top of the directory, and jobs, which the database leads to."""
+_CHUNK_BYTES = 1 << 20
+
+
+class BackupError(Exception):
+    """It cannot be backed up or restored; the message says what to do."""
+
+
+class Manifest(BaseModel):
+    """What an archive holds: SHA-256 and size in bytes of every file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    version: str
+    jobs: int
+    files: dict[str, tuple[str, int]]
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all files."""
+        return sum(size for _, size in self.files.values())
+
+
+def back_up(data_dir: Path, target: Path) -> Manifest:
+    """Write an archive of a data directory, whether or not a service works there.
+
+    Parameters
+    ----------
+    data_dir : Path
+    target : Path
+        A new file; compressed if its name ends with ``gz``.
+
+    Raises
+    ------
+    BackupError, OSError
+    """
+    if not data_dir.is_dir():
+        raise BackupError(f"there is no data directory {data_dir}; name it with --data-dir")
+    if target.exists():
+        raise BackupError(f"{target} is there already; name a new file")
+    if target.resolve().is_relative_to(data_dir.resolve()):
+        raise BackupError(f"{target} lies in the data directory; name a file elsewhere")
+    if (data_dir / _RESTORING).exists():
+        raise BackupError(f"{data_dir}: a restore was broken off there; finish it first")
+    if (data_dir / _OLD_DATABASE).exists():
+        raise BackupError(f"{data_dir} is of an earlier version; run `stillpath migrate` first")
+    with (
+        replacing(target) as temporary,
+        tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as work,
+        tarfile.open(
+            temporary, "w:gz" if target.name.endswith("gz") else "w", format=tarfile.PAX_FORMAT
+        ) as tar,
+    ):
+        archive = _Archive(tar)
+        jobs = 0
+        if (data_dir / DATABASE).exists():
+            jobs = _add_jobs(archive, data_dir, Path(work) / DATABASE)
+        _add_rest(archive, data_dir)
+        manifest = Manifest(version=__version__, jobs=jobs, files=archive.files)
+        archive.add_text(_MANIFEST, manifest.model_dump_json(indent=1))
+    return manifest
+
+
+def restore(source: Path, data_dir: Path) -> Manifest:
+    """Fill an empty data directory from an archive; every file is checked before any counts.
+
+    Raises
+    ------
+    BackupError
+        The archive is damaged or broken off, or there are data already; nothing has changed then.
+    OSError
+        EBUSY if a service works with the directory.
+    """
+    with exclusive(data_dir):
+        fresh = data_dir / _RESTORING
+        if fresh.exists():  # whatever else is here came from a restore that was broken off
+            _clear(data_dir)
+        there = sorted(p.name for p in data_dir.iterdir() if p.name not in (_LOCK, _RESTORING))
+        if there:
+            raise BackupError(
+                f"{data_dir} is not empty ({', '.join(there[:3])}); move it away, or name another "
+                "folder with --data-dir"
+            )
+        fresh.mkdir()
+        try:
+            manifest = _unpack(source, fresh)
+        except BaseException:
+            shutil.rmtree(fresh)
+            raise
+        names = sorted(path.name for path in fresh.iterdir())
+        for name in sorted(names, key=lambda name: name == DATABASE):
+            (fresh / name).replace(data_dir / name)
+        _sync(data_dir)
+        fresh.rmdir()
+    return manifest
+
+
+class _Archive:
+    """A tar file that remembers what was put into it."""
+
+    def __init__(self, tar: tarfile.TarFile) -> None:
+        self._tar = tar
+        self.files: dict[str, tuple[str, int]] = {}
+
+    def add(self, name: str, path: Path) -> None:
+        with path.open("rb") as file:
+            entry = tarfile.TarInfo(name)
+            state = os.fstat(file.fileno())
+            entry.size, entry.mtime = state.st_size, int(state.st_mtime)
+            hashing = _Hashing(file)
+            self._tar.addfile(entry, hashing)
+        self.files[name] = (hashing.digest.hexdigest(), entry.size)
+
+    def add_text(self, name: str, text: str) -> None:
+        data = text.encode()
+        entry = tarfile.TarInfo(name)
+        entry.size = len(data)
+        self._tar.addfile(entry, io.BytesIO(data))
+
+    def forget(self, names: list[str]) -> None:
+        for name in names:
+            del self.files[name]
+
+
+class _Hashing(io.RawIOBase):
+    """A file that is hashed on its way."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size)
+        self.digest.update(data)
+        return data
+
+
+def _add_jobs(archive: _Archive, data_dir: Path, copy: Path) -> int:
+    """Add the database and the files that its jobs name; return how many jobs there are."""
+    with (
+        contextlib.closing(sqlite3.connect(data_dir / DATABASE, timeout=60.0)) as live,
+        contextlib.closing(sqlite3.connect(copy)) as taken,
+    ):
+        live.backup(taken)
+        taken.execute("PRAGMA journal_mode = DELETE").fetchone()
+        taken.execute("PRAGMA foreign_keys = ON").close()
+        rows = taken.execute("SELECT id, state, output FROM jobs").fetchall()
+        gone = []
+        for job_id, state, output in rows:
+            names = _add_job(archive, data_dir, job_id, output)
+            # Rows are deleted before their files: what has a row still was whole.
+            still = live.execute("SELECT 1 FROM jobs WHERE id = ?", (job_id,)).fetchone()
+            if still is None or (names is None and state not in ("failed", "cancelled")):
+                archive.forget(names or [])
+                gone.append((job_id,))
+        taken.executemany("DELETE FROM jobs WHERE id = ?", gone).close()
+        taken.commit()
+    archive.add(DATABASE, copy)
+    return len(rows) - len(gone)
+
+
+def _add_job(
+    archive: _Archive, data_dir: Path, job_id: str, output: str | None
+) -> list[str] | None:
+    """Add the files of a job and return their names; None, and nothing added, if some are gone."""
+    folder = data_dir / "jobs" / job_id
+    added: list[str] = []
+    try:
+        paths = _below(folder / "source")
+        if not paths:
+            raise FileNotFoundError(errno.ENOENT, "the upload is gone", str(folder))
+        if (folder / "machine.json").exists():  # jobs of the first version had none
+            paths.add(folder / "machine.json")
+        if output:
+            paths |= _below(data_dir / output)
+        for path in sorted(paths):
+            name = path.relative_to(data_dir).as_posix()
+            archive.add(name, path)
+            added.append(name)
+    except FileNotFoundError:
+        archive.forget(added)
+        return None
+    return added
+
+
+def _add_rest(archive: _Archive, data_dir: Path) -> None:
+    """Add machines, identifications, and whatever else is kept: files that are never changed."""
+    for top in sorted(data_dir.iterdir()):
+        if top.name in _PASSING or top.name.startswith((".", DATABASE, _OLD_DATABASE)):
+            continue
+        for path in sorted(_below(top) if top.is_dir() else {top}):
+            if path.is_symlink() or path.name.endswith(".part"):
+                continue
+            with contextlib.suppress(FileNotFoundError):
+                archive.add(path.relative_to(data_dir).as_posix(), path)
+
+
+def _below(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+def _unpack(source: Path, folder: Path) -> Manifest:
+    found: dict[str, tuple[str, int]] = {}
+    manifest: Manifest | None = None
+    try:
+        with tarfile.open(source, "r:*") as tar:
+            for entry in tar:
+                content = tar.extractfile(entry) if entry.isfile() else None
+                if content is None or not _is_inside(entry.name):
+                    raise BackupError(f"{source}: {entry.name!r} does not belong into a backup")
+                if entry.name == _MANIFEST:
+                    manifest = Manifest.model_validate_json(content.read())
+                else:
+                    found[entry.name] = _write(folder / entry.name, content)
+    except (tarfile.TarError, EOFError, ValidationError, UnicodeError) as error:
+        raise BackupError(f"{source} is damaged ({_first_line(error)}); take another") from None
+    if manifest is None:
+        raise BackupError(f"{source} has no end: it was broken off, or is no backup; take another")
+    for name, known in manifest.files.items():
+        if found.pop(name, None) != known:
+            raise BackupError(f"{source}: {name} is damaged or missing; take another backup")
+    for name in found:  # of jobs that were deleted while the backup was made
+        (folder / name).unlink()
+    return manifest
+
+
+def _write(path: Path, content: IO[bytes]) -> tuple[str, int]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    digest, size = hashlib.sha256(), 0
+    with path.open("wb") as file:
+        for chunk in _chunks(content):
+            file.write(chunk)
+            digest.update(chunk)
+            size += len(chunk)
+        file.flush()
+        os.fsync(file.fileno())
+    return digest.hexdigest(), size
+
+
+def _chunks(content: IO[bytes]) -> Iterator[bytes]:
+    while chunk := content.read(_CHUNK_BYTES):
+        yield chunk
+
+
+def _is_inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "\\" not in name
+
+
+def _clear(data_dir: Path) -> None:
+    for path in data_dir.iterdir():
+        if path.name in (_LOCK, _RESTORING):
+            continue
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    shutil.rmtree(data_dir / _RESTORING)  # last: until then we may begin anew
+
+
+def _sync(folder: Path) -> None:
+    if os.name != "nt":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

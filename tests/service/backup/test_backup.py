@@ -1,0 +1,237 @@
+"""Backup and restore from outside: what was kept comes back, and nothing is harmed."""
+
+from __future__ import annotations
+
+import gzip
+import random
+import shutil
+import tarfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.backup import archive
+from service.backup.archive import BackupError, back_up, restore
+from service.cli import run
+from service.database.engine import open_database
+from service.exclusive import exclusive
+from service.jobs.state import JobState
+from service.jobs.store import JobStore
+from service.settings import Settings
+from tests.service.database.examples import finished, make_job
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def store(data: Path) -> Iterator[JobStore]:
+    engine = open_database(Settings(data_dir=data))
+    yield JobStore(engine)
+    engine.dispose()
+
+
+def add_done(store: JobStore, data: Path, text: str = "G28\n") -> str:
+    job = make_job()
+    write(data / f"jobs/{job.id}/source/part.gcode", text)
+    write(data / f"jobs/{job.id}/machine.json", "{}")
+    store.add(job)
+    running = store.claim(job.id, 1500.0, "w")
+    write(data / f"jobs/{job.id}/1/result/part.stillpath.gcode", "; compensated\n" + text)
+    write(data / f"jobs/{job.id}/1/report/report.html", "<p>")
+    store.apply(job.id, finished(running))
+    return job.id
+
+
+def write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and "sqlite3" not in path.name and path.name != "service.lock"
+    }
+
+
+def jobs(data: Path) -> dict[str, JobState]:
+    engine = open_database(Settings(data_dir=data))
+    page = JobStore(engine).page("anna", limit=1000)
+    engine.dispose()
+    return {job.id: job.state for job in page.jobs}
+
+
+@pytest.mark.parametrize("name", ["backup.tar", "backup.tar.gz"])
+def test_what_was_kept_comes_back(name, store, data, tmp_path):
+    ids = [add_done(store, data, f"G28 ; {n}\n") for n in range(3)]
+    write(data / "machines/mine/1.json", "{}")
+    expected = tree(data)
+    write(data / "incoming/half", "passing")
+    write(data / "cache/shaper.json", "passing")
+    target = tmp_path / name
+    with exclusive(data):  # a service is at work
+        assert run(["backup", str(target), "--data-dir", str(data)]) == 0
+    assert run(["restore", str(target), "--data-dir", str(tmp_path / "new")]) == 0
+    assert tree(tmp_path / "new") == expected
+    assert jobs(tmp_path / "new") == dict.fromkeys(ids, JobState.DONE)
+
+
+def test_running_jobs_can_be_taken_up(store, data, tmp_path):
+    job = make_job()
+    write(data / f"jobs/{job.id}/source/part.gcode", "G28\n")
+    store.add(job)
+    store.claim(job.id, 1500.0, "w")
+    write(data / f"jobs/{job.id}/1/result/part.stillpath.gcode", "; half")
+    back_up(data, tmp_path / "b.tar")
+    restore(tmp_path / "b.tar", tmp_path / "new")
+    assert jobs(tmp_path / "new") == {job.id: JobState.RUNNING}
+    assert list(tree(tmp_path / "new")) == [f"jobs/{job.id}/source/part.gcode"]
+
+
+def test_while_jobs_come_and_go(store, data, tmp_path):
+    """No row of a backup is without its files, whatever is added and deleted meanwhile."""
+    stop = threading.Event()
+    ids = [add_done(store, data) for _ in range(20)]
+
+    def churn() -> None:
+        rng = random.Random(3)
+        while not stop.is_set():
+            gone = ids.pop(rng.randrange(len(ids)))
+            store.forget(gone)
+            shutil.rmtree(data / "jobs" / gone)
+            ids.append(add_done(store, data))
+
+    thread = threading.Thread(target=churn)
+    thread.start()
+    try:
+        for n in range(5):
+            back_up(data, tmp_path / f"{n}.tar")
+    finally:
+        stop.set()
+        thread.join()
+    for n in range(5):
+        new = tmp_path / f"new{n}"
+        restore(tmp_path / f"{n}.tar", new)
+        found = jobs(new)
+        assert 10 < len(found) <= 21
+        for job_id in found:
+            assert (new / f"jobs/{job_id}/source/part.gcode").exists()
+            assert (new / f"jobs/{job_id}/1/result/part.stillpath.gcode").exists()
+        assert {path.name for path in (new / "jobs").iterdir()} == set(found)
+
+
+def test_a_damaged_archive_changes_nothing(store, data, tmp_path):
+    add_done(store, data, "G28 " * 3000)
+    target = tmp_path / "b.tar"
+    back_up(data, target)
+    whole = target.read_bytes()
+    rng = random.Random(5)
+    for n in range(12):
+        broken = bytearray(whole)
+        if n % 2:
+            del broken[rng.randrange(len(broken) - 8000) :]
+        else:
+            at = whole.index(b"G28 G28") + rng.randrange(10_000)
+            broken[at] ^= 1
+        target.write_bytes(broken)
+        with pytest.raises(BackupError):
+            restore(target, tmp_path / "new")
+        assert [path.name for path in (tmp_path / "new").iterdir()] == ["service.lock"]
+    target.write_bytes(gzip.compress(whole)[:-600])
+    with pytest.raises(BackupError):
+        restore(target, tmp_path / "new")
+    target.write_bytes(b"no archive")
+    assert run(["restore", str(target), "--data-dir", str(tmp_path / "new")]) == 2
+
+
+@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "..\\evil"])
+def test_an_archive_writes_nowhere_else(name, tmp_path):
+    (tmp_path / "x").write_text("x")
+    with tarfile.open(tmp_path / "b.tar", "w") as tar:
+        entry = tarfile.TarInfo(name)
+        entry.size = 1
+        with (tmp_path / "x").open("rb") as file:
+            tar.addfile(entry, file)
+    with pytest.raises(BackupError, match="does not belong"):
+        restore(tmp_path / "b.tar", tmp_path / "new")
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+def test_a_link_is_refused(tmp_path):
+    with tarfile.open(tmp_path / "b.tar", "w") as tar:
+        entry = tarfile.TarInfo("link")
+        entry.type, entry.linkname = tarfile.SYMTYPE, "/etc/passwd"
+        tar.addfile(entry)
+    with pytest.raises(BackupError, match="does not belong"):
+        restore(tmp_path / "b.tar", tmp_path / "new")
+
+
+def test_a_restore_never_writes_over_data(store, data, tmp_path):
+    add_done(store, data)
+    back_up(data, tmp_path / "b.tar")
+    before = tree(data)
+    with pytest.raises(BackupError, match="is not empty"):
+        restore(tmp_path / "b.tar", data)
+    assert tree(data) == before
+    with exclusive(tmp_path / "new"), pytest.raises(OSError, match="another service works"):
+        restore(tmp_path / "b.tar", tmp_path / "new")
+
+
+@pytest.mark.parametrize("step", range(5))
+def test_a_restore_that_was_killed_begins_anew(step, store, data, tmp_path, monkeypatch):
+    add_done(store, data)
+    write(data / "machines/mine/1.json", "{}")
+    back_up(data, tmp_path / "b.tar")
+    new = tmp_path / "new"
+    left = step
+
+    class Killed(BaseException):
+        pass
+
+    def killed(act):
+        def counted(*arguments):
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise Killed
+            return act(*arguments)
+
+        return counted
+
+    with monkeypatch.context() as patched:
+        patched.setattr(archive.Path, "replace", killed(Path.replace))
+        patched.setattr(archive.shutil, "rmtree", lambda path: None)
+        try:
+            restore(tmp_path / "b.tar", new)
+        except Killed:
+            assert step < 3
+    if step < 3:
+        restore(tmp_path / "b.tar", new)
+    assert tree(new) == tree(data)
+    assert len(jobs(new)) == 1
+    assert not (new / ".restoring").exists()
+
+
+def test_refusals(store, data, tmp_path, monkeypatch, capsys):
+    (tmp_path / "there.tar").write_text("mine")
+    for target in (tmp_path / "there.tar", data / "b.tar"):
+        assert run(["backup", str(target), "--data-dir", str(data)]) == 2
+    assert run(["backup", str(tmp_path / "b.tar"), "--data-dir", str(tmp_path / "no")]) == 2
+    assert (tmp_path / "there.tar").read_text() == "mine"
+    monkeypatch.setenv("STILLPATH_DATABASE_URL", "postgresql://localhost/x")
+    assert run(["backup", str(tmp_path / "b.tar"), "--data-dir", str(data)]) == 2
+    assert "pg_dump" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "there.tar"]
+
+
+def test_migrate(data, capsys):
+    assert run(["migrate", "--data-dir", str(data)]) == 0
+    assert run(["migrate", "--data-dir", str(data)]) == 0
+    assert (data / "stillpath.sqlite3").exists()
+    assert "schema" in capsys.readouterr().out
