@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from service.pipeline.progress import Progress
     from service.pipeline.result import Result
 
-__all__ = ["print_planned", "print_result", "progress_shown"]
+__all__ = ["print_planned", "print_result", "progress_shown", "shown"]
 
 _PLAIN_EVERY_S = 5.0
 
@@ -29,7 +29,7 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
 
     It raises `Interrupted` when the process was asked to stop.
     """
-    with interruptible() as check, _shown(title) as show:
+    with interruptible() as check, shown(title) as show:
 
         def tell(progress: Progress) -> None:
             check()
@@ -86,7 +86,8 @@ def print_planned(planned: PlannedTime, console: Console | None = None) -> None:
         sys.stderr.write(f"warning: {warning}\n")
 
 
-def _shown(title: str) -> AbstractContextManager[Callable[[Progress], None]]:
+def shown(title: str) -> AbstractContextManager[Callable[[Progress], None]]:
+    """Give a progress callback as `progress_shown` does, and leave signals alone."""
     return _bar(title) if sys.stderr.isatty() else nullcontext(_plain_lines(title))
 
 

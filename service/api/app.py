@@ -3,32 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from pathlib import Path
+from contextlib import AsyncExitStack, asynccontextmanager
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
-from starlette.responses import FileResponse
 
-from service.api import controllers, designs, health, identifications, jobs, machines, problems
-from service.api.guard import Guard
+from service.api import (
+    assets,
+    controllers,
+    designs,
+    documents,
+    events,
+    frequency,
+    health,
+    identifications,
+    jobs,
+    keys,
+    machines,
+    metrics,
+    octoprint,
+    pages,
+    printers,
+    problems,
+    trajectories,
+)
+from service.api.guard import Guard, hosts_of
+from service.api.hub import Hub
+from service.api.intake import Intake
+from service.api.limits import Limits
+from service.database.engine import open_database
+from service.deliveries.printers import load_printers
+from service.deliveries.sender import Sender
 from service.identification.archive import Archive
 from service.jobs.store import JobStore
-from service.jobs.supervisor import Supervisor
+from service.jobs.work import Work
 from service.jobs.worker import Runner, run_task
 from service.machines.resolve import Resolver
 from service.machines.store import MachineStore
+from service.security.audit import AuditLog
+from service.security.keys import KeyStore, announce_first_key
 from service.settings import Settings
+from service.storage.opened import open_storage
 from service.version import __version__
 
 __all__ = ["create_app"]
 
-_PAGE = Path(__file__).with_name("page.html")
-# The pages hold their own script and style; nothing may be fetched from anywhere else.
-_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data:; connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'"
-)
 _DESCRIPTION = """\
 Hand in a sliced file, name the machine, and fetch a file that keeps the nozzle on its path,
 with a report whose figures were measured on the written file.
@@ -39,7 +58,9 @@ Errors are `application/problem+json` (RFC 9457).
 """
 
 
-def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
+def create_app(
+    settings: Settings, *, keys_required: bool = False, runner: Runner = run_task
+) -> FastAPI:
     """Return the HTTP application.
 
     The database is opened and the workers are started with the application's lifespan and end
@@ -48,28 +69,17 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
     Parameters
     ----------
     settings : Settings
+    keys_required : bool
+        Whether callers must show a key (`service.security.keys.keys_needed`).
     runner : callable
         Does the work of a job in the worker process; tests put another in.
     """
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store = JobStore(settings.data_dir)
-        supervisor = Supervisor(
-            store,
-            workers=settings.workers,
-            max_attempts=settings.max_attempts,
-            cancel_grace_s=settings.cancel_grace_s,
-            runner=runner,
-        )
-        app.state.store = store
-        app.state.supervisor = supervisor
-        supervisor.start()
-        try:
+        async with AsyncExitStack() as stack:
+            await _open(app, settings, runner, stack)
             yield
-        finally:
-            await run_in_threadpool(supervisor.stop)
-            store.close()
 
     app = FastAPI(
         title="Stillpath",
@@ -80,32 +90,67 @@ def create_app(settings: Settings, *, runner: Runner = run_task) -> FastAPI:
         redoc_url=None,
         docs_url=None,
     )
-    app.state.settings = settings
-    app.state.designs = designs.Designs()
-    app.state.controllers = controllers.Controllers()
-    app.state.identifications = identifications.Identifications(
-        Archive(settings.data_dir / "identifications")
+    state = app.state
+    state.settings = settings
+    state.keys_required = keys_required
+    state.limits = Limits(settings.requests_per_minute)
+    state.printers = load_printers(settings.printers)
+    state.designs = designs.Designs()
+    state.controllers = controllers.Controllers()
+    state.trajectories = trajectories.Trajectories(settings)
+    state.metrics = metrics.Metrics(
+        lambda: state.store, lambda: state.work.workers, lambda: state.hub.watchers
     )
-    app.state.machines = Resolver(
+    app.add_middleware(
+        Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
+    )
+    app.add_middleware(metrics.Measured, metrics=state.metrics)
+    problems.install(app)
+    for part in (
+        jobs,
+        assets,
+        trajectories,
+        events,
+        machines,
+        frequency,
+        designs,
+        identifications,
+    ):
+        app.include_router(part.router, responses=problems.responses(401, 403, 429, 503))
+    for part in (controllers, documents, octoprint, keys, printers, health, metrics, pages):
+        app.include_router(part.router)
+    return app
+
+
+async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncExitStack) -> None:
+    """Open and start everything; the stack ends it in the other order."""
+    state = app.state
+    engine = await run_in_threadpool(open_database, settings)
+    stack.callback(engine.dispose)
+    storage = await run_in_threadpool(open_storage, settings)
+    state.store = JobStore(engine)
+    state.storage = storage
+    state.keys = KeyStore(engine)
+    state.audit = AuditLog(engine)
+    if state.keys_required:
+        await run_in_threadpool(announce_first_key, state.keys, settings.first_key)
+    state.machines = Resolver(
         MachineStore(settings.data_dir / "machines"),
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
-    app.add_middleware(Guard, allow_remote=settings.allow_remote)
-    problems.install(app)
-    app.include_router(jobs.router)
-    app.include_router(machines.router)
-    app.include_router(designs.router)
-    app.include_router(identifications.router)
-    app.include_router(controllers.router)
-    app.include_router(health.router)
-
-    @app.get("/", include_in_schema=False)
-    def page() -> FileResponse:
-        return FileResponse(
-            _PAGE,
-            media_type="text/html",
-            headers={"Content-Security-Policy": _POLICY, "X-Content-Type-Options": "nosniff"},
-        )
-
-    return app
+    state.identifications = identifications.Identifications(
+        Archive(settings.data_dir / "identifications")
+    )
+    state.layers = assets.Layers(storage)
+    state.intake = Intake(settings, state.store, storage, state.machines, state.printers)
+    await run_in_threadpool(state.intake.prepare)
+    state.deliveries = Sender(engine, state.store, storage, settings, state.printers)
+    await run_in_threadpool(state.deliveries.start)
+    stack.push_async_callback(run_in_threadpool, state.deliveries.stop)
+    state.work = Work(settings, state.store, storage, runner=runner)
+    await run_in_threadpool(state.work.start)
+    stack.push_async_callback(run_in_threadpool, state.work.stop)
+    state.hub = Hub(state.store)
+    await state.hub.start()
+    stack.push_async_callback(state.hub.stop)

@@ -6,13 +6,14 @@ import asyncio
 from functools import cache
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Header, Query, Request
+from fastapi import APIRouter, Body, Header, Path, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
 from compensation.base import DesignError
 from models.errors import ModelError
 from models.loops import builtin_loops
+from service.api.access import Reader
 from service.api.problems import Problem, responses
 from service.controllers.figures import ControllerReport, LoopFigures
 from service.controllers.options import ControllerOptions, resolved
@@ -40,7 +41,7 @@ class Controllers:
 
 
 @router.get("/loops", response_model=list[LoopFigures], summary="List the closed-loop machines")
-async def list_loops() -> Any:
+async def list_loops(_: Reader) -> Any:
     """Return the built-in closed-loop machines and the methods that fit each."""
     return await run_in_threadpool(_loops)
 
@@ -53,8 +54,14 @@ async def list_loops() -> Any:
 )
 async def design_controller(
     request: Request,
-    name: str,
-    options: ControllerOptions,
+    name: Annotated[
+        str, Path(max_length=255, description="Of `/v1/loops`.", examples=["galvo-40khz"])
+    ],
+    options: Annotated[
+        ControllerOptions,
+        Body(openapi_examples={"fmsdob": {"value": {"method": "fmsdob", "targets_hz": [2000.0]}}}),
+    ],
+    _: Reader,
     format: Annotated[  # noqa: A002 - the parameter's name on the wire
         Literal["json", "html", "c"] | None, Query(description="Goes before `Accept`.")
     ] = None,

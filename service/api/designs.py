@@ -13,7 +13,8 @@ from starlette.responses import HTMLResponse, Response
 from compensation.base import DesignError
 from models.errors import ModelError
 from models.machine import Machine
-from service.api.machines import look_up
+from service.api.access import Reader
+from service.api.machines import Name, look_up
 from service.api.problems import Problem, responses
 from service.design.figures import DesignReport
 from service.pipeline.options import BasisName, RobustMode
@@ -52,7 +53,8 @@ class Designs:
 
 async def _asked(
     request: Request,
-    name: str,
+    name: Name,
+    _: Reader,
     axis: Literal["x", "y"],
     basis: BasisName = "ce-opt",
     robust: RobustMode = "off",

@@ -16,14 +16,17 @@ from models.errors import ModelError
 from models.identification.readers.settings import ReadSettings
 from models.machine import Machine
 from models.store import explain
+from service.api.access import Reader, Submitter
 from service.api.machine_views import RevisionView
-from service.api.machines import Author, Message, as_problems, look_up
+from service.api.machines import Author, Message, Name, as_problems, look_up
 from service.api.problems import Problem, responses
 from service.api.uploads import limited_body, safe_name
 from service.identification.archive import Archive
 from service.identification.figures import IdentificationReport
 from service.machines.resolve import Resolver
 from service.machines.revision import Revision
+from service.security.audit import record
+from service.security.callers import Scope
 
 __all__ = ["Identifications", "router"]
 
@@ -115,7 +118,8 @@ def _settings(
 async def post_measurements(
     request: Request,
     response: Response,
-    name: str,
+    name: Name,
+    caller: Submitter,
     settings: Annotated[ReadSettings, Depends(_settings)],
     base: Annotated[
         str | None, Query(description="What a machine that does not exist yet starts from.")
@@ -123,7 +127,7 @@ async def post_measurements(
     title: Annotated[str | None, Query(description="Of the machine.", max_length=200)] = None,
     trial: Annotated[bool, Query(description="Store nothing.")] = False,
     max_order: Annotated[int, Query(ge=1, le=8, description="Most modes to try.")] = 4,
-    author: Author = "unknown",
+    author: Author = None,
     message: Message = "",
 ) -> Any:
     """Give the axes that were measured new plants, as a new revision of the machine.
@@ -132,6 +136,10 @@ async def post_measurements(
     file that cannot be used is named with its reason, and nothing is stored.
     """
     machines: Resolver = request.app.state.machines
+    if not trial and not caller.may(Scope.ADMIN):
+        raise Problem(
+            403, "Not allowed", "To change a machine needs a key with the scope admin; a trial not."
+        )
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
     files = await _received(request)
@@ -144,8 +152,24 @@ async def post_measurements(
             response.status_code = 200
             return IdentificationView(revision=None, report=found.report)
         made: Revision = await run_in_threadpool(
-            _stored, machines, identifications.archive, name, found, author, message, expected
+            _stored,
+            machines,
+            identifications.archive,
+            name,
+            found,
+            author or caller.owner,
+            message,
+            expected,
         )
+    await run_in_threadpool(
+        record,
+        request,
+        caller,
+        "machine.change",
+        name,
+        revision=made.machine.revision,
+        number=made.number,
+    )
     response.headers["Location"] = f"/v1/machines/{name}/revisions/{made.number}"
     return IdentificationView(revision=RevisionView.of(made, None), report=found.report)
 
@@ -153,7 +177,7 @@ async def post_measurements(
 @router.get(
     "/identification", responses=responses(404, 422), summary="How the machine's plants were found"
 )
-def read_identification(request: Request, name: str) -> IdentificationReport:
+def read_identification(request: Request, name: Name, _: Reader) -> IdentificationReport:
     """Return the figures of the identification that led to the machine as it stands."""
     return _kept(request, name)
 
@@ -164,7 +188,7 @@ def read_identification(request: Request, name: str) -> IdentificationReport:
     responses=responses(404, 422),
     summary="How the machine's plants were found, as a page",
 )
-def read_identification_page(request: Request, name: str) -> HTMLResponse:
+def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLResponse:
     """Return one self-contained HTML page: measured and model, modes, shapers."""
     from service.identification.page import render_identification
 

@@ -13,6 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from models.errors import ModelError
 from models.machine import Machine
 from models.store import builtin_machines, load_machine, read_machine
+from service.api.access import Admin, Reader
 from service.api.machine_views import (
     DiffView,
     HistoryView,
@@ -27,8 +28,10 @@ from service.machines.drift import drift
 from service.machines.resolve import Resolver
 from service.machines.revision import Conflict, Revision, UnknownMachine
 from service.machines.store import MachineStore
+from service.security.audit import record
+from service.security.callers import Caller
 
-__all__ = ["Author", "Message", "as_problems", "look_up", "router"]
+__all__ = ["Author", "Message", "Name", "as_problems", "look_up", "router"]
 
 _LARGEST_BYTES = 4_000_000
 _BODY = {
@@ -40,9 +43,17 @@ _BODY = {
 }
 _ETAG = {"headers": {"ETag": {"schema": {"type": "string"}, "description": "The revision."}}}
 
+Name = Annotated[
+    str, Path(description="A name of `/v1/machines`.", examples=["ender3"], max_length=255)
+]
 Author = Annotated[
-    str,
-    Query(min_length=1, max_length=100, description="Who does it, as the caller says."),
+    str | None,
+    Query(
+        min_length=1,
+        max_length=100,
+        description="Who does it, as the caller says; by default the owner of the key.",
+        examples=["anna"],
+    ),
 ]
 Message = Annotated[str, Query(max_length=2000, description="Why.")]
 Number = Annotated[int, Path(ge=1, le=999_999, description="Number of a revision.")]
@@ -60,7 +71,7 @@ def look_up(request: Request, name: str) -> Machine:
 
 
 @router.get("", summary="List the machines")
-def list_machines(request: Request) -> list[MachineSummary]:
+def list_machines(request: Request, _: Reader) -> list[MachineSummary]:
     """Return the machines a job can name: the library, then the user's own."""
     store = _store(request)
     own = [_own_summary(store, name) for name in store.names()]
@@ -76,7 +87,8 @@ def list_machines(request: Request) -> list[MachineSummary]:
 def show_machine(
     request: Request,
     response: Response,
-    name: str,
+    name: Name,
+    _: Reader,
     if_none_match: Annotated[str | None, Header()] = None,
 ) -> Any:
     """Return the whole document of a machine: travel, limits, firmware, plants."""
@@ -101,8 +113,9 @@ def show_machine(
 async def put_machine(
     request: Request,
     response: Response,
-    name: str,
-    author: Author = "unknown",
+    name: Name,
+    caller: Admin,
+    author: Author = None,
     message: Message = "",
     if_match: IfMatch = None,
 ) -> RevisionView:
@@ -117,8 +130,14 @@ async def put_machine(
     with as_problems():
         machine = read_machine(content)
         made = await run_in_threadpool(
-            store.add_revision, name, machine, author=author, message=message, expected=expected
+            store.add_revision,
+            name,
+            machine,
+            author=author or caller.owner,
+            message=message,
+            expected=expected,
         )
+    await run_in_threadpool(_note, request, caller, "change", made)
     if expected == 0:
         response.status_code = 201
         response.headers["Location"] = f"/v1/machines/{name}"
@@ -131,7 +150,9 @@ async def put_machine(
     responses=responses(403, 404, 409, 412),
     summary="Delete a machine",
 )
-def delete_machine(request: Request, name: str, if_match: IfMatch = None) -> Response:
+def delete_machine(
+    request: Request, name: Name, caller: Admin, if_match: IfMatch = None
+) -> Response:
     """Move a machine with its history to the trash of the data directory.
 
     `stillpath machines restore NAME` brings it back.
@@ -140,13 +161,15 @@ def delete_machine(request: Request, name: str, if_match: IfMatch = None) -> Res
     with as_problems():
         _check_state(store, name, if_match)
         store.delete(name)
+    record(request, caller, "machine.delete", name)
     return Response(status_code=204)
 
 
 @router.get("/{name}/revisions", responses=responses(404, 409, 422), summary="List the revisions")
 def list_revisions(
     request: Request,
-    name: str,
+    name: Name,
+    _: Reader,
     since: Annotated[
         date | None, Query(description="Look for drift from this day on (after a rebuild).")
     ] = None,
@@ -165,7 +188,7 @@ def list_revisions(
 @router.get(
     "/{name}/revisions/{number}", responses=responses(404, 409, 422), summary="Show one revision"
 )
-def show_revision(request: Request, name: str, number: Number) -> RevisionDocument:
+def show_revision(request: Request, name: Name, number: Number, _: Reader) -> RevisionDocument:
     """Return a state of a machine with its document."""
     store = _store(request)
     with as_problems():
@@ -177,7 +200,8 @@ def show_revision(request: Request, name: str, number: Number) -> RevisionDocume
 @router.get("/{name}/diff", responses=responses(404, 409, 422), summary="Compare two revisions")
 def show_diff(
     request: Request,
-    name: str,
+    name: Name,
+    _: Reader,
     before: Annotated[int, Query(alias="from", ge=1)],
     after: Annotated[int, Query(alias="to", ge=1)],
 ) -> DiffView:
@@ -195,14 +219,21 @@ def show_diff(
     summary="Approve a revision",
 )
 def approve_revision(
-    request: Request, name: str, number: Number, author: Author = "unknown", message: Message = ""
+    request: Request,
+    name: Name,
+    number: Number,
+    caller: Admin,
+    author: Author = None,
+    message: Message = "",
 ) -> RevisionView:
     """Say that a revision may be used for jobs. An approval that stands already stays."""
     store = _store(request)
     with as_problems():
         _check_own(name)
-        store.approve(name, number, author=author, message=message)
-        return _view(store, store.revision(name, number))
+        store.approve(name, number, author=author or caller.owner, message=message)
+        found = store.revision(name, number)
+        _note(request, caller, "approve", found)
+        return _view(store, found)
 
 
 @router.post(
@@ -213,9 +244,10 @@ def approve_revision(
 def roll_back(
     request: Request,
     response: Response,
-    name: str,
+    name: Name,
     number: Number,
-    author: Author = "unknown",
+    caller: Admin,
+    author: Author = None,
     message: Message = "",
     if_match: IfMatch = None,
 ) -> RevisionView:
@@ -223,8 +255,16 @@ def roll_back(
     store = _store(request)
     with as_problems():
         expected = _check_state(store, name, if_match)
-        made = store.roll_back(name, number, author=author, message=message, expected=expected)
+        by = author or caller.owner
+        made = store.roll_back(name, number, author=by, message=message, expected=expected)
+        _note(request, caller, "change", made)
         return _changed(store, response, made)
+
+
+def _note(request: Request, caller: Caller, what: str, made: Revision) -> None:
+    """Write down who did something to a machine."""
+    name, revision = made.machine.name, made.machine.revision
+    record(request, caller, f"machine.{what}", name, revision=revision, number=made.number)
 
 
 def _machines(request: Request) -> Resolver:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import json
 from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Any
@@ -10,11 +12,18 @@ import structlog
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
-from starlette.responses import JSONResponse, Response
+from starlette.requests import ClientDisconnect
+from starlette.responses import Response
 
+from service.database.engine import DatabaseAway
 from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
+from service.storage.base import StorageError
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+_SHOWN = 200
+"""Characters of a wrong value that are repeated."""
 
 
 class Problem(Exception):  # named as in RFC 9457
@@ -47,8 +56,8 @@ def problem_response(
     document: Mapping[str, Any], headers: Mapping[str, str] | None = None
 ) -> Response:
     """Return the answer for a problem document."""
-    return JSONResponse(
-        dict(document),
+    return Response(
+        json.dumps(dict(document)),  # ASCII: what a caller wrote may be no text
         status_code=int(document["status"]),
         headers=dict(headers or {}),
         media_type=PROBLEM_MEDIA_TYPE,
@@ -70,6 +79,26 @@ def install(app: FastAPI) -> None:
             called = f"{request.method} {request.url.path}"
             detail = f"{called}: {title.lower()}; /openapi.json lists what there is."
         return problem_response(problem(error.status_code, title, detail), error.headers)
+
+    @app.exception_handler(DatabaseAway)
+    async def _no_database(request: Request, error: DatabaseAway) -> Response:
+        return _away(request, "The database does not answer", error)
+
+    @app.exception_handler(StorageError)
+    async def _no_storage(request: Request, error: StorageError) -> Response:
+        if error.errno in _FULL:
+            return _full(request, error)
+        return _away(request, "The storage does not answer", error)
+
+    @app.exception_handler(OSError)
+    async def _system(request: Request, error: OSError) -> Response:
+        if error.errno in _FULL:
+            return _full(request, error)
+        raise error
+
+    @app.exception_handler(ClientDisconnect)
+    async def _gone(_: Request, __: ClientDisconnect) -> Response:
+        return Response(status_code=400)  # nobody reads it
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> Response:
@@ -98,12 +127,31 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     }
 
 
+def _away(request: Request, title: str, error: Exception) -> Response:
+    structlog.get_logger("api").error(
+        title, method=request.method, path=request.url.path, reason=str(error)
+    )
+    detail = f"{title}; try again in a while. The service's log says more."
+    return problem_response(problem(503, title, detail), {"Retry-After": "5"})
+
+
+def _full(request: Request, error: OSError) -> Response:
+    structlog.get_logger("api").error("disk full", path=request.url.path, reason=str(error))
+    detail = "The disk of the service is full. Delete old jobs, or make room on it."
+    return problem_response(problem(507, "No space left", detail), {"Connection": "close"})
+
+
 def _field(entry: Mapping[str, Any]) -> dict[str, str]:
     place = entry.get("loc", ())
     return {
         "name": ".".join(str(part) for part in place[1:]) or str(place[0] if place else "request"),
-        "message": f"{entry.get('msg', 'bad value')} (given: {entry.get('input')!r})",
+        "message": f"{entry.get('msg', 'bad value')} (given: {_short(entry.get('input'))})",
     }
+
+
+def _short(given: object) -> str:
+    text = repr(given)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 _SCHEMA: dict[str, Any] = {
@@ -119,12 +167,24 @@ _SCHEMA: dict[str, Any] = {
     },
 }
 _EXAMPLES: dict[int, dict[str, Any]] = {
-    404: problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
-    409: problem(409, "Not done yet", "The job is running. Ask again when its state is done."),
-    413: problem(413, "File too large", "The upload is larger than 1073741824 bytes."),
-    422: problem(
-        422,
-        "Bad parameter",
-        "method: String should match pattern '^(fbf|zpetc|none|shaper:...)$' (given: 'magic')",
-    ),
+    document["status"]: document
+    for document in (
+        problem(400, "Bad Request", "There was an error parsing the body."),
+        problem(401, "No key", "No key came with the request. Send one as X-Api-Key."),
+        problem(403, "Not allowed", "This needs a key with scope 'admin'."),
+        problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
+        problem(409, "Not done yet", "The job is running. Ask again when its state is done."),
+        problem(412, "Precondition failed", "Machine 'mine' is at \"3f6a\" (revision 4)."),
+        problem(413, "File too large", "The upload is larger than 1073741824 bytes."),
+        problem(416, "No such range", "The file has 120 bytes; bytes=500- lies outside."),
+        problem(
+            422,
+            "Bad parameter",
+            "method: String should match pattern '^(fbf|zpetc|none|shaper:...)$' (given: 'magic')",
+        ),
+        problem(428, "Precondition required", "Machine 'mine' exists. Send its ETag as If-Match."),
+        problem(429, "Too many requests", "More than 1200 requests in a minute. Wait 1 s."),
+        problem(503, "Not ready", "database: it does not answer"),
+        problem(507, "No space left", "The disk of the service is full. Delete old jobs."),
+    )
 }

@@ -1,63 +1,177 @@
-"""What the API answers with."""
+"""What the API asks for and answers with."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from service.jobs.state import Job, JobState
+from service.pipeline.options import (
+    DEFAULT_TOLERANCE_UM,
+    BasisName,
+    DialectName,
+    Options,
+    RobustMode,
+)
 
-__all__ = ["Health", "JobView", "Links"]
+__all__ = ["Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
+
+_EXAMPLE: dict[str, Any] = {
+    "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
+    "state": "running",
+    "stage": "compensating",
+    "progress": 0.42,
+    "eta_s": 3.1,
+    "queue_position": None,
+    "attempt": 1,
+    "owner": "anna",
+    "batch": None,
+    "priority": 0,
+    "machine": "ender3",
+    "machine_revision": "3f6a2c1b9d04",
+    "options": {
+        "method": "fbf",
+        "basis": "ce-opt",
+        "robust": "off",
+        "along": None,
+        "plate": None,
+        "tolerance_um": 2.0,
+        "times": "new",
+        "dialect": None,
+    },
+    "source_name": "gear.gcode",
+    "source_bytes": 645932,
+    "source_sha256": "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08",
+    "result_name": "gear.stillpath.gcode",
+    "result_bytes": None,
+    "summary": None,
+    "webhook": None,
+    "printer": None,
+    "print": False,
+    "created_at": "2025-01-31T12:00:00Z",
+    "started_at": "2025-01-31T12:00:00Z",
+    "finished_at": None,
+    "error": None,
+    "links": {
+        "self": "/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
+        "events": "/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10/events",
+        "result": None,
+        "report": None,
+        "report_json": None,
+        "layers": None,
+        "trajectories": None,
+    },
+}
+
+
+def _is_line(text: str) -> str:
+    """Refuse what would break a line of a log, or a database."""
+    if any(ord(character) < 32 or ord(character) == 127 for character in text):
+        raise ValueError("control characters are not allowed")
+    return text
+
+
+Line = Annotated[str, AfterValidator(_is_line)]
+
+
+class JobQuery(BaseModel):
+    """Parameters of a job, beside the file."""
+
+    machine: Line = Field(
+        max_length=255, description="A name from `/v1/machines`.", examples=["ender3"]
+    )
+    method: str = Field(
+        default="fbf",
+        # The methods are written down once, in the options.
+        pattern=Options.model_json_schema()["properties"]["method"]["pattern"],
+        description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
+        "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
+        "3hump_ei) or `none`; with `+ripple` behind it the machine's ripple is undone as well.",
+    )
+    basis: BasisName = Field(default="ce-opt", description="Basis functions of `fbf`.")
+    robust: RobustMode = Field(
+        default="off",
+        description="What `fbf` is designed for: the nominal plant (`off`), or the machine's "
+        "plant set by least squares (`ensemble`) or for its worst member (`minimax`).",
+    )
+    along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = Field(
+        default=None,
+        description="Weight of errors along the path against those across it, for `fbf`; less "
+        "than 1 takes longer. By default .09 with a set, else 1.",
+    )
+    tolerance_um: float = Field(
+        default=DEFAULT_TOLERANCE_UM,
+        ge=0.5,
+        le=50,
+        allow_inf_nan=False,
+        description="How far the written path may be from the computed one.",
+    )
+    plate: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
+        default=None, description="Which plate of a 3MF package with several."
+    )
+    times: Literal["new", "kept"] = Field(
+        default="new", description="Whether the slicer's times in the file follow the new motion."
+    )
+    dialect: DialectName | None = Field(
+        default=None,
+        description="How the file is read; by default as the machine's firmware reads it.",
+    )
+    name: str = Field(
+        default="upload.gcode",
+        max_length=255,
+        description="File name, for a raw body.",
+        examples=["gear.gcode"],
+    )
+    priority: int = Field(
+        default=0, ge=-100, le=100, description="Higher ones go first; more than 0 needs `admin`."
+    )
+    batch: Line | None = Field(
+        default=None,
+        min_length=1,
+        max_length=64,
+        description="What several jobs have in common; `GET /v1/jobs?batch=` finds them.",
+    )
+    fresh: bool = Field(
+        default=False,
+        description="Do the work again, even if the same file was done with the same machine, "
+        "options and version before.",
+    )
+    webhook: Line | None = Field(
+        default=None,
+        max_length=2000,
+        description="Address that is told when the job is over; one of "
+        "`STILLPATH_WEBHOOK_TARGETS`.",
+    )
+    printer: Line | None = Field(
+        default=None,
+        max_length=64,
+        description="Printer of `/v1/printers` that the result is sent to.",
+    )
+    print: bool = Field(default=False, description="Whether that printer starts to print it.")
+
+    def options(self) -> Options:
+        """Return the settings of the compensation among the parameters."""
+        return Options.model_validate(self.model_dump(include=set(Options.model_fields)))
 
 
 class Links(BaseModel):
-    """Where to go from here; result and report are there once the job is done."""
+    """Where to go from here; what comes of a job is there once it is done."""
 
     self: str
+    events: str
     result: str | None = None
     report: str | None = None
     report_json: str | None = None
+    layers: str | None = None
+    trajectories: str | None = None
 
 
 class JobView(BaseModel):
     """A job as its owner sees it."""
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "examples": [
-                {
-                    "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
-                    "state": "running",
-                    "stage": "compensating",
-                    "progress": 0.42,
-                    "eta_s": 3.1,
-                    "queue_position": None,
-                    "machine": "ender3",
-                    "options": {
-                        "method": "fbf",
-                        "basis": "ce-opt",
-                        "robust": "off",
-                        "along": None,
-                        "tolerance_um": 2.0,
-                    },
-                    "source_name": "gear.gcode",
-                    "source_bytes": 645932,
-                    "created_at": "2025-01-31T12:00:00Z",
-                    "started_at": "2025-01-31T12:00:00Z",
-                    "finished_at": None,
-                    "error": None,
-                    "links": {
-                        "self": "/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
-                        "result": None,
-                        "report": None,
-                        "report_json": None,
-                    },
-                }
-            ]
-        }
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     id: str
     state: JobState
@@ -65,10 +179,24 @@ class JobView(BaseModel):
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(description="Seconds still needed; null while unknown.")
     queue_position: int | None = Field(description="Jobs before this one while it is queued.")
+    attempt: int = Field(description="How often it was started.")
+    owner: str
+    batch: str | None
+    priority: int
     machine: str
+    machine_revision: str = Field(description="Names the state of the machine that is used.")
     options: dict[str, Any]
     source_name: str
     source_bytes: int
+    source_sha256: str
+    result_name: str
+    result_bytes: int | None
+    summary: dict[str, Any] | None = Field(
+        description="Once it is done: print times in s, contour errors in um, warnings."
+    )
+    webhook: str | None
+    printer: str | None
+    print: bool
     created_at: datetime
     started_at: datetime | None
     finished_at: datetime | None
@@ -82,6 +210,8 @@ class JobView(BaseModel):
         """Return the view of a job."""
         here = f"/v1/jobs/{job.id}"
         done = job.state is JobState.DONE
+        made = ("result", "report", "report.json", "layers", "trajectories")
+        links = {name.replace(".", "_"): f"{here}/{name}" for name in made if done}
         return cls(
             id=job.id,
             state=job.state,
@@ -89,29 +219,57 @@ class JobView(BaseModel):
             progress=job.progress,
             eta_s=job.eta_s,
             queue_position=queue_position,
+            attempt=job.attempt,
+            owner=job.owner,
+            batch=job.batch,
+            priority=job.priority,
             machine=job.machine,
+            machine_revision=job.machine_revision,
             options=job.options,
             source_name=job.source_name,
             source_bytes=job.source_bytes,
-            created_at=_moment(job.created_at),
-            started_at=None if job.started_at is None else _moment(job.started_at),
-            finished_at=None if job.finished_at is None else _moment(job.finished_at),
+            source_sha256=job.source_sha256,
+            result_name=job.result_name,
+            result_bytes=job.result_bytes,
+            summary=job.summary,
+            webhook=job.webhook,
+            printer=job.printer,
+            print=job.print_after,
+            created_at=datetime.fromtimestamp(job.created_at, UTC),
+            started_at=_moment(job.started_at),
+            finished_at=_moment(job.finished_at),
             error=job.problem,
-            links=Links(
-                self=here,
-                result=f"{here}/result" if done else None,
-                report=f"{here}/report" if done else None,
-                report_json=f"{here}/report.json" if done else None,
-            ),
+            links=Links(self=here, events=f"{here}/events", **links),
         )
+
+
+class JobPage(BaseModel):
+    """Jobs, newest first, and where the next ones are."""
+
+    jobs: list[JobView]
+    next: str | None = Field(description="`cursor` of the next page; null: there is none.")
+
+
+class LayerIndex(BaseModel):
+    """What tiles of the print there are."""
+
+    model_config = ConfigDict(extra="allow")
+
+    version: int
+    channels: list[str]
+    scale_um: float = Field(description="One unit of the errors in the tiles.")
+    bounds_mm: list[float] = Field(description="x and y of the lower left, then the upper right.")
+    layers: list[dict[str, Any]]
 
 
 class Health(BaseModel):
     """Answer of the health checks."""
 
+    model_config = ConfigDict(json_schema_extra={"examples": [{"status": "ok", "version": "0.7"}]})
+
     status: str
     version: str
 
 
-def _moment(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, UTC)
+def _moment(seconds: float | None) -> datetime | None:
+    return None if seconds is None else datetime.fromtimestamp(seconds, UTC)

@@ -1,10 +1,10 @@
-"""An upload goes from the socket to the disk; memory holds one chunk."""
+"""An upload goes from the socket to the disk, hashed on its way; memory holds one chunk."""
 
 from __future__ import annotations
 
-import os
+import hashlib
 import re
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -14,6 +14,7 @@ from fastapi import Request
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.api.limits import COUNTED
 from service.api.problems import Problem
 
 if TYPE_CHECKING:
@@ -23,14 +24,28 @@ __all__ = ["Upload", "limited_body", "receive_document", "receive_upload", "safe
 
 _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
+_MOST_FIELDS = 32
+_LONGEST_FIELD_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """What arrived: the file's name as its sender called it, made safe, and its size."""
+    """What arrived.
+
+    Attributes
+    ----------
+    name : str
+        As its sender called the file, made safe.
+    size_bytes : int
+    sha256 : str
+    fields : mapping
+        The form's other parts.
+    """
 
     name: str
-    size: int
+    size_bytes: int
+    sha256: str
+    fields: Mapping[str, str]
 
 
 async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> Upload:
@@ -39,9 +54,10 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
     Parameters
     ----------
     request : Request
-        For multipart, the first part with a file name counts; others are ignored.
+        For multipart, the first part with a file name counts; other files are ignored.
     target : Path
-        Is left incomplete when an error is raised; the caller deletes it.
+        Is left incomplete when an error is raised; the caller deletes it. Nothing is synced:
+        what stores the file for good does that.
     max_bytes : int
         Largest body.
 
@@ -54,23 +70,25 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
     if declared.isdecimal() and int(declared) > max_bytes:
         raise _too_large(max_bytes)
     kind, parameters = parse_options_header(request.headers.get("content-type"))
+    fields: dict[str, str] = {}
     with target.open("wb") as file:
         sink = _Sink(file)
         if kind == b"multipart/form-data":
-            name = await _receive_form(request, sink, parameters.get(b"boundary"), max_bytes)
+            form = await _receive_form(request, sink, parameters.get(b"boundary"), max_bytes)
+            name, fields = form.name or "", form.fields
         else:
             name = request.query_params.get("name", "")
             async for chunk in limited_body(request, max_bytes):
                 await sink.write(chunk)
-        await sink.finish()
-    if sink.size == 0:
+        await sink.flush()
+    if sink.size_bytes == 0:
         raise Problem(
             422,
             "The file is empty",
             "The request brought no bytes. Send the G-code as the body "
             "(curl --data-binary @part.gcode) or as a form's file.",
         )
-    return Upload(safe_name(name), sink.size)
+    return Upload(safe_name(name), sink.size_bytes, sink.digest.hexdigest(), fields)
 
 
 async def receive_document(request: Request, *, max_bytes: int) -> bytes:
@@ -93,42 +111,42 @@ def safe_name(name: str) -> str:
 
 @dataclass(slots=True)
 class _Sink:
-    """Collects small chunks and writes large ones, in a thread: the disk may be slow."""
+    """Collects small chunks; hashes and writes large ones, in a thread: the disk may be slow."""
 
     file: BinaryIO
-    size: int = 0
+    size_bytes: int = 0
+    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
     _chunks: list[bytes] = field(default_factory=list)
-    _waiting: int = 0
+    _waiting_bytes: int = 0
 
     def take(self, chunk: bytes) -> None:
         self._chunks.append(chunk)
-        self._waiting += len(chunk)
-        self.size += len(chunk)
+        self._waiting_bytes += len(chunk)
+        self.size_bytes += len(chunk)
 
     async def write(self, chunk: bytes) -> None:
         self.take(chunk)
         await self.drain()
 
     async def drain(self) -> None:
-        if self._waiting >= _WRITE_BYTES:
-            await to_thread.run_sync(self._flush)
+        if self._waiting_bytes >= _WRITE_BYTES:
+            await self.flush()
 
-    async def finish(self) -> None:
-        await to_thread.run_sync(self._flush_and_sync)
+    async def flush(self) -> None:
+        await to_thread.run_sync(self._flush)
 
     def _flush(self) -> None:
-        self.file.write(b"".join(self._chunks))
+        collected = b"".join(self._chunks)
         self._chunks.clear()
-        self._waiting = 0
-
-    def _flush_and_sync(self) -> None:
-        self._flush()
+        self._waiting_bytes = 0
+        self.digest.update(collected)
+        self.file.write(collected)
         self.file.flush()
-        os.fsync(self.file.fileno())
 
 
 async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
     """Yield the body of a request; raise `Problem` 413 when it grows too large."""
+    request.scope[COUNTED] = True
     size = 0
     async for chunk in request.stream():
         size += len(chunk)
@@ -139,7 +157,7 @@ async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes
 
 async def _receive_form(
     request: Request, sink: _Sink, boundary: bytes | None, max_bytes: int
-) -> str:
+) -> _Form:
     if not boundary:
         raise _broken_form("the Content-Type names no boundary")
     form = _Form(sink.take)
@@ -151,21 +169,27 @@ async def _receive_form(
         parser.finalize()
     except FormParserError as error:
         raise _broken_form(str(error)) from error
+    if not form.is_whole:
+        raise _broken_form("it ends before its last boundary")
     if form.name is None:
         raise _broken_form("no part has a file name")
-    return form.name
+    return form
 
 
 class _Form:
-    """Callbacks of the multipart parser: finds the first file and passes its data on."""
+    """Callbacks of the multipart parser: passes the first file's data on, keeps short fields."""
 
     def __init__(self, take: Callable[[bytes], None]) -> None:
         self.name: str | None = None
+        self.fields: dict[str, str] = {}
+        self.is_whole = False
         self._take = take
         self._in_file = False
         self._headers: dict[bytes, bytes] = {}
         self._field = b""
         self._value = b""
+        self._text_name: str | None = None
+        self._text = b""
 
     def callbacks(self) -> MultipartCallbacks:
         return {
@@ -176,6 +200,7 @@ class _Form:
             "on_headers_finished": self._headers_finished,
             "on_part_data": self._part_data,
             "on_part_end": self._part_end,
+            "on_end": self._end,
         }
 
     def _part_begin(self) -> None:
@@ -197,13 +222,25 @@ class _Form:
         self._in_file = name is not None and self.name is None
         if self._in_file and name is not None:
             self.name = name.decode("utf-8", "replace")
+        elif name is None and len(self.fields) < _MOST_FIELDS:
+            self._text_name = parameters.get(b"name", b"").decode("utf-8", "replace")
 
     def _part_data(self, data: bytes, start: int, end: int) -> None:
         if self._in_file:
             self._take(data[start:end])
+        elif self._text_name is not None:
+            self._text += data[start:end]
+            if len(self._text) > _LONGEST_FIELD_BYTES:
+                raise _broken_form(f"a field is longer than {_LONGEST_FIELD_BYTES} bytes")
 
     def _part_end(self) -> None:
+        if self._text_name is not None:
+            self.fields[self._text_name] = self._text.decode("utf-8", "replace")
         self._in_file = False
+        self._text_name, self._text = None, b""
+
+    def _end(self) -> None:
+        self.is_whole = True
 
 
 def _too_large(max_bytes: int) -> Problem:

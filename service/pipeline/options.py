@@ -6,14 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.pipeline.reading import DialectName
-
-__all__ = ["DEFAULT_TOLERANCE_UM", "BasisName", "Options", "RobustMode"]
+__all__ = ["DEFAULT_TOLERANCE_UM", "BasisName", "DialectName", "Options", "RobustMode"]
 
 DEFAULT_TOLERANCE_UM = 2.0
 
 BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
 RobustMode = Literal["off", "ensemble", "minimax"]
+DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
 
 
 class Options(BaseModel):

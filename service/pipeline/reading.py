@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 from gcode.detection import detect
 from gcode.dialect import Dialect
@@ -12,10 +12,9 @@ from gcode.interpreter import Interpreter
 from models.errors import ModelError
 from models.firmware import Marlin
 from models.machine import Machine
+from service.pipeline.options import DialectName
 
 __all__ = ["DialectName", "dialect_for", "doubts", "passed_over"]
-
-DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
 
 _SHOWN = 5
 _END_BYTES = 1 << 18

@@ -1,0 +1,303 @@
+"""From an upload to a job in the queue; what goes wrong on the way leaves nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from fastapi import Request
+from starlette.concurrency import run_in_threadpool
+
+from models.errors import ModelError
+from service.api.problems import Problem
+from service.api.schemas import JobQuery
+from service.api.uploads import Upload, receive_upload
+from service.deliveries.printers import Printer, printer_for
+from service.deliveries.targets import TargetRefused, check_webhook
+from service.jobs.state import Job
+from service.jobs.store import IdempotencyConflict, JobStore, Quota, QuotaExceeded
+from service.machines.resolve import PinnedMachine, Resolver
+from service.machines.revision import NotApproved, UnknownMachine
+from service.security.audit import record
+from service.security.callers import Caller
+from service.settings import Settings
+from service.storage.base import Storage
+from service.version import __version__
+
+__all__ = ["Intake", "Taken"]
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """A job, and whether it is the one that was there already."""
+
+    job: Job
+    is_new: bool
+    upload: Upload
+
+
+class Intake:
+    """Takes uploads in.
+
+    First the file is stored for good, then the job is made known: whoever is told of a job can
+    rely on its file.
+
+    Parameters
+    ----------
+    settings : Settings
+    store : JobStore
+    storage : Storage
+    machines : Resolver
+    printers : mapping
+        That results may be sent to, by name.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: JobStore,
+        storage: Storage,
+        machines: Resolver,
+        printers: Mapping[str, Printer],
+    ) -> None:
+        self._settings = settings
+        self._store = store
+        self._storage = storage
+        self._machines = machines
+        self._printers = printers
+        self._quota = Quota(settings.max_jobs_per_owner, settings.max_bytes_per_owner)
+        self._folder = settings.data_dir / "incoming"
+
+    def prepare(self) -> None:
+        """Make the folder of uploads on their way, and delete what a killed service left there."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for leftover in self._folder.iterdir():
+            leftover.unlink(missing_ok=True)
+
+    async def take(
+        self,
+        request: Request,
+        wanted: JobQuery,
+        caller: Caller,
+        *,
+        idempotency_key: str | None = None,
+    ) -> Taken:
+        """Read the body of a request and return its job.
+
+        Parameters
+        ----------
+        request : Request
+        wanted : JobQuery
+            A form may say `print` as well, as OctoPrint's does.
+        caller : Caller
+        idempotency_key : str, optional
+
+        Raises
+        ------
+        Problem
+            413, 422, 429 or 507; nothing of the upload is left then.
+        """
+        await run_in_threadpool(self._check_targets, wanted)
+        pinned = await run_in_threadpool(self._pinned, wanted.machine)
+        await run_in_threadpool(self._check_room, caller)
+        job_id = uuid.uuid4().hex
+        with self._incoming(job_id) as incoming:
+            upload = await receive_upload(
+                request, incoming, max_bytes=self._settings.max_upload_bytes
+            )
+            with_print = _with_fields(wanted, upload)
+            if with_print != wanted:
+                wanted = with_print
+                await run_in_threadpool(self._check_targets, wanted)
+            taken = await run_in_threadpool(
+                self._accept, job_id, incoming, upload, wanted, pinned, caller, idempotency_key
+            )
+        request.app.state.metrics.upload_bytes.inc(upload.size_bytes)
+        if taken.is_new:
+            await run_in_threadpool(
+                record,
+                request,
+                caller,
+                "submit",
+                job_id,
+                machine=wanted.machine,
+                revision=pinned.machine.revision,
+                source_sha256=upload.sha256,
+            )
+            request.app.state.work.notify()
+        return taken
+
+    def _accept(
+        self,
+        job_id: str,
+        incoming: Path,
+        upload: Upload,
+        wanted: JobQuery,
+        pinned: PinnedMachine,
+        caller: Caller,
+        idempotency_key: str | None,
+    ) -> Taken:
+        """Store the upload and add its job, unless the same one is there."""
+        idempotency = None
+        if idempotency_key is not None:
+            idempotency = (idempotency_key, _fingerprint(wanted, upload))
+            earlier = self._earlier(caller, *idempotency)
+            if earlier is not None:
+                return Taken(earlier, False, upload)
+        dedupe_key = _dedupe_key(wanted, upload, pinned)
+        if not wanted.fresh and wanted.webhook is None and wanted.printer is None:
+            same = self._store.find_same(caller.owner, dedupe_key)
+            if same is not None:
+                return Taken(same, False, upload)
+        job = Job(
+            id=job_id,
+            owner=caller.owner,
+            batch=wanted.batch,
+            machine=wanted.machine,
+            machine_revision=pinned.machine.revision,
+            options=wanted.options().model_dump(),
+            dedupe_key=dedupe_key,
+            priority=wanted.priority,
+            source_name=upload.name,
+            source_bytes=upload.size_bytes,
+            source_sha256=upload.sha256,
+            result_name=_result_name(upload.name),
+            created_at=time.time(),
+            webhook=wanted.webhook,
+            printer=wanted.printer,
+            print_after=wanted.print,
+        )
+        self._check_room(caller, upload.size_bytes)
+        prefix = f"jobs/{job_id}/"
+        document = incoming.with_suffix(".machine")
+        added: Job | None = None
+        try:
+            pinned.write(document)
+            self._storage.put(f"{prefix}machine.json", document)
+            self._storage.put(f"{prefix}source/{job.source_name}", incoming)
+            added = self._store.add(job, idempotency=idempotency, limits=self._quota)
+        except QuotaExceeded as error:
+            raise _too_many(str(error)) from None
+        except IdempotencyConflict:
+            raise _conflict(idempotency_key) from None
+        finally:
+            document.unlink(missing_ok=True)
+            # Not known by this name: refused, or a request with the same key was quicker.
+            if added is None or added.id != job_id:
+                self._storage.delete(prefix)
+        return Taken(added, added.id == job_id, upload)
+
+    def _check_targets(self, wanted: JobQuery) -> None:
+        """Refuse where nothing may be sent to."""
+        try:
+            if wanted.webhook is not None:
+                check_webhook(wanted.webhook, self._settings)
+            if wanted.printer is not None:
+                printer_for(self._printers, wanted.printer, start=wanted.print)
+        except TargetRefused as error:
+            raise Problem(422, "It must not be sent there", str(error)) from None
+        if wanted.print and wanted.printer is None:
+            raise Problem(
+                422, "No printer", "`print` needs a printer: name one of /v1/printers as well."
+            )
+
+    def _earlier(self, caller: Caller, key: str, fingerprint: str) -> Job | None:
+        """Return the job that the same request led to before."""
+        found = self._store.submitted(caller.owner, key)
+        if found is None:
+            return None
+        known, job = found
+        if known != fingerprint:
+            raise _conflict(key)
+        return job
+
+    def _check_room(self, caller: Caller, upload_bytes: int = 0) -> None:
+        """Refuse as early as can be told; adding the job checks again, in its transaction."""
+        jobs, kept_bytes = self._store.usage(caller.owner)
+        if jobs >= self._quota.max_jobs:
+            raise _too_many(
+                f"{caller.owner!r} has {jobs} jobs that are not over, the limit is "
+                f"{self._quota.max_jobs}; wait for some, or cancel them."
+            )
+        if kept_bytes + upload_bytes >= self._quota.max_bytes:
+            raise Problem(
+                507,
+                "No space left",
+                f"{caller.owner!r} keeps {kept_bytes} bytes, and {self._quota.max_bytes} is the "
+                "limit; delete jobs that are over.",
+            )
+
+    def _pinned(self, name: str) -> PinnedMachine:
+        try:
+            return self._machines.for_job(name)
+        except UnknownMachine:
+            known = ", ".join(self._machines.names())
+            detail = f"No machine is called {name[:80]!r}. Known: {known}."
+            raise Problem(422, "Unknown machine", detail) from None
+        except NotApproved as error:
+            raise Problem(422, "Machine not approved", str(error)) from None
+        except ModelError as error:
+            raise Problem(422, "The machine cannot be used", str(error)) from None
+
+    @contextmanager
+    def _incoming(self, job_id: str) -> Iterator[Path]:
+        """Give a file for an upload on its way; gone afterwards, however the block ends."""
+        incoming = self._folder / f"{job_id}.upload"
+        try:
+            yield incoming
+        finally:
+            incoming.unlink(missing_ok=True)
+
+
+def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:
+    """Take `print` of a form, which is how printers' own APIs are told so."""
+    if upload.fields.get("print", "").strip().lower() in ("true", "1", "yes", "on"):
+        return wanted.model_copy(update={"print": True})
+    return wanted
+
+
+def _dedupe_key(wanted: JobQuery, upload: Upload, pinned: PinnedMachine) -> str:
+    """Return what jobs have in common that must have the same result."""
+    return _digest(
+        upload.sha256,
+        upload.name,  # stands in the report
+        pinned.machine.revision,
+        wanted.options().model_dump(),
+        wanted.batch,  # a list of a batch must be whole
+        __version__,
+    )
+
+
+def _fingerprint(wanted: JobQuery, upload: Upload) -> str:
+    """Return what makes two requests the same."""
+    return _digest(upload.sha256, upload.name, wanted.model_dump(exclude={"name"}))
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _result_name(source_name: str) -> str:
+    """Name the result; printers tell a sliced package by both of its suffixes."""
+    source = Path(source_name)
+    suffix = ".gcode.3mf" if source_name.lower().endswith(".gcode.3mf") else source.suffix
+    return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
+
+
+def _too_many(detail: str) -> Problem:
+    return Problem(429, "Too much at once", detail, headers={"Retry-After": "30"})
+
+
+def _conflict(key: str | None) -> Problem:
+    return Problem(
+        422,
+        "Idempotency-Key used before",
+        f"The Idempotency-Key {key!r:.80} belongs to another file or to other parameters; take a "
+        "new key for a new request.",
+    )

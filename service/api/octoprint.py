@@ -1,0 +1,170 @@
+"""The two requests of OctoPrint's API that slicers send a file to a printer with.
+
+A slicer is given the address of this service as that of an OctoPrint. With
+``http://host:8000/printers/NAME`` the file is for the printer NAME of the printers' file, to which
+the result is sent on, or, if there is none, for the machine NAME.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Request, Response
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from service.api.access import Reader, Uploader
+from service.api.intake import Intake
+from service.api.jobs import upload_body
+from service.api.problems import Problem, responses
+from service.api.schemas import JobQuery
+from service.version import __version__
+
+__all__ = ["router"]
+
+# Slicers look for the word in front.
+_TEXT = f"OctoPrint (Stillpath {__version__})"
+
+PrinterName = Annotated[
+    str, Path(description="A printer of `/v1/printers`, or a machine.", examples=["ender3"])
+]
+
+router = APIRouter(tags=["printers"])
+
+
+class ApiVersion(BaseModel):
+    """What OctoPrint says of itself."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"api": "0.1", "server": "1.10.0", "text": _TEXT}]}
+    )
+
+    api: str = "0.1"
+    server: str = "1.10.0"
+    text: str = _TEXT
+
+
+class LocalFile(BaseModel):
+    """A file, as OctoPrint tells of it."""
+
+    name: str
+    path: str
+    display: str
+    origin: str = "local"
+    refs: dict[str, str]
+
+
+class Stored(BaseModel):
+    """OctoPrint's answer to an upload; `job` is ours."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "files": {
+                        "local": {
+                            "name": "gear.gcode",
+                            "path": "gear.gcode",
+                            "display": "gear.gcode",
+                            "origin": "local",
+                            "refs": {"resource": "http://localhost:8000/v1/jobs/5f2c8e0e"},
+                        }
+                    },
+                    "done": True,
+                    "effectiveSelect": False,
+                    "effectivePrint": False,
+                    "job": "/v1/jobs/5f2c8e0e",
+                }
+            ]
+        }
+    )
+
+    files: dict[str, LocalFile]
+    done: bool = True
+    effectiveSelect: bool = False
+    effectivePrint: bool
+    job: str
+
+
+@router.get(
+    "/api/version", responses=responses(401, 403, 429), summary="Say what OctoPrint would say"
+)
+async def version(_: Reader) -> ApiVersion:
+    """Answer a slicer's test of the connection."""
+    return ApiVersion()
+
+
+@router.get(
+    "/printers/{name}/api/version",
+    responses=responses(401, 403, 404, 429),
+    summary="Say what OctoPrint would say",
+)
+async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersion:
+    """Answer a slicer's test of the connection."""
+    if name not in request.app.state.printers:
+        # Only whether there is one: jobs ask for more.
+        names = request.app.state.machines.names()
+        if name not in names:
+            raise _no_such_printer(request, name)
+    return ApiVersion()
+
+
+_UPLOAD: dict[str, Any] = {
+    "status_code": 201,
+    "responses": responses(401, 403, 413, 422, 429, 507),
+    "openapi_extra": upload_body(required_form=True),
+    "summary": "Hand in a file as to OctoPrint",
+}
+
+
+@router.post("/api/files/local", **_UPLOAD)
+async def upload(request: Request, response: Response, caller: Uploader) -> Stored:
+    """Make a job of the file, for the only printer there is."""
+    printers = request.app.state.printers
+    if len(printers) != 1:
+        raise Problem(
+            422,
+            "Which printer?",
+            f"There are {len(printers)} printers. Give the slicer an address that names one: "
+            f"{request.base_url}printers/NAME, with a name of /v1/printers or of /v1/machines.",
+        )
+    return await _taken(request, response, next(iter(printers)), caller)
+
+
+@router.post("/printers/{name}/api/files/local", **_UPLOAD)
+async def upload_for(
+    request: Request, response: Response, name: PrinterName, caller: Uploader
+) -> Stored:
+    """Make a job of the file; a printer gets the result, and prints it if `print` is true."""
+    return await _taken(request, response, name, caller)
+
+
+async def _taken(request: Request, response: Response, name: str, caller: Uploader) -> Stored:
+    intake: Intake = request.app.state.intake
+    taken = await intake.take(request, _wanted(request, name), caller)
+    here = f"/v1/jobs/{taken.job.id}"
+    response.headers["Location"] = f"{str(request.base_url).rstrip('/')}{here}"
+    file = LocalFile(
+        name=taken.job.source_name,
+        path=taken.job.source_name,
+        display=taken.job.source_name,
+        refs={"resource": response.headers["Location"]},
+    )
+    return Stored(files={"local": file}, effectivePrint=taken.job.print_after, job=here)
+
+
+def _wanted(request: Request, name: str) -> JobQuery:
+    printer = request.app.state.printers.get(name)
+    given: dict[str, Any] = {"machine": name, "fresh": True}
+    if printer is not None:
+        chosen = {"method": printer.method, "tolerance_um": printer.tolerance_um}
+        given |= {"machine": printer.machine, "printer": name}
+        given |= {key: value for key, value in chosen.items() if value is not None}
+    try:
+        return JobQuery.model_validate(given)
+    except ValidationError:
+        raise _no_such_printer(request, name) from None
+
+
+def _no_such_printer(request: Request, name: str) -> Problem:
+    known = ", ".join([*request.app.state.printers, *request.app.state.machines.names()])
+    return Problem(404, "No such printer", f"No printer is called {name!r:.80}. Known: {known}.")

@@ -1,0 +1,144 @@
+"""Answers with files of the storage: ranges, entity tags, HEAD; memory holds one chunk."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator, Iterator
+from urllib.parse import quote
+
+from fastapi import Request
+from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
+from starlette.responses import Response, StreamingResponse
+
+from service.api.problems import Problem
+from service.storage.base import Storage
+
+__all__ = ["HEADERS", "RANGES", "matches", "stored"]
+
+_RANGE = re.compile(r"bytes=(\d{1,18})?-(\d{1,18})?")
+
+HEADERS = {
+    "ETag": {"schema": {"type": "string"}, "description": "Names these bytes."},
+    "Accept-Ranges": {"schema": {"type": "string"}},
+}
+"""OpenAPI entries for the headers of a stored file."""
+
+RANGES: dict[int | str, dict[str, str]] = {
+    206: {"description": "The part that `Range` names"},
+    304: {"description": "Not Modified: `If-None-Match` names these bytes"},
+}
+"""OpenAPI entries for the other answers a stored file can give."""
+
+
+async def stored(
+    request: Request,
+    storage: Storage,
+    key: str,
+    *,
+    media_type: str,
+    etag: str | None = None,
+    filename: str | None = None,
+    span: tuple[int, int] | None = None,
+) -> Response:
+    """Return the answer with a stored file.
+
+    Parameters
+    ----------
+    request : Request
+        Its method and the headers Range, If-Range and If-None-Match are obeyed. Several ranges at
+        once are answered with the whole, as RFC 9110 allows.
+    storage : Storage
+    key : str
+    media_type : str
+    etag : str, optional
+        Without quotes; by default of size and time.
+    filename : str, optional
+        Under which a browser saves it.
+    span : (int, int), optional
+        First byte, and the one behind the last, of what counts as the file.
+
+    Raises
+    ------
+    Problem
+        404 if the file is gone, 416 if it has no such range.
+    """
+    try:
+        found = await run_in_threadpool(storage.stat, key)
+    except FileNotFoundError:
+        name = key.rsplit("/", 1)[-1]
+        raise Problem(404, "The file is gone", f"{name} is no longer in the storage.") from None
+    first, behind = span or (0, found.size_bytes)
+    if not 0 <= first <= behind <= found.size_bytes:
+        raise Problem(404, "The file is gone", "The file is shorter than its index says.")
+    tag = f'"{etag or f"{found.size_bytes:x}-{int(found.modified_at * 1e6):x}"}"'
+    headers = {"ETag": tag, "Accept-Ranges": "bytes"}
+    if filename is not None:
+        headers["Content-Disposition"] = _disposition(filename)
+    if matches(request.headers.get("if-none-match"), tag):
+        return Response(status_code=304, headers=headers)
+    size = behind - first
+    part = _range(request, tag, size)
+    status = 200
+    if part is not None:
+        status = 206
+        start, stop = part
+        headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
+        first, behind = first + start, first + stop
+    headers["Content-Length"] = str(behind - first)
+    if request.method == "HEAD" or first == behind:
+        return Response(status_code=status, headers=headers, media_type=media_type)
+    chunks = _closing(storage.read(key, first, behind))
+    return StreamingResponse(chunks, status_code=status, headers=headers, media_type=media_type)
+
+
+def matches(header: str | None, tag: str) -> bool:
+    """Return whether a list of entity tags (RFC 9110, 13.1) holds `tag`."""
+    if header is None:
+        return False
+    tags = [each.strip().removeprefix("W/") for each in header.split(",")]
+    return "*" in tags or tag in tags
+
+
+def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
+    """Return the part that is asked for, as first byte and the one behind the last."""
+    asked = request.headers.get("range")
+    condition = request.headers.get("if-range")
+    if asked is None or (condition is not None and condition != tag):
+        return None
+    found = _RANGE.fullmatch(asked.replace(" ", ""))
+    start_text, last_text = found.groups() if found else (None, None)
+    if start_text is None and last_text is None:
+        return None  # of another kind: as if it were not there
+    if start_text is None:
+        start, stop = max(size - int(last_text or 0), 0), size
+    else:
+        start = int(start_text)
+        stop = size if last_text is None else min(int(last_text) + 1, size)
+        if last_text is not None and int(last_text) < start:
+            return None
+    if start >= size or start == stop:
+        raise Problem(
+            416,
+            "No such range",
+            f"The file has {size} bytes; {asked[:80]} lies outside.",
+            headers={"Content-Range": f"bytes */{size}"},
+        )
+    return start, stop
+
+
+async def _closing(chunks: Iterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the chunks, and let go of the file also when the caller goes away."""
+    try:
+        async for chunk in iterate_in_threadpool(chunks):
+            yield chunk
+    finally:
+        close = getattr(chunks, "close", None)
+        if close is not None:
+            close()
+
+
+def _disposition(filename: str) -> str:
+    quoted = quote(filename)
+    if quoted == filename:
+        return f'attachment; filename="{filename}"'
+    return f"attachment; filename*=UTF-8''{quoted}"
