@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
-__all__ = ["PROBLEM_MEDIA_TYPE", "problem", "problem_of"]
+__all__ = ["DISK_FULL", "PROBLEM_MEDIA_TYPE", "problem", "problem_of"]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of errors that say that a disk takes no more."""
 
 
 def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any]:
@@ -46,8 +49,13 @@ def problem_of(error: BaseException) -> dict[str, Any]:
             return problem(422, "No compensator can be designed", str(error))
         case MemoryError():
             return problem(500, "Out of memory", "The worker ran out of memory; give it more.")
-        case OSError() if error.errno == 28:
-            return problem(507, "No space left", "The data directory's disk is full; free space.")
+        case OSError() if error.errno in DISK_FULL:
+            return problem(
+                507,
+                "No space left",
+                "The disk of the data directory or of the storage is full; free space there and "
+                "submit the job again.",
+            )
         case _:
             return problem(
                 500,

@@ -1,38 +1,64 @@
-"""The worker process: takes one job after the other from a pipe and tells how it goes.
+"""The work itself, in a worker process: claim a job, do it, put its files away, say so.
 
-Messages to the worker are `Task` (do this) and `Stop` (drop this attempt); messages from it are
-events of `service.jobs.state`, and `Dropped`. A closed pipe ends the worker.
+Nothing but the job's id travels through Dask; everything else is read from database and storage.
+An attempt's files lie under a prefix of its own, so that two attempts never meet, and the row
+names the prefix of the one that counts.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import hashlib
+import json
 import os
+import pkgutil
 import shutil
-import signal
+import socket
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import structlog
 
+from service.database.engine import DatabaseAway, StoreError, open_database
 from service.environment import prepare_environment
-from service.jobs.problems import problem_of
-from service.jobs.state import Failed, Finished, Progressed
+from service.jobs.problems import DISK_FULL, problem_of
+from service.jobs.state import Event, Failed, Finished, Job, Lost
+from service.jobs.store import JobStore
+from service.jobs.watch import Limits, Watch
 from service.logs import configure_logging
 from service.pipeline.progress import Cancelled, Progress
+from service.settings import Settings
+from service.storage import Storage, StorageError
+from service.storage.opened import open_storage
 
-__all__ = ["Dropped", "Runner", "Stop", "Task", "run_task", "worker_main"]
+__all__ = ["Runner", "Task", "Workplace", "execute", "run_job", "run_task"]
 
-_REPORT_EVERY_S = 0.2
+_PATIENCE_S = 60.0
+"""How long storage and database may be away before an attempt is given up."""
+_LONGEST_PAUSE_S = 4.0
+
+_Given = TypeVar("_Given")
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One attempt at a job; `machine_file` holds the machine that it was accepted with."""
+    """One attempt at a job, as a runner sees it: files on this computer.
+
+    Attributes
+    ----------
+    machine_file : Path
+        Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`).
+    source : Path
+        To be read only.
+    target, report : Path
+        File and folder to be made; the folders above exist.
+    cache_dir : Path
+        What is worth keeping between jobs.
+    """
 
     job_id: str
     attempt: int
@@ -45,39 +71,95 @@ class Task:
     cache_dir: Path
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
-    """Drop the attempt."""
-
-    job_id: str
-    attempt: int
+Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]
+"""Does the work of a task and returns the figures that lists show; importable by its name."""
 
 
 @dataclass(frozen=True, slots=True)
-class Dropped:
-    """The attempt was dropped; nothing of it is left."""
+class Workplace:
+    """What a worker has around it.
 
-    attempt: int
-
-
-Runner = Callable[[Task, Callable[[Progress], None]], None]
-"""Does the work of a task; importable by name, because it travels to a new process."""
-
-
-def run_task(task: Task, progress: Callable[[Progress], None]) -> None:
-    """Compensate the task's file and write its report.
-
-    The report is made beside its place and moved there whole; the result likewise (see
-    `service.pipeline.road`).
+    Attributes
+    ----------
+    scratch : Path
+        Folder for files that are being made.
+    name : str
+        Of the worker.
+    interrupted : callable
+        Says why the worker has to give its job back, or None.
+    end : callable
+        Ends this process with an exit code.
     """
+
+    settings: Settings
+    store: JobStore
+    storage: Storage
+    scratch: Path
+    name: str = field(default_factory=lambda: f"{socket.gethostname()}:{os.getpid()}")
+    interrupted: Callable[[], str | None] = lambda: None
+    end: Callable[[int], object] = os._exit
+
+
+def run_job(job_id: str, settings: dict[str, Any] | None, runner: str) -> None:
+    """Do one job in a Dask worker, unless somebody else does it or did it.
+
+    Parameters
+    ----------
+    job_id : str
+    settings : dict, optional
+        Fields of `Settings`; by default this process reads them from its environment.
+    runner : str
+        ``module:name`` of a `Runner`.
+    """
+    from distributed import get_worker
+    from distributed.core import Status
+
+    worker = get_worker()
+
+    def interrupted() -> str | None:
+        ended = worker.status not in (Status.running, Status.paused)
+        return "the worker was stopped" if ended else None
+
+    given = None if settings is None else json.dumps(settings, sort_keys=True)
+    own, store, storage = _opened(given)
+    workplace = Workplace(
+        own, store, storage, Path(worker.local_directory), interrupted=interrupted
+    )
+    execute(job_id, workplace, pkgutil.resolve_name(runner))
+
+
+def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
+    """Claim a job, do it, and write down how it ended; if it cannot be claimed, do nothing."""
+    store = workplace.store
+    job = _patiently(
+        lambda: store.claim(job_id, time.time(), workplace.name), DatabaseAway, time.sleep
+    )
+    if job is None:
+        return
+    log = structlog.get_logger("worker")
+    settings = workplace.settings
+    limits = Limits(settings.max_job_s, settings.max_job_bytes, settings.cancel_grace_s)
+    watch = Watch(store, job, limits, interrupted=workplace.interrupted, end=workplace.end)
+    with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
+        log.info("job started", worker=workplace.name)
+        with watch:
+            event = _attempt(job, workplace, runner, watch)
+        # A verdict of the watch that the database has not heard of comes first.
+        for said in (watch.verdict, event):
+            if said is not None:
+                _report(store, job, said)
+        log.info("job over", outcome="dropped" if event is None else type(event).__name__)
+    if watch.outgrown:
+        workplace.end(0)
+
+
+def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
+    """Compensate the task's file and write its report; see `Runner`."""
     from service.machines.resolve import PinnedMachine
     from service.pipeline.options import Options
     from service.pipeline.road import compensate_file
     from service.reports import write_report
 
-    # A worker that was killed may have left half a file.
-    shutil.rmtree(task.target.parent, ignore_errors=True)
-    task.target.parent.mkdir(parents=True)
     pinned = PinnedMachine.read(task.machine_file, task.machine)
     result = compensate_file(
         task.source,
@@ -86,59 +168,129 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> None:
         Options.model_validate(task.options),
         cache_dir=task.cache_dir,
         progress=progress,
+        layers=task.report,
     )
     result.warnings.extend(pinned.warnings)
-    fresh = task.report.with_name(f"{task.report.name}.{task.attempt}.part")
-    write_report(result, fresh)
-    shutil.rmtree(task.report, ignore_errors=True)
-    fresh.rename(task.report)
+    write_report(result, task.report)
+    contour_um = {c.name: c.extruding.contour_rms_um for c in result.channels}
+    return {
+        "original_s": result.original_time_s,
+        "written_s": result.time_s,
+        **{f"{name}_um": contour_um.get(name) for name in ("before", "after", "shaper")},
+        "put_back": len(result.put_back),
+        "warnings": len(result.warnings),
+    }
 
 
-def worker_main(connection: Connection, runner: Runner = run_task) -> None:
-    """Serve tasks until the pipe is closed. The entry point of the worker process."""
-    prepare_environment()
-    configure_logging()
-    # Ctrl-C goes to the whole terminal group; the service ends its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with contextlib.suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        while True:
-            message = connection.recv()
-            if isinstance(message, Task):
-                _serve(connection, message, runner)
-
-
-def _serve(connection: Connection, task: Task, runner: Runner) -> None:
-    last = 0.0
-
-    def tell(progress: Progress) -> None:
-        nonlocal last
-        while connection.poll():
-            message = connection.recv()  # a closed pipe raises EOFError, which ends the worker
-            if isinstance(message, Stop) and message.attempt == task.attempt:
-                raise Cancelled
-        now = time.monotonic()
-        if now - last >= _REPORT_EVERY_S:
-            last = now
-            connection.send(
-                Progressed(task.attempt, progress.stage, progress.fraction, progress.eta_s)
-            )
-
+def _attempt(job: Job, workplace: Workplace, runner: Runner, watch: Watch) -> Event | None:
+    """Return how the attempt ended; None if it was stopped from outside."""
     try:
-        runner(task, tell)
+        with _folder(workplace.scratch / f"{job.id}-{job.attempt}") as folder:
+            return _work(job, workplace, runner, watch, folder)
     except Cancelled:
-        connection.send(Dropped(task.attempt))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        raise
+        return None
+    except StorageError as error:
+        if error.errno not in DISK_FULL:
+            _log_crash()
+            # Perhaps it answers another worker, or later.
+            return Lost(job.attempt, time.time(), str(error), workplace.settings.max_attempts)
+        return Failed(job.attempt, time.time(), problem_of(error))
     except Exception as error:
         found = problem_of(error)
         if found["status"] >= 500:
-            _log_crash(task)
-        connection.send(Failed(task.attempt, time.time(), found))
-    else:
-        connection.send(Finished(task.attempt, time.time()))
+            _log_crash()
+        return Failed(job.attempt, time.time(), found)
 
 
-def _log_crash(task: Task) -> None:
-    structlog.get_logger("worker").exception(
-        "job broke", job=task.job_id, attempt=task.attempt, pid=os.getpid()
-    )
+def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: Path) -> Finished:
+    storage, place = workplace.storage, f"jobs/{job.id}"
+    target, report = folder / "result" / job.result_name, folder / "report"
+    target.parent.mkdir()
+    with contextlib.ExitStack() as stack:
+
+        def fetch(key: str) -> Path:
+            return _patiently(
+                lambda: stack.enter_context(storage.local(f"{place}/{key}")),
+                StorageError,
+                watch.pause,
+            )
+
+        source = fetch(f"source/{job.source_name}")
+        try:
+            machine = fetch("machine.json")
+        except FileNotFoundError:
+            machine = folder / "machine.json"  # a job of an earlier version
+        cache = workplace.settings.data_dir / "cache"
+        cache.mkdir(parents=True, exist_ok=True)
+        summary = runner(
+            Task(
+                job.id,
+                job.attempt,
+                job.machine,
+                machine,
+                job.options,
+                source,
+                target,
+                report,
+                cache,
+            ),
+            watch.tell,
+        )
+    with target.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    result_bytes = target.stat().st_size
+    output, output_bytes = f"{place}/{job.attempt}", sum(path.stat().st_size for path in files)
+    for path in files:
+        key = f"{output}/{path.relative_to(folder).as_posix()}"
+        watch.check()
+        _patiently(functools.partial(storage.put, key, path), StorageError, watch.pause)
+    return Finished(job.attempt, time.time(), output, output_bytes, result_bytes, digest, summary)
+
+
+def _report(store: JobStore, job: Job, event: Event) -> None:
+    # Should the database break after it has taken the event, the second try is stale: no harm.
+    _patiently(lambda: store.apply(job.id, event), DatabaseAway, time.sleep)
+
+
+def _patiently(
+    action: Callable[[], _Given],
+    trouble: type[Exception],
+    pause: Callable[[float], None],
+) -> _Given:
+    """Repeat `action` while it raises `trouble`, up to a limit; a full disk is not waited for."""
+    deadline = time.monotonic() + _PATIENCE_S
+    wait_s = 0.2
+    while True:
+        try:
+            return action()
+        except trouble as error:
+            full = isinstance(error, OSError) and error.errno in DISK_FULL
+            if full or time.monotonic() > deadline:
+                raise
+            structlog.get_logger("worker").warning("trying again", error=str(error), in_s=wait_s)
+        pause(wait_s)
+        wait_s = min(2 * wait_s, _LONGEST_PAUSE_S)
+
+
+@contextlib.contextmanager
+def _folder(folder: Path) -> Iterator[Path]:
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(given: str | None) -> tuple[Settings, JobStore, Storage]:
+    """Open database and storage, once for each process."""
+    prepare_environment()
+    configure_logging()
+    settings = Settings() if given is None else Settings.model_validate_json(given)
+    engine = _patiently(lambda: open_database(settings), StoreError, time.sleep)
+    return settings, JobStore(engine), open_storage(settings)
+
+
+def _log_crash() -> None:
+    structlog.get_logger("worker").exception("job broke", pid=os.getpid())

@@ -9,19 +9,47 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from gcode.errors import GcodeError
 from service.jobs.worker import Task
 from service.pipeline.progress import Progress
-from service.reports import write_report
-from tests.service.synthetic import make_result
 
-__all__ = ["pretend"]
+__all__ = ["light", "pretend"]
+
+SUMMARY: dict[str, Any] = {
+    "original_s": 10.0,
+    "written_s": 9.5,
+    "before_um": 100.0,
+    "after_um": 20.0,
+    "shaper_um": 40.0,
+    "put_back": 0,
+    "warnings": 0,
+}
 
 
-def pretend(task: Task, progress: Callable[[Progress], None]) -> None:
+def pretend(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
+    """Do as told, with a real report."""
+    from service.reports import write_report
+    from tests.service.synthetic import make_result
+
+    _act(task, progress)
+    write_report(make_result(layers=4), task.report)
+    return SUMMARY
+
+
+def light(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
+    """Do as told, and import nothing heavy."""
+    _act(task, progress)
+    task.report.mkdir()
+    (task.report / "report.json").write_text("{}")
+    return SUMMARY
+
+
+def _act(task: Task, progress: Callable[[Progress], None]) -> None:
     text = task.source.read_text()
-    word = text.split()[0]
+    word, _, rest = text.partition(" ")
+    word = word.split("\n")[0]
     if word == "bad":
         raise GcodeError("X1e400 is too large", line=7, text="G1 X1e400")
     if word == "crash":
@@ -29,21 +57,48 @@ def pretend(task: Task, progress: Callable[[Progress], None]) -> None:
     if word == "die" or (word == "die-once" and _first_time(task.source)):
         os._exit(9)
     if word == "slow":
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
-            time.sleep(0.02)
+        _take(60.0, progress)
+    if word == "slow-once" and _first_time(task.source):
+        _take(60.0, progress)
+    if word == "nap":
+        _take(float(rest.split()[0]), progress)
     if word == "deaf":
-        time.sleep(60)
+        time.sleep(600)
+    if word == "grow":
+        _grow(int(rest.split()[0]) << 20, progress)
     progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
-    task.target.parent.mkdir(parents=True, exist_ok=True)
-    task.target.write_text("; compensated\n" + text)
-    write_report(make_result(layers=4), task.report)
+    with task.target.open("w") as file:
+        file.write("; compensated\n" + text)
+        if word == "long":
+            for _ in range(int(rest.split()[0])):
+                file.write("; " + "x" * ((1 << 20) - 3) + "\n")
+                progress(Progress("compensating", 0.6, 10.0, 1.0, 1.0))
+
+
+def _take(seconds: float, progress: Callable[[Progress], None]) -> None:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
+        time.sleep(0.02)
+
+
+def _grow(size: int, progress: Callable[[Progress], None]) -> None:
+    kept = bytearray(b"x") * size
+    while kept:
+        progress(Progress("compensating", 0.5, 10.0, 1.0, 1.0))
+        time.sleep(0.02)
 
 
 def _first_time(source: Path) -> bool:
-    mark = source.with_name("tried")
-    if mark.exists():
+    """Return whether this source is seen for the first time on this computer."""
+    folder = (
+        Path(os.environ["STILLPATH_TEST_MARKS"])
+        if "STILLPATH_TEST_MARKS" in os.environ
+        else (source.parent)
+    )
+    mark = folder / f"tried-{source.read_text().split()[-1][:60]}"
+    try:
+        mark.touch(exist_ok=False)
+    except FileExistsError:
         return False
-    mark.touch()
     return True

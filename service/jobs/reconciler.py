@@ -1,0 +1,258 @@
+"""Makes the workers do what the database says: hands jobs over, and notices lost ones.
+
+One thread of each process of the API. Of several, the one with the lease acts; it keeps nothing
+that could not be found out again, so any other can go on in its place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+import uuid
+from typing import TYPE_CHECKING
+
+import structlog
+
+from service.database.engine import DatabaseAway
+from service.jobs.cluster import Cluster, ClusterAway
+from service.jobs.state import Job, JobState, Lost
+from service.jobs.store import JobStore
+from service.jobs.sweep import forget_expired, sweep_files, sweep_incoming
+from service.settings import Settings
+from service.storage import Storage, StorageError
+
+if TYPE_CHECKING:
+    from distributed import Future
+
+__all__ = ["Reconciler"]
+
+_LEASE, _LEASE_S = "reconciler", 5.0
+_TICK_S = 0.5
+_SWEEP_EVERY_S = 60.0
+_ORPHAN_S = 3600.0
+"""Files without a row are of an upload, as long as they are younger."""
+_RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
+_OWN_GRACE_S, _GRACE_S = 60.0, 5.0
+"""How long our own workers, which start anew by themselves, and those elsewhere may be away before
+the service is not ready."""
+
+
+class Reconciler:
+    """The thread.
+
+    Parameters
+    ----------
+    settings : Settings
+    store : JobStore
+    storage : Storage
+    cluster : Cluster
+
+    Attributes
+    ----------
+    slots : int
+        How many jobs can run at once, as far as is known.
+    """
+
+    def __init__(
+        self, settings: Settings, store: JobStore, storage: Storage, cluster: Cluster
+    ) -> None:
+        self.slots = 0
+        self._settings = settings
+        self._store = store
+        self._storage = storage
+        self._cluster = cluster
+        self._holder = uuid.uuid4().hex
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="reconciler", daemon=True)
+        self._sweeper = threading.Thread(target=self._run_sweeps, name="sweeper", daemon=True)
+        self._log = structlog.get_logger("reconciler")
+        self._in_flight: dict[str, tuple[Job, Future]] = {}
+        self._has_lease = False
+        self._took_over = False
+        self._started_at = time.time()
+        self._trouble: str | None = None
+        self._trouble_since = 0.0
+        # Since when the database and the workers answer, without a break.
+        self._steady_since = time.monotonic()
+
+    def start(self) -> None:
+        """Start the threads."""
+        self._started_at = time.time()
+        self._trouble, self._trouble_since = "no worker has started yet", time.monotonic()
+        self._thread.start()
+        self._sweeper.start()
+
+    def stop(self) -> None:
+        """End the threads."""
+        self._stopping.set()
+        self._wake.set()
+        self._thread.join()
+        self._sweeper.join()
+
+    def leave(self) -> None:
+        """Give the jobs of our own workers, which have ended, back to the queue."""
+        with contextlib.suppress(DatabaseAway):
+            if self._cluster.is_own:
+                for job, _ in self._in_flight.values():
+                    self._give_back(job.id, job.attempt + 1, "the service stopped", blame=False)
+            self._store.release(_LEASE, self._holder)
+        self._in_flight.clear()
+
+    def notify(self) -> None:
+        """Look at once: there is a new job, or a place became free."""
+        self._wake.set()
+
+    @property
+    def trouble(self) -> str | None:
+        """Why no job would be done now, or None.
+
+        Workers that start are none: what is submitted meanwhile is kept and done.
+        """
+        grace_s = _OWN_GRACE_S if self._cluster.is_own else _GRACE_S
+        lasted_s = time.monotonic() - self._trouble_since
+        return self._trouble if lasted_s > grace_s else None
+
+    # The thread
+
+    def _run(self) -> None:
+        wait_s = _RETRY_S
+        while not self._stopping.is_set():
+            try:
+                self._tick()
+            except (DatabaseAway, ClusterAway) as error:
+                self._say(str(error))
+                self.slots = 0
+                self._steady_since = time.monotonic()
+                if isinstance(error, ClusterAway):
+                    self._in_flight.clear()
+                    self._cluster.disconnect()
+                self._stopping.wait(wait_s)
+                wait_s = min(2 * wait_s, _LONGEST_RETRY_S)
+            except Exception:
+                self._log.exception("reconciler broke")
+                self._stopping.wait(_LONGEST_RETRY_S)
+            else:
+                wait_s = _RETRY_S
+                self._wake.wait(_TICK_S)
+                self._wake.clear()
+
+    def _tick(self) -> None:
+        if self._cluster.is_own and not self._took_over:
+            self._take_over()
+        if not self._cluster.is_connected:
+            self._in_flight.clear()
+            self._cluster.connect()
+        self.slots = self._cluster.slots()
+        self._say(None if self.slots else "no worker is connected to the scheduler")
+        self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
+        if not self._has_lease:
+            self._in_flight.clear()  # whoever has the lease hands them over again
+            return
+        self._find_silent()
+        self._collect()
+        self._hand_over()
+
+    def _take_over(self) -> None:
+        """Give back what ran when the service before us ended; its workers ended with it.
+
+        Only with a database that no other service uses (`service.exclusive` keeps the folder);
+        otherwise silence tells.
+        """
+        if self._store.engine.dialect.name == "sqlite":
+            for job in self._store.in_state(JobState.RUNNING):
+                self._give_back(job.id, job.attempt, "the service ended", blame=False)
+        self._took_over = True
+
+    def _find_silent(self) -> None:
+        timeout_s = self._settings.heartbeat_timeout_s
+        # While nobody could reach the database, nobody could be heard.
+        if time.monotonic() - self._steady_since > timeout_s:
+            for job in self._store.silent(time.time() - timeout_s):
+                reason = f"nothing was heard of its worker {job.worker} for {timeout_s:g} s"
+                self._give_back(job.id, job.attempt, reason)
+
+    def _collect(self) -> None:
+        """Drop the futures that are done; a job that still runs by then has lost its worker."""
+        done = {job_id: pair for job_id, pair in self._in_flight.items() if pair[1].done()}
+        if not done:
+            return
+        rows = self._store.many(done)
+        unclaimed = False
+        for job_id, (job, future) in done.items():
+            row = rows.get(job_id)
+            if row is not None and row.attempt == job.attempt + 1:
+                if row.state is JobState.RUNNING:
+                    self._give_back(job_id, row.attempt, _reason(future))
+            elif row is not None and row.state is JobState.QUEUED and row.attempt == job.attempt:
+                unclaimed = True
+                self._log.warning("not even begun", job=job_id, reason=_reason(future))
+            del self._in_flight[job_id]
+        if unclaimed:
+            self._stopping.wait(_RETRY_S)  # whatever it is, do not try it a thousand times
+
+    def _hand_over(self) -> None:
+        """Hand over as many jobs as there are free workers.
+
+        No more: one that waits at Dask would not see that a more urgent one has come.
+        """
+        running = {job.id for job in self._store.in_state(JobState.RUNNING)}
+        free = self.slots - len(running | set(self._in_flight))
+        if free <= 0:
+            return
+        for job in self._store.next_queued(free, exclude=list(self._in_flight)):
+            self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+
+    def _give_back(self, job_id: str, attempt: int, reason: str, *, blame: bool = True) -> None:
+        event = Lost(attempt, time.time(), reason, self._settings.max_attempts, blame)
+        after = self._store.apply(job_id, event)
+        if after is not None:
+            self._log.warning(
+                "worker lost", job=job_id, attempt=attempt, reason=reason, now=after.state.value
+            )
+
+    def _say(self, trouble: str | None) -> None:
+        if trouble is None and self._trouble is not None:
+            self._log.info("jobs are done", workers=self.slots)
+        elif trouble is not None and self._trouble is None:
+            self._trouble_since = time.monotonic()
+            self._log.warning("no jobs are done", reason=trouble)
+        self._trouble = trouble
+
+    # The other thread: what may take long
+
+    def _run_sweeps(self) -> None:
+        while True:
+            if self._has_lease:
+                try:
+                    self._sweep()
+                except (DatabaseAway, StorageError) as error:
+                    self._log.warning("sweep broken off", reason=str(error))
+                except Exception:
+                    self._log.exception("sweep broke")
+                pause = _SWEEP_EVERY_S
+            else:
+                pause = _TICK_S
+            if self._stopping.wait(pause):
+                return
+
+    def _sweep(self) -> None:
+        before = time.time() - _ORPHAN_S
+        if self._cluster.is_own and self._settings.storage_url is None:
+            # Nobody else uploads here: what is older than this process is of no upload.
+            before = max(before, self._started_at)
+        sweep_incoming([self._settings.data_dir / "incoming"], before=before)
+        forget_expired(self._store, self._storage, keep_days=self._settings.keep_days)
+        sweep_files(self._store, self._storage, before=before)
+
+
+def _reason(future: Future) -> str:
+    if future.status == "error":
+        error = future.exception(timeout=5)
+        if type(error).__name__ == "KilledWorker":
+            return "its process ended"
+        return f"{type(error).__name__}: {error}"
+    if future.status == "finished":
+        return "its worker left it"
+    return f"the scheduler {future.status} it"

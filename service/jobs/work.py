@@ -1,0 +1,56 @@
+"""All of the work behind one door, for the API: start, stop, look."""
+
+from __future__ import annotations
+
+from service.jobs.cluster import Cluster
+from service.jobs.reconciler import Reconciler
+from service.jobs.store import JobStore
+from service.jobs.worker import Runner, run_task
+from service.settings import Settings
+from service.storage import Storage
+
+__all__ = ["Work"]
+
+
+class Work:
+    """Gets the jobs of a store done.
+
+    Parameters
+    ----------
+    settings : Settings
+    store : JobStore
+    storage : Storage
+        Store and storage are the caller's to close, after `stop`.
+    runner : Runner
+        Does the work of a job in the worker process; tests put another in.
+    """
+
+    def __init__(
+        self, settings: Settings, store: JobStore, storage: Storage, runner: Runner = run_task
+    ) -> None:
+        self._cluster = Cluster(settings, runner)
+        self._reconciler = Reconciler(settings, store, storage, self._cluster)
+
+    def start(self) -> None:
+        """Begin, in threads; returns at once, workers come up meanwhile."""
+        self._reconciler.start()
+
+    def stop(self) -> None:
+        """End. Jobs that run in our own workers go back to the queue, those elsewhere go on."""
+        self._reconciler.stop()
+        self._cluster.close()
+        self._reconciler.leave()
+
+    def notify(self) -> None:
+        """Say that there is a new job, or one less."""
+        self._reconciler.notify()
+
+    @property
+    def workers(self) -> int:
+        """How many jobs can run at once, as far as is known."""
+        return self._reconciler.slots
+
+    @property
+    def is_ready(self) -> str | None:
+        """Why jobs are not done at the moment; None if they are."""
+        return self._reconciler.trouble
