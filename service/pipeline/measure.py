@@ -34,7 +34,7 @@ from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 from simulation.scheduled import MachineStream
 
-__all__ = ["Measurement", "MotionSamples", "channel_names", "part_of"]
+__all__ = ["Measurement", "MotionSamples", "Trace", "channel_names", "part_of"]
 
 Array = NDArray[np.float64]
 
@@ -85,6 +85,8 @@ class Measurement:
         Whether there is a channel `after` beside `before` and `shaper`.
     take_layer : callable, optional
         Is given every layer as soon as it is measured; channels as `channel_names` has them.
+    trace : callable, optional
+        Is given the motion. Errors are then measured at every sample.
     """
 
     def __init__(
@@ -95,13 +97,16 @@ class Measurement:
         *,
         compensated: bool,
         take_layer: Callable[[LayerTile], None] | None = None,
+        trace: Callable[[Trace], None] | None = None,
     ) -> None:
+        self._stride = STRIDE if trace is None else 1
+        self._tracer = None if trace is None else _Tracer(trace)
         self._dt_s = dt_s
         self._machine = machine
         self._point = EMPTY
         self._band = BandContent(machine, dt_s)
         self._names = channel_names(compensated=compensated)
-        self._meter = MotionMeter(dt_s, stride=STRIDE, channels=len(self._names))
+        self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._streams: dict[str, MachineStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
@@ -110,7 +115,7 @@ class Measurement:
         self._spectra = ErrorSpectra(machine, dt_s, self._names)
         self._views = LayerViews(self._names)
         takers = [self._views.add] + ([take_layer] if take_layer else [])
-        self._tiles = LayerRecorder(len(self._names), STRIDE * dt_s, takers)
+        self._tiles = LayerRecorder(len(self._names), self._stride * dt_s, takers)
         self._count = 0
         self._waiting: list[_Points] = []
         self._fresh = self._jumped = True
@@ -126,7 +131,7 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = part_of(samples, len(samples) - 1, len(samples))
-            points = _Points.of(samples, slice(-self._count % STRIDE, None, STRIDE))
+            points = _Points.of(samples, slice(-self._count % self._stride, None, self._stride))
             if len(points):
                 self._waiting.append(replace(points, jumped=self._jumped))
                 self._jumped = False
@@ -184,6 +189,8 @@ class Measurement:
             [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
         )
         self._spectra.add(shaped.path_mm, answers, shaped.extruding)
+        if self._tracer is not None:
+            self._tracer.wait(shaped.executed_mm, answers)
         self._note(self._meter.push(shaped.path_mm, answers, shaped.extruding))
 
     def _note(self, errors: ContourErrors) -> None:
@@ -199,6 +206,8 @@ class Measurement:
             else:
                 del self._waiting[0]
             moves, row = points.moves, points.row
+            if self._tracer is not None:
+                self._tracer.tell(points, found)
             self._layers.add(found, moves.layer[row], points.extruding)
             self._features.add(found, moves.feature[row], points.extruding)
             self._tiles.add(
@@ -250,7 +259,7 @@ class Measurement:
             out.append(
                 GroupFigures(
                     name=label,
-                    seconds=round(STRIDE * tally.count * self._dt_s, 3),
+                    seconds=round(self._stride * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
                     contour_max_um={n: 1e3 * t[key].max for n, t in tallies.items() if key in t},
                 )
@@ -276,6 +285,71 @@ class Measurement:
 def channel_names(*, compensated: bool) -> tuple[str, ...]:
     """Return the names of what is measured, in the order of all tables of channels."""
     return ("before", "after", "shaper") if compensated else ("before", "shaper")
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Motion as measured, sample by sample.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first sample.
+    path_mm, executed_mm : ndarray, shape (2, n)
+        As planned, and as the firmware executes the written file.
+    simulated_mm : ndarray, shape (channels, 2, n)
+    error_mm : ndarray, shape (channels, n)
+        Contour errors.
+    z_mm, extruding, line, layer : ndarray, shape (n,)
+    """
+
+    first: int
+    path_mm: Array
+    executed_mm: Array
+    simulated_mm: Array
+    error_mm: Array
+    z_mm: Array
+    extruding: NDArray[np.bool_]
+    line: NDArray[np.int64]
+    layer: NDArray[np.int32]
+
+
+class _Tracer:
+    """Hold the motion until its errors are known."""
+
+    def __init__(self, trace: Callable[[Trace], None]) -> None:
+        self._trace = trace
+        self._executed: Array | None = None
+        self._simulated = np.zeros((0, 2, 0))
+        self._told = 0
+
+    def wait(self, executed_mm: Array, simulated_mm: Array) -> None:
+        if self._executed is None:
+            self._executed, self._simulated = executed_mm, simulated_mm
+        else:
+            self._executed = np.concatenate([self._executed, executed_mm], axis=1)
+            self._simulated = np.concatenate([self._simulated, simulated_mm], axis=2)
+
+    def tell(self, points: _Points, error_mm: Array) -> None:
+        count = len(points)
+        assert self._executed is not None
+        executed, simulated = self._executed[:, :count], self._simulated[:, :, :count]
+        self._executed = self._executed[:, count:]
+        self._simulated = self._simulated[:, :, count:]
+        first, self._told = self._told, self._told + count
+        self._trace(
+            Trace(
+                first,
+                points.path_mm,
+                executed,
+                simulated,
+                error_mm,
+                points.z_mm,
+                points.extruding,
+                points.moves.line[points.row],
+                points.moves.layer[points.row],
+            )
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import shutil
-import tempfile
 import time
-import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
@@ -25,10 +22,12 @@ from gcode.slicers.facts import SlicerFacts
 from gcode.types import EventKind, Moves, Phases, ProgramBlock
 from models.machine import Machine
 from service.pipeline.clock import StageClock
+from service.pipeline.columns import npz_table
 from service.pipeline.compensating import DT_S
-from service.pipeline.files import default_cache_dir, replacing
+from service.pipeline.files import default_cache_dir
 from service.pipeline.layer_files import written_layers
-from service.pipeline.measure import Measurement, MotionSamples, channel_names
+from service.pipeline.length import LengthGuard
+from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names
 from service.pipeline.operating import Operation
 from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
@@ -97,30 +96,11 @@ def plan_file(
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 100_000):
         raise GcodeError(f"the rate of {rate_hz:g} samples per second is outside 0 to 100000")
     motion = _Motion(source, plate, machine, dialect, 1.0 / rate_hz, progress)
-    with (
-        replacing(target_npz) as temporary,
-        tempfile.TemporaryDirectory(dir=target_npz.parent, prefix=".stillpath-plan-") as folder,
-    ):
-        columns = {name: Path(folder, name) for name in _COLUMNS}
-        files = {name: path.open("wb") for name, path in columns.items()}
-        count = 0
-        try:
-            for part in motion:
-                samples = part.samples
-                rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
-                for name, row in zip(_COLUMNS, rows, strict=True):
-                    files[name].write(np.ascontiguousarray(row, dtype="<f8").tobytes())
-                count += len(samples)
-        finally:
-            for file in files.values():
-                file.close()
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name, path in columns.items():
-                entry = zipfile.ZipInfo(f"{name}.npy")
-                with archive.open(entry, "w", force_zip64=True) as out, path.open("rb") as column:
-                    header = {"descr": "<f8", "fortran_order": False, "shape": (count,)}
-                    np.lib.format.write_array_header_1_0(out, header)
-                    shutil.copyfileobj(column, out, 1 << 20)
+    with npz_table(target_npz, dict.fromkeys(_COLUMNS, "<f8")) as table:
+        for part in motion:
+            samples = part.samples
+            rows = (samples.t_s, *samples.xyz_mm, samples.e_mm)
+            table.write(dict(zip(_COLUMNS, rows, strict=True)))
     return PlannedTime(motion.time_s, motion.facts.slicer, motion.facts.estimate_s, motion.warnings)
 
 
@@ -133,6 +113,7 @@ def simulate_file(
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
     layers: Path | None = None,
+    trace: Callable[[Trace], None] | None = None,
 ) -> Result:
     """Predict the vibration of a file as it is, and with the best firmware shaper.
 
@@ -156,6 +137,7 @@ def simulate_file(
             shaper,
             compensated=False,
             take_layer=writer.add if writer else None,
+            trace=trace,
         )
         for part in motion:
             if part.jumped:
@@ -285,6 +267,7 @@ class _Motion:
             self.facts = container.facts()
             file = container.text
             doubtful = doubts(file, self._machine, self._asked)
+            guard = LengthGuard(file, self._machine, self._dialect)
             size = max(file.seek(0, io.SEEK_END), 1)
             file.seek(0)
             while True:
@@ -293,7 +276,7 @@ class _Motion:
                     moves += len(block.moves)
                     self._hold(block)
                     phases = planner.push(block)
-                    self._check(phases, planner.time_s)
+                    self._check(phases, planner.time_s, guard.check)
                     for samples in sampler.push(self._shortened(phases)):
                         yield from self._parts(samples)
                 self.time_s = planner.time_s
@@ -301,7 +284,7 @@ class _Motion:
                 if not data:
                     break
         phases = planner.flush()
-        self._check(phases, planner.time_s)
+        self._check(phases, planner.time_s, check_print_ends)
         for samples in chain(sampler.push(self._shortened(phases)), sampler.flush()):
             yield from self._parts(samples)
         self.time_s = planner.time_s
@@ -315,10 +298,12 @@ class _Motion:
         lost = block.events.kind == EventKind.UNKNOWN
         self._jumps += block.events.move_index[lost].tolist()
 
-    def _check(self, phases: Phases, time_s: float) -> None:
+    def _check(
+        self, phases: Phases, time_s: float, check_length: Callable[[float, int], None]
+    ) -> None:
         if self._held:
             check_moves_end(phases, self._line)
-            check_print_ends(time_s, int(self._held[-1][1].line[-1]))
+            check_length(time_s, int(self._held[-1][1].line[-1]))
 
     def _line(self, move_index: int) -> int:
         first, moves = [held for held in self._held if held[0] <= move_index][-1]

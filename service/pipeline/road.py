@@ -13,7 +13,7 @@ import hashlib
 import io
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -22,7 +22,7 @@ import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
-from gcode.firmware.planning import check_print_ends, join_phases, plan_moves
+from gcode.firmware.planning import join_phases, plan_moves
 from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
@@ -44,7 +44,8 @@ from service.pipeline.compensating import (
 )
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.layer_files import LayerWriter, written_layers
-from service.pipeline.measure import Measurement, MotionSamples, channel_names, part_of
+from service.pipeline.length import LengthGuard
+from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names, part_of
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options
@@ -76,6 +77,7 @@ def compensate_file(
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
     layers: Path | None = None,
+    trace: Callable[[Trace], None] | None = None,
 ) -> Result:
     """Compensate a print file.
 
@@ -93,6 +95,8 @@ def compensate_file(
         Called now and then; may raise `Cancelled`.
     layers : Path, optional
         Folder for layers.json and layers.bin (`service.pipeline.layer_files`).
+    trace : callable, optional
+        Is given the motion as it is measured.
 
     Returns
     -------
@@ -123,7 +127,7 @@ def compensate_file(
                 writer = files.enter_context(
                     written_layers(layers, channel_names(compensated=True))
                 )
-            job = _Job(container.text, spool, machine, options, cache_dir, progress, writer)
+            job = _Job(container.text, spool, machine, options, cache_dir, progress, writer, trace)
             result = job.run(source.name, facts)
             spool.seek(0)
             job.retiming.copy(spool, text, job.delay_s)
@@ -150,7 +154,8 @@ class _Job:
         options: Options,
         cache_dir: Path | None,
         progress: ProgressCallback | None,
-        layers: LayerWriter | None = None,
+        layers: LayerWriter | None,
+        trace: Callable[[Trace], None] | None,
     ) -> None:
         self._layers = layers
         self._source, self._target = source, target
@@ -174,6 +179,7 @@ class _Job:
         if tuned_first:
             self._work = PieceCompensator(machine, options, self._shaper)
         dialect = dialect_for(machine, options.dialect)
+        self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)
         self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
@@ -184,6 +190,7 @@ class _Job:
             self._shaper,
             compensated=True,
             take_layer=layers.add if layers else None,
+            trace=trace,
         )
         if self._changes:
             self._writer = StreamWriter(self._kit, self._stamp())
@@ -326,7 +333,7 @@ class _Job:
     def _check_end(self, item: Passage, seconds: float) -> None:
         lines: Moves | Events = item.moves if len(item.moves) else item.events
         if len(lines):
-            check_print_ends(self._sum.original_s + seconds, int(lines.line[-1]))
+            self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
 
     def _measure_passage(self, passage: Passage, phases: Phases) -> None:
         moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
