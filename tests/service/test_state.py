@@ -20,7 +20,8 @@ from service.jobs.state import (
     Stale,
     advance,
 )
-from tests.service.database.examples import events, finished, make_job
+from tests.service.database.examples import finished, make_job
+from tests.service.database.happenings import events
 
 QUEUED = make_job(id="a")
 RUNNING = advance(QUEUED, Claimed(1.0, "worker-1"))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import time
 import uuid
 from typing import Any
 
-from hypothesis import strategies as st
+from service.jobs.state import Finished, Job
+from service.jobs.store import JobStore
 
-from service.jobs.state import Cancelled, Claimed, Event, Failed, Finished, Job, Lost, Progressed
-
-__all__ = ["events", "finished", "make_job"]
+__all__ = ["finished", "make_job", "take_all"]
 
 
 def make_job(**fields: Any) -> Job:
@@ -36,21 +36,13 @@ def finished(job: Job, at: float = 2000.0) -> Finished:
     return Finished(job.attempt, at, output, 70, 50, "7" * 64, {"before_um": 9.5})
 
 
-def events() -> st.SearchStrategy[Event]:
-    """Return anything that may happen to a job in its first attempts."""
-    at, attempt = st.floats(1e3, 1e4), st.integers(0, 4)
-    words = st.sampled_from(["reading", "compensating", "measuring"])
-    problem = st.just({"status": 422, "detail": "out of range"})
-    eta_s = st.none() | st.floats(0, 1e4)
-    return st.one_of(
-        st.builds(Claimed, at, st.sampled_from(["worker-1", "worker-2"])),
-        st.builds(Progressed, attempt, at, words, st.floats(-0.5, 1.5), eta_s),
-        st.builds(
-            lambda attempt, at: Finished(attempt, at, f"a/{attempt}", 9, 7, "7" * 64, {"x": 1}),
-            attempt,
-            at,
-        ),
-        st.builds(Failed, attempt, at, problem),
-        st.builds(Lost, attempt, at, words, st.integers(1, 3), st.booleans()),
-        st.builds(Cancelled, at),
-    )
+def take_all(store: JobStore, worker: str) -> list[str]:
+    """Claim until nothing waits any more, and return what was claimed."""
+    taken = []
+    while waiting := store.next_queued(3):
+        for job in waiting:
+            claimed = store.claim(job.id, time.time(), worker)
+            if claimed is not None:
+                assert (claimed.worker, claimed.attempt) == (worker, 1)
+                taken.append(job.id)
+    return taken

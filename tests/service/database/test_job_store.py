@@ -27,7 +27,8 @@ from service.jobs.store import (
     Quota,
     QuotaExceeded,
 )
-from tests.service.database.examples import events, finished, make_job
+from tests.service.database.examples import finished, make_job
+from tests.service.database.happenings import events
 
 # The database is one for all examples; every example takes jobs and owners of its own.
 many_examples = settings(

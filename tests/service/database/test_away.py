@@ -1,0 +1,69 @@
+"""A database that goes away and comes back."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.database import engine as database
+from service.database.engine import DatabaseAway, open_database
+from service.jobs.state import JobState
+from service.jobs.store import JobStore
+from service.settings import Settings
+from tests.service.database.examples import finished, make_job
+from tests.service.database.postgres import PostgresServer
+
+
+@pytest.fixture
+def server(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
+    """A server of the test's own; `postgres_server` only decides whether there can be one."""
+    folder = Path(tempfile.mkdtemp(prefix="sp-pg-"))
+    folder.chmod(0o755)
+    own = PostgresServer(folder / "server")
+    try:
+        own.start()
+        yield own
+    finally:
+        own.stop()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.mark.postgresql
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGQUIT], ids=["restart", "crash"])
+def test_postgresql_comes_back(server: PostgresServer, tmp_path: Path, how: signal.Signals):
+    engine = open_database(Settings(data_dir=tmp_path, database_url=server.new_database()))
+    store = JobStore(engine)
+    job = store.add(make_job())
+    running = store.claim(job.id, 1500.0, "w")
+    assert running is not None
+    server.stop(how)
+    with pytest.raises(DatabaseAway, match=r"127\.0\.0\.1:\d+/t\w+ does not answer"):
+        store.beat(job.id, 1, 1501.0, "reading", 0.5, None)
+    with pytest.raises(DatabaseAway):
+        store.get(job.id)
+    server.start()
+    assert store.beat(job.id, 1, 1502.0, "reading", 0.5, None)
+    assert store.apply(job.id, finished(running)) is not None
+    assert store.counts()[JobState.DONE] == 1
+    engine.dispose()
+
+
+def test_sqlite_kept_by_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(database, "_BUSY_TIMEOUT_MS", 50)
+    engine = open_database(Settings(data_dir=tmp_path))
+    store = JobStore(engine)
+    job = store.add(make_job())
+    other = sqlite3.connect(tmp_path / "stillpath.sqlite3", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(DatabaseAway, match="locked"):
+        store.claim(job.id, 1500.0, "w")
+    assert store.get(job.id) == job  # readers do not wait
+    other.close()
+    assert store.claim(job.id, 1500.0, "w") is not None
+    engine.dispose()

@@ -1,0 +1,101 @@
+"""The schema: migrations lead to the tables, and only to databases of this version."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Engine, inspect, text
+
+import service.database.migrations
+from service.database.engine import (
+    StoreError,
+    database_url,
+    migrate,
+    open_database,
+    reading,
+    writing,
+)
+from service.database.migrations import LATEST
+from service.database.tables import metadata
+from service.jobs.store import JobStore
+from service.settings import Settings
+from tests.service.database.examples import make_job
+
+
+def test_migrations_lead_to_the_tables(engine: Engine):
+    with reading(engine) as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+
+
+def test_the_latest_is_the_last():
+    folder = Path(service.database.migrations.__file__).parent
+    assert ScriptDirectory(str(folder)).get_heads() == [LATEST]
+
+
+def test_opening_again_changes_nothing(settings: Settings, engine: Engine):
+    job = JobStore(engine).add(make_job())
+    again = open_database(settings)
+    assert JobStore(again).get(job.id) == job
+    again.dispose()
+
+
+def test_a_migration_that_fails_leaves_nothing(settings: Settings, engine: Engine):
+    """As if somebody had made a table of the last migration's by hand."""
+    with writing(engine) as connection:
+        for table in reversed(metadata.sorted_tables):
+            connection.execute(text(f"DROP TABLE {table.name}"))
+        connection.execute(text("DELETE FROM alembic_version"))
+        connection.execute(text("CREATE TABLE leases (name TEXT)"))
+    with pytest.raises(StoreError, match="leases"):
+        open_database(settings)
+    with reading(engine) as connection:
+        assert set(inspect(connection).get_table_names()) == {"alembic_version", "leases"}
+    with writing(engine) as connection:
+        connection.execute(text("DROP TABLE leases"))
+    migrate(engine)
+    assert JobStore(engine).add(make_job())
+
+
+def test_a_newer_schema_is_refused(settings: Settings, engine: Engine):
+    with writing(engine) as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    with pytest.raises(StoreError, match=r"schema 9999, .* up to 0\d+: a newer Stillpath"):
+        open_database(settings)
+
+
+def test_what_is_no_database(tmp_path: Path):
+    (tmp_path / "stillpath.sqlite3").write_bytes(b"G1 X1\n" * 999)
+    with pytest.raises(StoreError, match=r"stillpath\.sqlite3 cannot be opened: .*not a database"):
+        open_database(Settings(data_dir=tmp_path))
+
+
+def test_a_server_that_is_not_there(tmp_path: Path):
+    url = "postgresql://anna:geheim@127.0.0.1:1/stillpath"
+    with pytest.raises(StoreError, match=r"127\.0\.0\.1:1/stillpath does not answer") as caught:
+        open_database(Settings(data_dir=tmp_path, database_url=url))
+    assert "geheim" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [("nonsense", "not an address"), ("mysql://host/x", "begins with mysql")],
+)
+def test_an_address_of_something_else(tmp_path: Path, given: str, words: str):
+    with pytest.raises(StoreError, match=f"STILLPATH_DATABASE_URL .*{words}"):
+        open_database(Settings(data_dir=tmp_path, database_url=given))
+
+
+def test_where_the_database_is(tmp_path: Path):
+    assert database_url(Settings(data_dir=tmp_path)).database == str(tmp_path / "stillpath.sqlite3")
+    for given in ("postgresql", "postgres", "postgresql+psycopg"):
+        url = database_url(Settings(data_dir=tmp_path, database_url=f"{given}://u@h/d"))
+        assert str(url) == "postgresql+psycopg://u@h/d"
+    elsewhere = Settings(data_dir=tmp_path, database_url=f"sqlite:///{tmp_path / 'own' / 'db'}")
+    engine = open_database(elsewhere)
+    engine.dispose()
+    assert (tmp_path / "own" / "db").exists()
