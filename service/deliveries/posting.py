@@ -85,7 +85,7 @@ def post(
     with httpx2.Client(
         trust_env=False,
         follow_redirects=False,
-        verify=ssl.create_default_context(),
+        verify=ssl.create_default_context() if target.scheme == "https" else False,
         timeout=httpx2.Timeout(timeout_s, connect=_CONNECT_S),
         headers={"User-Agent": f"stillpath/{__version__}", "Accept-Encoding": "identity"},
     ) as client:

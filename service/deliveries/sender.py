@@ -210,8 +210,11 @@ class Sender:
                 printer, file, job.result_name, sha256=job.result_sha256, start=job.print_after
             )
         state, error = _judged(reply)
-        if state == "done" and job.print_after:
-            error = what_started(printer, reply)
+        if job.print_after:
+            if reply.status >= 500:  # perhaps of a proxy that lost patience
+                return "failed", _unknown(error or "")
+            if state == "done":
+                error = what_started(printer, reply)
         return state, error
 
 

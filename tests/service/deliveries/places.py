@@ -1,0 +1,101 @@
+"""A database and a folder with jobs that are over, and senders for them."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from service.database.engine import open_database
+from service.deliveries.printers import load_printers
+from service.deliveries.rows import Delivery, deliveries_of
+from service.deliveries.sender import Sender
+from service.jobs.state import Claimed, Failed, Finished, Job
+from service.jobs.store import JobStore
+from service.settings import Settings
+from service.storage.opened import open_storage
+from tests.service.database.examples import make_job
+from tests.service.deliveries.listeners import until
+
+__all__ = ["RESULT", "SECRET", "Place", "open_place"]
+
+SECRET = "a secret that nobody else knows"
+RESULT = b"; compensated\n" + b"G1 X10 Y10\n" * 20_000
+
+
+class Place:
+    """What a sender works on."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.engine = open_database(settings)
+        self.store = JobStore(self.engine)
+        self.storage = open_storage(settings)
+
+    def sender(self, **how: Any) -> Sender:
+        """Return a sender in a hurry."""
+        how = {"first_wait_s": 0.05, "poll_s": 0.05, "claim_s": 60.0} | how
+        printers = load_printers(self.settings.printers)
+        return Sender(self.engine, self.store, self.storage, self.settings, printers, **how)
+
+    @contextmanager
+    def sending(self, **how: Any) -> Iterator[None]:
+        """Let a sender send during the `with` block."""
+        sender = self.sender(**how)
+        sender.start()
+        try:
+            yield
+        finally:
+            sender.stop()
+
+    def finish(self, folder: Path, **fields: Any) -> Job:
+        """Return a job that was added and is done, with its result in the storage."""
+        job = make_job(**fields)
+        self.store.add(job)
+        self.store.apply(job.id, Claimed(time.time(), "worker"))
+        output = f"jobs/{job.id}/1"
+        file = folder / job.id
+        file.write_bytes(RESULT)
+        self.storage.put(f"{output}/result/{job.result_name}", file)
+        digest = hashlib.sha256(RESULT).hexdigest()
+        event = Finished(1, time.time(), output, len(RESULT), len(RESULT), digest, {"after_um": 1})
+        done = self.store.apply(job.id, event)
+        assert done is not None
+        return done
+
+    def fail(self, **fields: Any) -> Job:
+        """Return a job that was added and has failed."""
+        job = make_job(**fields)
+        self.store.add(job)
+        self.store.apply(job.id, Claimed(time.time(), "worker"))
+        event = Failed(1, time.time(), {"status": 422, "detail": "line 7 is too large"})
+        failed = self.store.apply(job.id, event)
+        assert failed is not None
+        return failed
+
+    def delivery(self, job: Job, kind: str | None = None) -> Delivery:
+        """Return the job's delivery as it stands."""
+        [found] = [
+            each
+            for each in deliveries_of(self.engine, [job.id])[job.id]
+            if kind in (None, each.kind)
+        ]
+        return found
+
+    def settled(self, job: Job, kind: str | None = None) -> Delivery:
+        """Return the job's delivery, once nothing more will come of it."""
+        until(lambda: self.delivery(job, kind).state in ("done", "failed"))
+        return self.delivery(job, kind)
+
+
+@contextmanager
+def open_place(data_dir: Path, **settings: Any) -> Iterator[Place]:
+    """Open a place during the `with` block."""
+    place = Place(Settings(data_dir=data_dir, webhook_secret=SECRET, **settings))
+    try:
+        yield place
+    finally:
+        place.engine.dispose()

@@ -1,0 +1,217 @@
+"""Results to printers, as Moonraker and OctoPrint take them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from service.deliveries.printers import PrinterFileError, load_printers, printer_for
+from service.deliveries.targets import TargetRefused
+from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until
+from tests.service.deliveries.places import RESULT, SECRET, Place, open_place
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def printer(name: str, kind: str, url: str, **more: object) -> str:
+    rows = {"kind": kind, "url": url, "machine": "ender3", **more}
+    return f"[printer.{name}]\n" + "".join(f"{k} = {json.dumps(v)}\n" for k, v in rows.items())
+
+
+def at(tmp_path: Path, text: str):
+    file = tmp_path / "printers.toml"
+    file.write_text(text)
+    return open_place(tmp_path / "data", printers=file)
+
+
+@pytest.mark.parametrize("prints", [False, True])
+def test_moonraker_gets_the_whole_file_and_checks_it(tmp_path: Path, prints: bool):
+    with (
+        moonraker(key="k1") as server,
+        at(
+            tmp_path, printer("m", "moonraker", server.url + "/", api_key="k1", start=True)
+        ) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=prints)
+        with place.sending():
+            delivery = place.settled(job)
+    assert (delivery.state, delivery.error) == ("done", None)
+    [seen] = server.seen
+    parts = seen.parts()
+    assert parts["file"] == (job.result_name, RESULT)
+    assert parts["root"][1] == b"gcodes"
+    assert parts["checksum"][1].decode() == job.result_sha256
+    assert parts["print"][1] == (b"true" if prints else b"false")
+
+
+@pytest.mark.parametrize("prints", [False, True])
+def test_octoprint_gets_it_below_a_prefix(tmp_path: Path, prints: bool):
+    with (
+        octoprint(key="k2") as server,
+        at(
+            tmp_path, printer("o", "octoprint", server.url + "/octo", api_key="k2", start=True)
+        ) as place,
+    ):
+        job = place.finish(tmp_path, printer="o", print_after=prints)
+        with place.sending():
+            assert place.settled(job).state == "done"
+    [seen] = server.seen
+    parts = seen.parts()
+    assert parts["file"] == (job.result_name, RESULT)
+    word = b"true" if prints else b"false"
+    assert (parts["print"][1], parts["select"][1]) == (word, word)
+
+
+def test_a_failed_job_goes_to_no_printer(tmp_path: Path):
+    with moonraker() as server, at(tmp_path, printer("m", "moonraker", server.url)) as place:
+        job = place.fail(printer="m")
+        with pytest.raises(KeyError):
+            place.delivery(job)
+
+
+def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
+    with (
+        moonraker(key="right") as server,
+        at(tmp_path, printer("m", "moonraker", server.url, api_key="wrong")) as place,
+    ):
+        job = place.finish(tmp_path, printer="m")
+        with place.sending():
+            delivery = place.settled(job)
+    assert (delivery.state, len(server.seen)) == ("failed", 1)
+    assert "401" in (delivery.error or "")
+    assert "wrong" not in (delivery.error or "")
+
+
+def test_a_printer_that_does_not_begin_is_told(tmp_path: Path):
+    with (
+        moonraker(can_print=False) as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=True)
+        with place.sending():
+            delivery = place.settled(job)
+    assert delivery.state == "done"
+    assert "did not begin" in (delivery.error or "")
+
+
+def test_a_printer_that_must_not_be_started_is_not(tmp_path: Path):
+    with moonraker() as server, at(tmp_path, printer("m", "moonraker", server.url)) as place:
+        job = place.finish(tmp_path, printer="m", print_after=True)
+        with place.sending():
+            delivery = place.settled(job)
+    assert (delivery.state, server.seen) == ("failed", [])
+    assert "start = true" in (delivery.error or "")
+
+
+def test_a_printer_that_is_off_gets_it_when_it_is_on(tmp_path: Path):
+    with Listener() as server:
+        port = server.port
+    with at(tmp_path, printer("m", "moonraker", f"http://127.0.0.1:{port}", start=True)) as place:
+        job = place.finish(tmp_path, printer="m", print_after=True)
+        with place.sending(attempts=1000, first_wait_s=0.01):
+            until(lambda: place.delivery(job).attempts >= 2)
+            with Listener(port=port) as server:
+                assert place.settled(job).state == "done"
+    [seen] = server.seen
+    assert seen.parts()["file"][1] == RESULT
+
+
+@pytest.mark.parametrize("answer", ["silence", "502"])
+def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
+    """Nobody knows whether the first upload began to print: it is left to a person."""
+    servers: list[Listener] = []
+
+    def answers(_: Seen):
+        if answer == "silence":
+            raise ConnectionResetError
+        return 502, {}, b"bad gateway"
+
+    with (
+        Listener(answers) as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        servers.append(server)
+        job = place.finish(tmp_path, printer="m", print_after=True)
+        with place.sending():
+            delivery = place.settled(job)
+    assert (delivery.state, len(server.seen)) == ("failed", 1)
+    assert "may have been started" in (delivery.error or "")
+
+
+@pytest.mark.parametrize("prints", [False, True])
+def test_a_sender_killed_in_between(tmp_path: Path, prints: bool):
+    """An upload is done again; one that starts a print is not."""
+    holding = [True]
+
+    def answer(_: Seen):
+        while holding[0]:
+            time.sleep(0.02)
+        return 201, {}, b"{}"
+
+    with (
+        Listener(answer) as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=prints)
+        _kill_in_between(place, server)
+        assert place.delivery(job).state == "sending"
+        holding[0] = False
+        with place.sending():
+            delivery = place.settled(job)
+    if prints:
+        assert (delivery.state, len(server.seen)) == ("failed", 1)
+        assert "look at it" in (delivery.error or "")
+    else:
+        assert (delivery.state, len(server.seen)) == ("done", 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[printer.a]\nkind = 'duet'\nurl = 'http://h'\nmachine = 'x'", "printer.a. kind"),
+        ("[printer.a]\nkind = 'moonraker'\nmachine = 'x'", "url"),
+        ("[printer.a]\nkind = 'moonraker'\nurl = 'http://u:p@h'\nmachine = 'x'", "user name"),
+        ("[printer.a]\nkind = 'moonraker'\nurl = 'file:///x'\nmachine = 'x'", "https://HOST"),
+        ("[printer.a]\nkind = 'moonraker'\nurl = 'http://h?k=1'\nmachine = 'x'", "query"),
+        ("[printer.'a/b']\nkind = 'moonraker'\nurl = 'http://h'\nmachine = 'x'", "name"),
+        (printer("a", "moonraker", "http://h", method="magic"), "method"),
+        (printer("a", "moonraker", "http://h", tolerance_um=0), "tolerance_um"),
+        (printer("a", "moonraker", "http://h", apikey="sesame"), "apikey"),
+        ("printer = 1", "sections"),
+        ("[printer]\na = 1", "no section"),
+        ("[other]\na = 1", "sections"),
+        ("not toml", "cannot be read"),
+    ],
+)
+def test_a_bad_file_of_printers_says_where(tmp_path: Path, text: str, words: str):
+    file = tmp_path / "printers.toml"
+    file.write_text(text)
+    with pytest.raises(PrinterFileError, match=words) as caught:
+        load_printers(file)
+    assert "sesame" not in str(caught.value)
+
+
+def test_no_file_no_printers(tmp_path: Path):
+    assert load_printers(None) == {}
+    with pytest.raises(PrinterFileError, match="gone"):
+        load_printers(tmp_path / "gone.toml")
+    with pytest.raises(TargetRefused, match="known: none"):
+        printer_for({}, "m")
+
+
+def _kill_in_between(place: Place, server: Listener) -> None:
+    settings = place.settings.model_dump_json(exclude={"webhook_secret"}, exclude_defaults=True)
+    given = json.dumps(json.loads(settings) | {"webhook_secret": SECRET})
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.service.deliveries.sender_process", given, "1"], cwd=ROOT
+    )
+    try:
+        until(lambda: server.seen)
+    finally:
+        process.kill()
+        process.wait()
