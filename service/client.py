@@ -327,6 +327,10 @@ class Client:
         """Return the document of a machine."""
         return self._document(self._ask("GET", f"/v1/machines/{quote(name, safe='')}"))
 
+    def version(self) -> str:
+        """Return the version of the service."""
+        return str(self._document(self._ask("GET", "/healthz")).get("version", ""))
+
     def cancel(self, job_id: str) -> JobView:
         """Stop a job; it stays in the list."""
         return self._job(self._ask("POST", _path(job_id, "cancel")))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
-_INTERRUPTED = 130
+_AT_A_SERVER = 8
 
 Machine = Annotated[
     str | None,
@@ -173,10 +173,16 @@ def _at_work(
         jobs = jobs or os.cpu_count() or 1
         works = Here(open_machines(), options, jobs)
     else:
-        from service.farm.server import There
+        from service.client import Client, ClientError
+        from service.farm.server import There, batch_name
 
-        jobs = jobs or 8
-        works = There(server, key or os.environ.get("STILLPATH_KEY"), options)
+        jobs = jobs or _AT_A_SERVER
+        try:
+            client = Client(server, key or os.environ.get("STILLPATH_KEY"))
+            works = There(client, options, batch_name(output))
+        except ClientError as error:
+            sys.stderr.write(f"stillpath: error: {error}\n")
+            raise SystemExit(error.exit_code) from None
     with (
         interruptible() as check,
         OutputFolder.opened(output) as folder,
