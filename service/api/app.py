@@ -106,19 +106,25 @@ def create_app(
     )
     app.add_middleware(metrics.Measured, metrics=state.metrics)
     problems.install(app)
+    app.include_router(health.router)
+    app.include_router(pages.router)
     for part in (
         jobs,
+        events,
         assets,
         trajectories,
-        events,
+        documents,
         machines,
         frequency,
         designs,
         identifications,
+        controllers,
+        printers,
+        octoprint,
+        keys,
+        metrics,
     ):
         app.include_router(part.router, responses=problems.responses(401, 403, 429, 503))
-    for part in (controllers, documents, octoprint, keys, printers, health, metrics, pages):
-        app.include_router(part.router)
     return app
 
 
