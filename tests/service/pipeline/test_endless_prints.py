@@ -9,6 +9,7 @@ import pytest
 from gcode.errors import GcodeError
 from models.store import load_machine
 from service.pipeline.options import Options
+from service.pipeline.progress import Progress, ProgressCallback
 from service.pipeline.road import compensate_file, plan_file, simulate_file
 from tests.gcode.cutting import HEAD
 
@@ -29,18 +30,35 @@ def test_refused(tmp_path: Path, cache: Path, name: str, road: str) -> None:
     text, message = FILES[name]
     source, target = tmp_path / "in.gcode", tmp_path / "out"
     source.write_text(text)
-    machine = load_machine("ender3")
-
-    def go() -> None:
-        if road == "plan":
-            plan_file(source, target, machine, rate_hz=1.0)
-        elif road == "simulate":
-            simulate_file(source, machine, cache_dir=cache)
-        else:
-            compensate_file(source, target, machine, Options(method=road), cache_dir=cache)
-
     with pytest.raises(GcodeError, match=message):
-        go()
+        go(road, source, target, cache)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
+
+
+def go(
+    road: str, source: Path, target: Path, cache: Path, progress: ProgressCallback | None = None
+) -> None:
+    machine = load_machine("ender3")
+    if road == "plan":
+        plan_file(source, target, machine, rate_hz=1.0, progress=progress)
+    elif road == "simulate":
+        simulate_file(source, machine, cache_dir=cache, progress=progress)
+    else:
+        options = Options(method=road)
+        compensate_file(source, target, machine, options, cache_dir=cache, progress=progress)
+
+
+@pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
+def test_refused_before_it_is_computed(tmp_path: Path, cache: Path, road: str) -> None:
+    """What makes the print endless stands behind two long days of it: the file is read to its end
+    before hours are spent on its beginning."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out"
+    days = "G4 P180000000\n"  # cheap ones
+    source.write_text(HEAD + MOVES + days + MOVES * 8000 + "G4 P3600000000\n" + MOVES)
+    told: list[Progress] = []
+    with pytest.raises(GcodeError, match=r"line 16012: .* takes 1052\.76 h, more than 1000 h"):
+        go(road, source, target, cache, told.append)
+    assert all(report.print_seconds < 60.0 for report in told)
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 
 
