@@ -2,48 +2,76 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import sys
+from collections.abc import Iterator
 
 import uvicorn
 
 from service.api import create_app
 from service.exclusive import exclusive
+from service.jobs.worker import Runner, run_task
 from service.logs import configure_logging
+from service.security.keys import keys_needed
 from service.settings import Settings
 
 __all__ = ["serve_forever"]
 
-_BACKLOG = 128
+_BACKLOG = 1024
+_LONGEST_HEADERS_BYTES = 32 << 10
+_GOODBYE_S = 5
+"""How long requests under way may take once the service was asked to end."""
 
 
-def serve_forever(settings: Settings, host: str, port: int) -> None:
+def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = run_task) -> None:
     """Serve until interrupted.
 
     Parameters
     ----------
     settings : Settings
     host : str
-        Address to bind; the caller has checked that it may be reached.
+        Address to bind.
     port : int
         0 takes any free port; the first line on stdout names it.
+    runner : Runner
+        Does the work of a job; tests put another in.
 
     Raises
     ------
     OSError
         If the address cannot be bound, or another service works with the data directory.
+    UnsafeBinding
+        If other computers can reach the address, and keys are switched off.
     """
     configure_logging()
-    app = create_app(settings)
+    app = create_app(settings, keys_required=keys_needed(settings, host), runner=runner)
     config = uvicorn.Config(
-        app, host=host, port=port, log_level="warning", access_log=False, server_header=False
+        app,
+        host=host,
+        port=port,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        h11_max_incomplete_event_size=_LONGEST_HEADERS_BYTES,
+        timeout_graceful_shutdown=_GOODBYE_S,
     )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with (
-        exclusive(settings.data_dir),
+        _alone(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
         shown = f"[{host}]" if family == socket.AF_INET6 else host
         sys.stdout.write(f"stillpath: http://{shown}:{listener.getsockname()[1]}/\n")
         sys.stdout.flush()
         uvicorn.Server(config).run(sockets=[listener])
+
+
+@contextlib.contextmanager
+def _alone(settings: Settings) -> Iterator[None]:
+    """Keep the folder of data, unless the workers are elsewhere: then nothing lasting is in it."""
+    if settings.scheduler is not None:
+        yield
+        return
+    with exclusive(settings.data_dir):
+        yield

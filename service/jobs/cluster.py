@@ -48,6 +48,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
     "distributed.worker.profile.enabled": False,
+    "distributed.worker.preload": ["service.jobs.preload"],
     # They die with us.
     "distributed.worker.daemon": True,
     # `service.environment` knows better.
@@ -170,7 +171,7 @@ class Cluster:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
             memory_limit=0,
             local_directory=str(self._settings.data_dir / "scratch"),
             silence_logs=logging.CRITICAL,

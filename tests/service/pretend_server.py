@@ -1,18 +1,14 @@
-"""The real server with a pretended road: `python pretend_server.py DATA_DIR`."""
+"""The real server with a pretended road: `python pretend_server.py DATA_DIR [RUNNER]`."""
 
 import sys
 from pathlib import Path
 
 if __name__ == "__main__":
-    from unittest import mock
-
-    from service import server
-    from service.api import create_app
+    from service.environment import prepare_environment
+    from service.server import serve_forever
     from service.settings import Settings
-    from tests.service.runners import pretend
+    from tests.service import runners
 
-    def application(settings: Settings):
-        return create_app(settings, runner=pretend)
-
-    with mock.patch.object(server, "create_app", application):
-        server.serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0)
+    prepare_environment()
+    runner = getattr(runners, sys.argv[2] if len(sys.argv) > 2 else "pretend")
+    serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=runner)

@@ -1,0 +1,100 @@
+"""`stillpath serve`, and its parts on several computers: `stillpath scheduler`, `... worker`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from service.settings import Settings
+
+__all__ = ["register"]
+
+DataOption = Annotated[
+    Path | None, typer.Option(help="Database, uploads, results [STILLPATH_DATA_DIR].")
+]
+WorkersOption = Annotated[int | None, typer.Option(help="Worker processes [STILLPATH_WORKERS].")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(serve)
+    app.command()(scheduler)
+    app.command()(worker)
+
+
+def serve(
+    host: Annotated[str, typer.Option(help="Address to bind.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 8000,
+    data_dir: DataOption = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Serve HTTP: a page at /, the API under /v1.
+
+    An address that other computers can reach asks its callers for a key. All settings:
+    docs/running.md.
+    """
+    settings = _settings(data_dir=data_dir, workers=workers)
+
+    from service.security.keys import UnsafeBinding
+    from service.server import serve_forever
+
+    try:
+        serve_forever(settings, host, port)
+    except UnsafeBinding as error:
+        raise typer.TyperException(str(error)) from None
+
+
+def scheduler(
+    host: Annotated[
+        str,
+        typer.Option(help="Address to bind. Whoever reaches it can run anything on the workers."),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 8786,
+) -> None:
+    """Run the scheduler of a service on several computers."""
+    from service.jobs.daemons import run_scheduler
+    from service.logs import configure_logging
+
+    configure_logging()
+    run_scheduler(host, port)
+
+
+def worker(
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="For instance tcp://host:8786 [STILLPATH_SCHEDULER]."),
+    ] = None,
+    workers: WorkersOption = None,
+    data_dir: Annotated[
+        Path | None, typer.Option(help="For files that are being made [STILLPATH_DATA_DIR].")
+    ] = None,
+) -> None:
+    """Do jobs for a service on several computers. Database and storage: as for `serve`."""
+    settings = _settings(data_dir=data_dir, workers=workers, scheduler=scheduler)
+    if settings.scheduler is None:
+        raise typer.TyperException(
+            "which scheduler? Say --scheduler tcp://host:8786, or set STILLPATH_SCHEDULER"
+        )
+
+    from service.jobs.daemons import run_workers
+    from service.logs import configure_logging
+
+    configure_logging()
+    run_workers(settings)
+
+
+def _settings(**given: Any) -> Settings:
+    from pydantic import ValidationError
+
+    from service.settings import Settings
+
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        said = f"{place}: {first['msg']} (given: {first['input']!r})" if place else first["msg"]
+        raise typer.TyperException(said) from None

@@ -1,0 +1,26 @@
+"""What Dask does first in every worker process: make it deaf to signals that are not for it."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from typing import Any
+
+__all__ = ["dask_setup"]
+
+
+async def dask_setup(worker: Any) -> None:
+    """Set up a worker process; Dask calls it by this name."""
+    # Ctrl-C goes to the whole terminal group; the service ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if not hasattr(signal, "SIGKILL"):
+        return  # Windows
+    loop = asyncio.get_running_loop()
+    closing: set[asyncio.Task[Any]] = set()
+
+    def close() -> None:
+        # The job goes back to the queue: its watch sees that the worker closes.
+        closing.add(loop.create_task(worker.close(timeout=5, reason="SIGTERM")))
+
+    # Supervisors send it to all processes at once.
+    loop.add_signal_handler(signal.SIGTERM, close)
