@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from service import commands_serve
 from service.backup import commands as backup
 from service.controllers import commands as controllers
 from service.environment import prepare_environment
@@ -297,48 +298,6 @@ def design(
     print_design(made)
 
 
-@app.command()
-def serve(
-    host: Annotated[str, typer.Option(help="Address to bind.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 8000,
-    data_dir: Annotated[
-        Path | None, typer.Option(help="Database, uploads, results [STILLPATH_DATA_DIR].")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Worker processes [STILLPATH_WORKERS].")
-    ] = None,
-    allow_remote: Annotated[
-        bool,
-        typer.Option(
-            "--allow-remote",
-            help="Bind an address other computers can reach; there are no keys "
-            "[STILLPATH_ALLOW_REMOTE].",
-        ),
-    ] = False,
-) -> None:
-    """Serve HTTP: a page at /, the API under /v1."""
-    from pydantic import ValidationError
-
-    from service.server import serve_forever
-    from service.settings import Settings, is_loopback
-
-    given: dict[str, Any] = {
-        "data_dir": data_dir,
-        "workers": workers,
-        "allow_remote": allow_remote or None,
-    }
-    try:
-        settings = Settings(**{key: value for key, value in given.items() if value is not None})
-    except ValidationError as error:
-        raise _Refused(_first_field(error)) from None
-    if not is_loopback(host) and not settings.allow_remote:
-        raise _Refused(
-            f"{host} can be reached from other computers, and this service has no keys. Bind "
-            "127.0.0.1, or say --allow-remote if something before it checks who is calling"
-        )
-    serve_forever(settings, host, port)
-
-
 identification.register(app)
 proof.register(app)
 controllers.register(app)
@@ -346,6 +305,7 @@ scanning.register(app)
 register_trajectories(app)
 security.register(app)
 farm.register(app)
+commands_serve.register(app)
 backup.register(app)
 register_jobs(app)
 
