@@ -10,7 +10,9 @@ counts every module of ours that the kernel's module imports, and theirs.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
 import re
 from collections.abc import Callable
 from functools import cache
@@ -18,7 +20,12 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numba
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    UserProvidedCacheLocator,
+)
 
 __all__ = ["kernel", "source_digest"]
 
@@ -28,8 +35,29 @@ R = TypeVar("R")
 _IMPORT = re.compile(rb"^(?:from|import) +([A-Za-z_][\w.]*)", re.MULTILINE)
 
 
+class _ReadOnlyLocator(UserProvidedCacheLocator):
+    """A folder of kernels that can be read and not written, as that of an image."""
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> Any:
+        """Return a locator if there are kernels of `file`, and else leave it to numba's own."""
+        if not os.environ.get("NUMBA_CACHE_DIR"):
+            return None
+        locator: Any = cls(function, file)
+        return locator if Path(locator.get_cache_path()).is_dir() else None
+
+
+class _CacheImpl(CompileResultCacheImpl):
+    _locator_classes = [_ReadOnlyLocator, *CompileResultCacheImpl._locator_classes]  # noqa: RUF012
+
+
 class _KernelCache(FunctionCache):
-    """Numba's cache on disk, with a stamp of all sources that went into the machine code."""
+    """Numba's cache on disk, with a stamp of all sources that went into the machine code.
+
+    Where it cannot be written, a kernel that is not in it is compiled anew each time.
+    """
+
+    _impl_class = _CacheImpl
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
@@ -42,6 +70,11 @@ class _KernelCache(FunctionCache):
                 source_digest(file, file.parents[function.__module__.count(".")]),
             ),
         )
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """See `numba.core.caching.Cache`."""
+        with contextlib.suppress(OSError):
+            super().save_overload(signature, data)  # type: ignore[no-untyped-call]
 
 
 @cache

@@ -260,7 +260,10 @@ def _unpack(source: Path, folder: Path) -> Manifest:
         if found.pop(name, None) != known:
             raise BackupError(f"{source}: {name} is damaged or missing; take another backup")
     for name in found:  # of jobs that were deleted while the backup was made
-        (folder / name).unlink()
+        path = folder / name
+        path.unlink()
+        while (path := path.parent) != folder and not any(path.iterdir()):
+            path.rmdir()
     return manifest
 
 
