@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from models.errors import ModelError
 from service.identification.figures import IdentificationReport
-from service.pipeline.files import replacing
+from service.machines.documents import DocumentFolder, Documents
 
 __all__ = ["Archive"]
 
@@ -17,22 +17,20 @@ _REVISION = re.compile(r"[0-9a-f]{12}")
 
 
 class Archive:
-    """A folder of reports; `Machine.revision` names the file.
+    """Reports by the `Machine.revision` that they led to.
 
     Parameters
     ----------
-    root : Path
-        Made when the first report is kept.
+    place : Path or Documents
+        Where they lie; a folder is made when the first report is kept.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, place: Path | Documents) -> None:
+        self._documents = DocumentFolder(place) if isinstance(place, Path) else place
 
     def keep(self, report: IdentificationReport) -> None:
         """Write a report, whole or not at all."""
-        self._root.mkdir(parents=True, exist_ok=True)
-        with replacing(self._file(report.machine_revision)) as temporary:
-            temporary.write_text(report.model_dump_json(), encoding="utf-8")
+        self._documents.replace(_file(report.machine_revision), report.model_dump_json())
 
     def find(self, revision: str) -> IdentificationReport | None:
         """Return the report that led to a machine's content, None if there is none.
@@ -42,15 +40,18 @@ class Archive:
         ModelError
             If the file is damaged.
         """
-        file = self._file(revision)
-        if not file.exists():
-            return None
+        file = _file(revision)
         try:
-            return IdentificationReport.model_validate_json(file.read_bytes())
+            return IdentificationReport.model_validate_json(self._documents.read(file))
+        except FileNotFoundError:
+            return None
         except ValidationError:
-            raise ModelError(f"{file}: damaged; identify the machine again") from None
+            raise ModelError(
+                f"{self._documents.place(file)}: damaged; identify the machine again"
+            ) from None
 
-    def _file(self, revision: str) -> Path:
-        if not _REVISION.fullmatch(revision):
-            raise ModelError(f"{revision!r} does not name the content of a machine")
-        return self._root / f"{revision}.json"
+
+def _file(revision: str) -> str:
+    if not _REVISION.fullmatch(revision):
+        raise ModelError(f"{revision!r} does not name the content of a machine")
+    return f"{revision}.json"

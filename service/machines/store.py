@@ -1,4 +1,4 @@
-"""The store of the user's machines: one folder per machine, one file per revision.
+"""The store of the user's machines: one folder per machine, one document per revision.
 
 ::
 
@@ -6,14 +6,14 @@
     machines/NAME/000001.approved.json   that it may be used
     machines/.trash/NAME/TIME/           a machine that was deleted
 
-Every file is written once (`service.machines.publish`), so nothing points anywhere: the newest
-revision is the current one, and a process that is killed leaves the state before or after.
+Every document is written once (`service.machines.documents`: files, or rows of a database), so
+nothing points anywhere: the newest revision is the current one, and a process that is killed leaves
+the state before or after.
 """
 
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from models.machine import Machine
 from models.plants import PlantSetSpec
 from models.provenance import SourceFile
 from models.store import builtin_machines, explain
-from service.machines.publish import publish, sync_folder
+from service.machines.documents import DocumentFolder, Documents
 from service.machines.revision import (
     Approval,
     Conflict,
@@ -52,8 +52,8 @@ class MachineStore:
 
     Parameters
     ----------
-    root : Path
-        Made when the first machine is added.
+    place : Path or Documents
+        Where they lie; a folder is made when the first machine is added.
 
     Notes
     -----
@@ -61,17 +61,14 @@ class MachineStore:
     and `ModelError`, naming the file, if a file of it is damaged.
     """
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, place: Path | Documents) -> None:
+        self._documents = DocumentFolder(place) if isinstance(place, Path) else place
 
     # Reading
 
     def names(self) -> list[str]:
         """Return the names of all machines, sorted."""
-        if not self._root.is_dir():
-            return []
-        folders = [p for p in self._root.iterdir() if _NAME.fullmatch(p.name) and p.is_dir()]
-        return sorted(folder.name for folder in folders if _numbers(folder, _REVISION))
+        return [name for name in self._documents.folders() if self._revision_numbers(name)]
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and bool(self._revision_numbers(name))
@@ -95,10 +92,9 @@ class MachineStore:
     def approvals(self, name: str) -> dict[int, Approval]:
         """Return the approvals by the number of their revision."""
         self._existing(name)
-        folder = self._root / name
         return {
-            number: _read(_approval_file(folder, number), Approval)
-            for number in _numbers(folder, _APPROVAL)
+            number: self._read(_approval_file(name, number), Approval)
+            for number in _numbers(self._documents.names(name), _APPROVAL)
         }
 
     def usable(self, name: str, *, require_approval: bool) -> Revision:
@@ -122,9 +118,10 @@ class MachineStore:
             )
         found = self.revision(name, max(approved))
         if approved[found.number].content_sha256 != found.content_sha256:
+            place = self._documents.place(_revision_file(name, found.number))
             raise ModelError(
-                f"{_revision_file(self._root / name, found.number)}: not the machine that was "
-                "approved; restore the file from a backup, or add the machine again and approve it"
+                f"{place}: not the machine that was approved; restore the file from a backup, or "
+                "add the machine again and approve it"
             )
         return found
 
@@ -226,11 +223,15 @@ class MachineStore:
         approval = Approval.of(
             revision, when=when or datetime.now(UTC), author=author, message=message
         )
-        file = _approval_file(self._root / name, number)
+        file = _approval_file(name, number)
         try:
-            publish(file, document_text(approval))
+            self._documents.create(
+                file, document_text(approval), beside=_revision_file(name, number)
+            )
         except FileExistsError:
-            return _read(file, Approval)
+            return self._read(file, Approval)
+        except FileNotFoundError:
+            raise _no_machine(name) from None
         return approval
 
     def add_history(self, name: str, revisions: Sequence[Revision]) -> None:
@@ -246,25 +247,20 @@ class MachineStore:
             raise Conflict("the revisions of a history must count from 1 without gaps")
         for revision in revisions:
             _check_own_name(name, revision.machine)
-        self._root.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self._root, prefix=".incoming-") as folder:
-            made = Path(folder) / name
-            made.mkdir()
-            for revision in revisions:
-                publish(_revision_file(made, revision.number), document_text(revision))
-            self._move_in(made, name)
+        contents = {_file_name(r.number): document_text(r) for r in revisions}
+        try:
+            self._documents.create_folder(name, contents)
+        except FileExistsError:
+            raise _exists(name) from None
 
     def delete(self, name: str, *, when: datetime | None = None) -> None:
         """Move a machine with its history to the trash; `restore` brings it back."""
         self._existing(name)
-        trash = self._root / _TRASH / name
-        trash.mkdir(parents=True, exist_ok=True)
         stamp = (when or datetime.now(UTC)).strftime("%Y%m%dT%H%M%S.%fZ")
         try:
-            (self._root / name).rename(trash / stamp)
+            self._documents.move(name, f"{_TRASH}/{name}/{stamp}")
         except FileNotFoundError:
             raise _no_machine(name) from None
-        sync_folder(self._root)
 
     def restore(self, name: str) -> Revision:
         """Bring the machine that was deleted last under this name back.
@@ -275,11 +271,16 @@ class MachineStore:
             If there is a machine of that name again.
         """
         _check_name(name)
-        trash = self._root / _TRASH / name
-        found = sorted(trash.iterdir()) if trash.is_dir() else []
+        trash = f"{_TRASH}/{name}"
+        found = self._documents.folders(trash)
         if not found:
-            raise UnknownMachine(f"no machine {name!r} is in the trash {self._root / _TRASH}")
-        self._move_in(found[-1], name)
+            raise UnknownMachine(
+                f"no machine {name!r} is in the trash {self._documents.place(_TRASH)}"
+            )
+        try:
+            self._documents.move(f"{trash}/{found[-1]}", name)
+        except FileExistsError:
+            raise _exists(name) from None
         return self.current(name)
 
     # Private
@@ -294,7 +295,6 @@ class MachineStore:
     ) -> Revision:
         """Write the revision that `change` makes of the current one, once more if it is late."""
         _check_name(name)
-        folder = self._root / name
         for _ in range(_ATTEMPTS):
             numbers = self._revision_numbers(name)
             last = numbers[-1] if numbers else 0
@@ -315,30 +315,16 @@ class MachineStore:
                 when=when or datetime.now(UTC),
                 **fields,
             )
-            folder.mkdir(parents=True, exist_ok=True)
-            file = _revision_file(folder, revision.number)
             try:
-                publish(file, document_text(revision))
+                self._documents.create(
+                    _revision_file(name, revision.number),
+                    document_text(revision),
+                    beside=_revision_file(name, last) if last else None,
+                )
             except (FileExistsError, FileNotFoundError):
                 continue  # somebody else was faster, or deleted the machine meanwhile
-            if last and not _revision_file(folder, last).exists():
-                # Deleted and made anew meanwhile: this is no revision of that one.
-                file.unlink(missing_ok=True)
-                continue
-            sync_folder(self._root)
             return revision
         raise Conflict(f"machine {name!r} is being changed by others all the time; try again")
-
-    def _move_in(self, folder: Path, name: str) -> None:
-        """Make a folder of revisions the machine `name`, which must be new."""
-        try:
-            # Fails on a folder that holds a revision already, whoever put it there.
-            folder.rename(self._root / name)
-        except OSError:
-            if name not in self:
-                raise
-            raise _exists(name) from None
-        sync_folder(self._root)
 
     def _existing(self, name: str) -> list[int]:
         numbers = self._revision_numbers(name)
@@ -348,7 +334,9 @@ class MachineStore:
 
     def _revision_numbers(self, name: str) -> list[int]:
         # A name only: a path must not reach the file system from outside.
-        return _numbers(self._root / name, _REVISION) if _NAME.fullmatch(name) else []
+        if not _NAME.fullmatch(name):
+            return []
+        return _numbers(self._documents.names(name), _REVISION)
 
     def _listed(self, name: str, number: int) -> Revision:
         """Read a revision that must be there: numbers have no gaps."""
@@ -357,54 +345,55 @@ class MachineStore:
         except _Gone:
             if name not in self:
                 raise
-            raise _damaged(_revision_file(self._root / name, number), "it is missing") from None
+            raise self._damaged(_revision_file(name, number), "it is missing") from None
 
     def _read_revision(self, name: str, number: int) -> Revision:
-        file = _revision_file(self._root / name, number)
-        revision = _read(file, Revision)
+        file = _revision_file(name, number)
+        revision = self._read(file, Revision)
         if (revision.machine.name, revision.number) != (name, number):
-            raise _damaged(
+            raise self._damaged(
                 file, f"it holds revision {revision.number} of {revision.machine.name!r}"
             )
         return revision
+
+    def _read(self, path: str, kind: type[_Kind]) -> _Kind:
+        try:
+            return kind.model_validate(from_json(self._documents.read(path)))
+        except FileNotFoundError:
+            place = self._documents.place(path)
+            raise _Gone(f"{place} is gone: the machine was deleted meanwhile") from None
+        except ValidationError as error:
+            raise self._damaged(path, explain(error)) from None
+        except ValueError as error:
+            raise self._damaged(path, f"not JSON ({error})") from None
+
+    def _damaged(self, path: str, why: str) -> ModelError:
+        return ModelError(
+            f"{self._documents.place(path)}: damaged: {why}; put the file back from a backup, or, "
+            "if it is the newest one, move it away with its .approved.json, to go on from the "
+            "revision before"
+        )
 
 
 class _Gone(UnknownMachine):
     """Deleted while it was read."""
 
 
-def _numbers(folder: Path, pattern: re.Pattern[str]) -> list[int]:
-    try:
-        found = [pattern.fullmatch(path.name) for path in folder.iterdir()]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
+def _numbers(names: Sequence[str], pattern: re.Pattern[str]) -> list[int]:
+    found = [pattern.fullmatch(name) for name in names]
     return sorted(int(match[1]) for match in found if match)
 
 
-def _revision_file(folder: Path, number: int) -> Path:
-    return folder / f"{number:06d}.json"
+def _file_name(number: int) -> str:
+    return f"{number:06d}.json"
 
 
-def _approval_file(folder: Path, number: int) -> Path:
-    return folder / f"{number:06d}.approved.json"
+def _revision_file(name: str, number: int) -> str:
+    return f"{name}/{_file_name(number)}"
 
 
-def _read(file: Path, kind: type[_Kind]) -> _Kind:
-    try:
-        return kind.model_validate(from_json(file.read_bytes()))
-    except FileNotFoundError:
-        raise _Gone(f"{file} is gone: the machine was deleted meanwhile") from None
-    except ValidationError as error:
-        raise _damaged(file, explain(error)) from None
-    except ValueError as error:
-        raise _damaged(file, f"not JSON ({error})") from None
-
-
-def _damaged(file: Path, why: str) -> ModelError:
-    return ModelError(
-        f"{file}: damaged: {why}; put the file back from a backup, or, if it is the newest one, "
-        "move it away with its .approved.json, to go on from the revision before"
-    )
+def _approval_file(name: str, number: int) -> str:
+    return f"{name}/{number:06d}.approved.json"
 
 
 def _check_name(name: str) -> None:
