@@ -1,0 +1,20 @@
+/** What can be taken away from a finished job. */
+
+import { h } from "../lib/dom.js";
+import { bytes } from "../lib/format.js";
+import { fileLink } from "../lib/files.js";
+
+/**
+ * @param {any} job
+ * @returns {HTMLElement}
+ */
+export function downloads(job) {
+  const { links } = job;
+  const stem = (job.result_name ?? job.source_name).replace(/\.[^.]*$/, "");
+  const size = job.result_bytes ? ` (${bytes(job.result_bytes)})` : "";
+  return h("div.downloads", { role: "group", "aria-label": "Downloads" },
+    fileLink({ text: `G-code${size}`, href: links.result, name: job.result_name, main: true }),
+    links.report ? fileLink({ text: "Report", href: links.report, name: `${stem}.report.html`, open: true }) : null,
+    links.report_json ? fileLink({ text: "JSON", href: links.report_json, name: `${stem}.report.json` }) : null,
+    links.trajectories ? fileLink({ text: "CSV", href: `${links.trajectories}?format=csv`, name: `${stem}.csv` }) : null);
+}

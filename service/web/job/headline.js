@@ -1,0 +1,29 @@
+/** The three figures that tell a job. */
+
+import { h } from "../lib/dom.js";
+import { duration, um } from "../lib/format.js";
+
+// Measuring a file that came as it was is no improvement, whatever the last digit says.
+const LEAST_RATIO = 1.05;
+
+/**
+ * @param {any} report
+ * @param {any[]} channels
+ * @returns {HTMLElement}
+ */
+export function headline(report, channels) {
+  const rms = Object.fromEntries(channels.map((c) => [c.name, c.extruding.contour_rms_um]));
+  const ratio = rms.before / rms.after;
+  const change = 100 * (report.time_s / report.original_time_s - 1);
+  return h("section.headline", { "aria-label": "Headline" },
+    rms.after !== undefined
+      ? h("div.figure.first", null, h("p.label", null, "Contour error while extruding, rms"),
+        h("p.big", null, h("span.before", null, um(rms.before)), h("span.to", { "aria-hidden": "true" }, " → "), h("span.sr", null, " to "), h("span.after", null, um(rms.after)), h("small", null, " µm")),
+        h("p.note", null, ratio >= LEAST_RATIO ? `${ratio >= 10 ? ratio.toFixed(0) : ratio.toFixed(1)} times smaller than the file as it came` : "no smaller than the file as it came"))
+      : h("div.figure.first", null, h("p.label", null, "Contour error while extruding, rms"),
+        h("p.big", null, h("span.before", null, um(rms.before)), h("small", null, " µm")), h("p.note", null, "the file as it came")),
+    rms.shaper === undefined ? null
+      : h("div.figure", null, h("p.label", null, "Best-tuned shaper"), h("p.big", null, um(rms.shaper), h("small", null, " µm")), h("p.note", null, report.best_shaper)),
+    h("div.figure", null, h("p.label", null, "Print time"), h("p.big", null, duration(report.time_s)),
+      h("p.note", null, rms.after === undefined || !Number.isFinite(change) ? "by the firmware's rules" : `${change >= 0 ? "+" : "−"}${Math.abs(change).toFixed(2)} % against the original`)));
+}

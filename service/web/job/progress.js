@@ -1,0 +1,44 @@
+/** How far a job is: its place in the queue, then stage, share and time left. */
+
+import { announce } from "../lib/announce.js";
+import { fill, h } from "../lib/dom.js";
+import { counted, remaining } from "../lib/format.js";
+
+const ANNOUNCE_EVERY = 0.25;
+
+/**
+ * @returns {{element: HTMLElement, update: (job: any) => void}}
+ */
+export function progressPanel() {
+  const bar = h("progress", { max: "1", "aria-label": "Progress" });
+  const stage = h("p.stage");
+  const left = h("p.hint.left");
+  const share = h("p.share", { "aria-hidden": "true" });
+  const element = h("section.card.progress", { "aria-label": "Progress" }, h("div.row", null, stage, share), bar, left);
+  let said = -1;
+  const update = (/** @type {any} */ job) => {
+    if (job.state === "queued") {
+      bar.removeAttribute("value");
+      fill(stage, "Waiting");
+      fill(share);
+      fill(left, job.queue_position ? `${counted(job.queue_position, "job")} before it` : "Next in the queue");
+      return;
+    }
+    bar.value = job.progress;
+    fill(stage, capital(job.stage));
+    fill(share, `${Math.floor(100 * job.progress)} %`);
+    fill(left, remaining(job.eta_s) || "Time left is not known yet",
+      job.attempt > 1 ? ` · attempt ${job.attempt}: a worker was lost, and the job began anew` : "");
+    const step = Math.floor(job.progress / ANNOUNCE_EVERY);
+    if (step !== said) {
+      said = step;
+      announce(`${capital(job.stage)}, ${Math.floor(100 * job.progress)} percent. ${remaining(job.eta_s)}`);
+    }
+  };
+  return { element, update };
+}
+
+/** @param {string} text */
+function capital(text) {
+  return text ? text[0].toUpperCase() + text.slice(1) : "";
+}

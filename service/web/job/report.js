@@ -1,0 +1,122 @@
+/** What was measured on the written file, from the headline to the pieces put back. */
+
+import { h } from "../lib/dom.js";
+import { isAbort } from "../lib/api.js";
+import { counted, duration, feature, grouped, bytes, um } from "../lib/format.js";
+import { problemPanel } from "../lib/problem.js";
+import { folded, longTable, table } from "../parts/table.js";
+import { headline } from "./headline.js";
+import { spectra, trackChart } from "./curves.js";
+
+/**
+ * @param {any} job
+ * @param {any} report
+ * @param {AbortSignal} signal
+ * @returns {Node[]}
+ */
+export function reportSections(job, report, signal) {
+  const channels = report.channels.map((/** @type {any} */ c) => ({ ...c, short: c.label.split(" (")[0] }));
+  const labels = Object.fromEntries(channels.map((/** @type {any} */ c) => [c.name, capital(c.short)]));
+  return [
+    headline(report, channels),
+    warnings(report),
+    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, note)), errorTable(channels, labels),
+      h("p.hint", null, "Contour: distance to the planned path. Tracking: distance to where the nozzle was planned to be at that moment.")),
+    layers(job, labels, signal),
+    trackChart(report, channels, labels, signal),
+    spectra(report, channels, labels, signal),
+    features(report, channels, labels),
+    putBack(report, channels),
+    written(report),
+  ].filter((part) => part !== null);
+}
+
+/** @param {string} title @param {...any} parts */
+function section(title, ...parts) {
+  return h("section", null, h("h2", null, title), parts);
+}
+
+/** @param {any} report */
+function warnings(report) {
+  if (report.warnings.length === 0) return null;
+  return h("section.notice", { "aria-label": "Please read" }, h("h2", null, "Please read"),
+    h("ul", null, report.warnings.map((/** @type {string} */ text) => h("li", null, text))));
+}
+
+/** @param {any[]} channels @param {Record<string, string>} labels */
+function errorTable(channels, labels) {
+  const row = (/** @type {string} */ name, /** @type {(c: any) => number} */ value) => [name, ...channels.map((c) => um(value(c)))];
+  return table("Error of the nozzle in micrometres", [{ title: "µm", text: true }, ...channels.map((c) => ({ title: key(c.name, labels[c.name]) }))], [
+    row("Contour, rms, extruding", (c) => c.extruding.contour_rms_um),
+    row("Contour, max, extruding", (c) => c.extruding.contour_max_um),
+    row("Tracking, rms, extruding", (c) => c.extruding.tracking_rms_um),
+    row("Contour, rms, all motion", (c) => c.all_motion.contour_rms_um),
+    row("Contour, max, all motion", (c) => c.all_motion.contour_max_um),
+    row("Vibration at rest, first 0.1 s, rms", (c) => c.residual_rms_um),
+  ]);
+}
+
+/** @param {any} job @param {Record<string, string>} labels @param {AbortSignal} signal */
+function layers(job, labels, signal) {
+  const where = job.links.layers;
+  if (!where) return null;
+  const area = h("div", { "aria-busy": "true" }, h("p.hint", null, "Fetching the layers …"));
+  const shown = section("Layer by layer", area);
+  import("../layers/viewer.js").then(({ layerView }) => layerView(where, labels, signal)).then((view) => {
+    if (view === null) shown.remove();
+    else area.replaceChildren(view);
+    area.removeAttribute("aria-busy");
+  }).catch((error) => {
+    if (isAbort(error)) return;
+    // Jobs of earlier versions have no layers.
+    if (error?.status === 404) shown.remove();
+    else area.replaceChildren(problemPanel(error));
+  });
+  return shown;
+}
+
+/** @param {any} report @param {any[]} channels @param {Record<string, string>} labels */
+function features(report, channels, labels) {
+  const groups = [...report.features].sort((a, b) => b.seconds - a.seconds);
+  if (groups.length === 0) return null;
+  return section("By feature", longTable("Contour error by feature, root mean square", [{ title: "Contour, rms, µm", text: true },
+    ...channels.map((c) => ({ title: key(c.name, labels[c.name]) })), { title: "Time", wide: true }], groups, (g) => [
+    feature(g.name), ...channels.map((c) => um(g.contour_rms_um[c.name])), duration(g.seconds)], 12));
+}
+
+/** @param {any} report @param {any[]} channels */
+function putBack(report, channels) {
+  if (!channels.some((c) => c.name === "after")) return null;
+  const pieces = report.put_back;
+  if (pieces.length === 0) return section("Put back as it came", h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`));
+  return section("Put back as it came",
+    h("p", null, `${grouped(pieces.length)} of ${counted(report.pieces, "piece")}, ${(100 * report.put_back_extruding_share).toFixed(2)} % of the extruding time. They are in the file as the slicer wrote them.`),
+    longTable("Pieces put back as they came", [{ title: "Lines", text: true }, { title: "Time" }, { title: "Extruding", wide: true }, { title: "Why", text: true }], pieces, (p) => [
+      `${p.line_first}–${p.line_last}`, duration(p.seconds), duration(p.extruding_seconds), p.reason], 20));
+}
+
+/** @param {any} report */
+function written(report) {
+  const facts = [
+    ["Print time", `${duration(report.original_time_s)} → ${duration(report.time_s)}`],
+    report.slicer_time_s ? ["By the slicer's estimate", `${duration(report.slicer_time_s)}${report.slicer ? ` (${report.slicer})` : ""}`] : null,
+    ["Size", `${bytes(report.original_bytes)} → ${bytes(report.written_bytes)}`],
+    ["Compensated", `${duration(report.compensated_s)} of the print; ${duration(report.extruding_s)} extrude`],
+    report.segments ? ["Segments", `${grouped(report.segments)}, ${Math.round(report.segments_per_s)} per second, at most ${grouped(Math.round(report.peak_segments_per_s))}`] : null,
+    ["Command", `at most ${Math.round(report.peak_velocity_mm_s)} mm/s and ${grouped(Math.round(report.peak_accel_mm_s2))} mm/s²`],
+    ["Written motion against the command", `${um(report.emission_rms_um)} µm rms, ${um(report.emission_max_um)} µm max`],
+    ["Best shaper of this machine", report.best_shaper],
+    ["Stillpath", report.version],
+  ].filter((fact) => fact !== null);
+  return h("section", null, folded("The written file in figures", () => h("dl.facts", null, facts.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]).flat())));
+}
+
+/** @param {string} name @param {string} label */
+function key(name, label) {
+  return h("span.keyed", { dataset: { channel: name } }, label);
+}
+
+/** @param {string} text */
+function capital(text) {
+  return text ? text[0].toUpperCase() + text.slice(1) : "";
+}

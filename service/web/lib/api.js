@@ -1,0 +1,115 @@
+/** Requests to the service: the key goes along, problems are thrown. */
+
+import { askForKey, keyHeaders, storedKey } from "./keys.js";
+import { problemOf, unreachable } from "./problem.js";
+
+/**
+ * @typedef {object} Asking
+ * @property {string} [method]
+ * @property {Record<string, any>} [query] Empty values are left out.
+ * @property {BodyInit} [body]
+ * @property {Record<string, string>} [headers]
+ * @property {AbortSignal} [signal]
+ */
+
+/**
+ * Send a request; a missing key is asked for and the request repeated.
+ *
+ * @param {string} path
+ * @param {Asking} [asking]
+ * @returns {Promise<Response>} A success.
+ */
+export async function request(path, asking = {}) {
+  for (;;) {
+    const shown = storedKey();
+    const answer = await send(path, asking);
+    if (answer.ok) return answer;
+    const problem = problemOf(answer.status, await answer.text());
+    if (answer.status !== 401) throw problem;
+    // Another request may have been given a key meanwhile.
+    if (storedKey() === shown && !(await askForKey(problem.message))) throw problem;
+  }
+}
+
+/**
+ * @param {string} path
+ * @param {Asking} [asking]
+ * @returns {Promise<any>}
+ */
+export async function getJson(path, asking = {}) {
+  return (await request(path, asking)).json();
+}
+
+/**
+ * @param {string} path
+ * @param {Record<string, any>} [query]
+ * @returns {string}
+ */
+export function address(path, query = {}) {
+  const given = Object.entries(query).filter(([, v]) => v !== null && v !== undefined && v !== "");
+  const text = new URLSearchParams(given.map(([k, v]) => [k, String(v)])).toString();
+  return text ? `${path}?${text}` : path;
+}
+
+/**
+ * Send a file as the body, telling how much of it is on its way; `fetch` cannot tell that.
+ *
+ * @param {string} path
+ * @param {Record<string, any>} query
+ * @param {Blob} body
+ * @param {(share: number) => void} onProgress
+ * @param {AbortSignal} signal
+ * @returns {Promise<any>} The answer's document.
+ */
+export async function upload(path, query, body, onProgress, signal) {
+  for (;;) {
+    const shown = storedKey();
+    const { status, text } = await post(address(path, query), body, onProgress, signal);
+    if (status >= 200 && status < 300) return JSON.parse(text);
+    const problem = problemOf(status, text);
+    if (status !== 401) throw problem;
+    if (storedKey() === shown && !(await askForKey(problem.message))) throw problem;
+  }
+}
+
+/**
+ * @param {unknown} error
+ * @returns {boolean} Whether it only says that nobody waits any more.
+ */
+export function isAbort(error) {
+  return error instanceof DOMException && error.name === "AbortError";
+}
+
+/** @param {string} path @param {Asking} asking @returns {Promise<Response>} */
+async function send(path, { method = "GET", query, body, headers, signal }) {
+  try {
+    return await fetch(address(path, query), {
+      method, body, signal, headers: { ...headers, ...keyHeaders() },
+    });
+  } catch (error) {
+    if (isAbort(error)) throw error;
+    throw unreachable();
+  }
+}
+
+/**
+ * @param {string} url
+ * @param {Blob} body
+ * @param {(share: number) => void} onProgress
+ * @param {AbortSignal} signal
+ * @returns {Promise<{status: number, text: string}>}
+ */
+function post(url, body, onProgress, signal) {
+  return new Promise((resolve, reject) => {
+    const sending = new XMLHttpRequest();
+    sending.open("POST", url);
+    sending.setRequestHeader("Content-Type", "application/octet-stream");
+    for (const [name, value] of Object.entries(keyHeaders())) sending.setRequestHeader(name, value);
+    sending.upload.onprogress = (event) => onProgress(event.total ? event.loaded / event.total : 0);
+    sending.onerror = () => reject(unreachable());
+    sending.onabort = () => reject(new DOMException("The upload was cancelled.", "AbortError"));
+    sending.onload = () => resolve({ status: sending.status, text: sending.responseText });
+    signal.addEventListener("abort", () => sending.abort());
+    sending.send(body);
+  });
+}

@@ -1,0 +1,30 @@
+/** Questions before something is lost. */
+
+import { h } from "./dom.js";
+
+/**
+ * Ask; the safe answer has the focus.
+ *
+ * @param {{title: string, text: string, yes: string, no?: string, danger?: boolean, fields?: Node[]}} question
+ * @returns {Promise<boolean>}
+ */
+export function confirmed({ title, text, yes, no = "Keep it", danger = true, fields = [] }) {
+  const before = /** @type {HTMLElement | null} */ (document.activeElement);
+  return new Promise((resolve) => {
+    const dialog = h("dialog.ask", { "aria-labelledby": "ask-title", "aria-describedby": "ask-text" },
+      h("form", { method: "dialog" },
+        h("h2", { id: "ask-title" }, title),
+        h("p", { id: "ask-text" }, text),
+        fields,
+        h("div.actions", null,
+          h(danger ? "button.danger" : "button.main", { type: "submit", value: "yes" }, yes),
+          h("button", { type: "button", autofocus: fields.length === 0, onclick: () => dialog.close("") }, no))));
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      if (before?.isConnected) before.focus();
+      resolve(dialog.returnValue === "yes");
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}

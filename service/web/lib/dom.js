@@ -1,0 +1,62 @@
+/** Making elements. Text always goes in as text, never as HTML. */
+
+/** @typedef {Node | string | number | null | undefined | false} Child */
+
+/**
+ * Make an element.
+ *
+ * @param {string} what Tag with classes: `"p.hint"`.
+ * @param {Record<string, any> | null} [props] `on...` are listeners, `dataset` an object; other
+ *   names are attributes (true: empty, false or null: left out).
+ * @param {...(Child | Child[])} children
+ * @returns {any}
+ */
+export function h(what, props, ...children) {
+  const [tag, ...classes] = what.split(".");
+  const element = document.createElement(tag || "div");
+  if (classes.length) element.className = classes.join(" ");
+  for (const [name, value] of Object.entries(props ?? {})) set(element, name, value);
+  element.append(...children.flat().filter(isShown).map(asNode));
+  return element;
+}
+
+/**
+ * Replace what an element holds.
+ *
+ * @param {Element} element
+ * @param {...(Child | Child[])} children
+ */
+export function fill(element, ...children) {
+  element.replaceChildren(...children.flat().filter(isShown).map(asNode));
+}
+
+/**
+ * Return the ids that tie a label to its field.
+ *
+ * @param {string} stem
+ * @returns {string}
+ */
+export function uniqueId(stem) {
+  counter += 1;
+  return `${stem}-${counter}`;
+}
+
+let counter = 0;
+
+/** @param {Element} element @param {string} name @param {any} value */
+function set(element, name, value) {
+  if (value === null || value === undefined || value === false) return;
+  if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+  else if (name === "dataset") Object.assign(/** @type {HTMLElement} */ (element).dataset, value);
+  else element.setAttribute(name, value === true ? "" : String(value));
+}
+
+/** @param {Child} child */
+function isShown(child) {
+  return child !== null && child !== undefined && child !== false;
+}
+
+/** @param {any} child */
+function asNode(child) {
+  return child instanceof Node ? child : document.createTextNode(String(child));
+}

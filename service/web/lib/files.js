@@ -1,0 +1,44 @@
+/** Downloads: plain links, or by way of a blob where a key must go along. */
+
+import { isAbort, request } from "./api.js";
+import { h } from "./dom.js";
+import { storedKey } from "./keys.js";
+import { problemPanel } from "./problem.js";
+
+/**
+ * Return a link to a file of the service.
+ *
+ * @param {{text: string, href: string, name: string, main?: boolean, open?: boolean}} file `open`:
+ *   in a tab of its own, where that is possible.
+ * @returns {HTMLElement}
+ */
+export function fileLink({ text, href, name, main = false, open = false }) {
+  const style = main ? "a.button.main" : "a.button";
+  if (storedKey() === null) {
+    return h(style, open ? { href, target: "_blank", rel: "noopener" } : { href, download: name },
+      text, open ? h("span.sr", null, " (new tab)") : null);
+  }
+  const link = h(style, { href, download: name, onclick: async (/** @type {Event} */ event) => {
+    event.preventDefault();
+    if (link.getAttribute("aria-busy")) return;
+    link.setAttribute("aria-busy", "true");
+    try {
+      save(await (await request(href)).blob(), name);
+    } catch (error) {
+      if (!isAbort(error)) link.after(problemPanel(error));
+    } finally {
+      link.removeAttribute("aria-busy");
+    }
+  } }, text);
+  return link;
+}
+
+/** @param {Blob} content @param {string} name */
+function save(content, name) {
+  const href = URL.createObjectURL(content);
+  const link = h("a", { href, download: name });
+  document.body.append(link);
+  link.click();
+  link.remove();
+  setTimeout(() => URL.revokeObjectURL(href), 60_000);
+}

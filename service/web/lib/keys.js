@@ -1,0 +1,80 @@
+/** The key of the service: kept for as long as the tab is open, asked for when it is missing. */
+
+import { h } from "./dom.js";
+
+const STORED = "stillpath.key";
+/** @type {Promise<boolean> | null} */
+let asking = null;
+
+/** @returns {string | null} */
+export function storedKey() {
+  try {
+    return sessionStorage.getItem(STORED);
+  } catch {
+    return null;
+  }
+}
+
+/** @returns {Record<string, string>} Headers that show the key, if there is one. */
+export function keyHeaders() {
+  const key = storedKey();
+  return key ? { Authorization: `Bearer ${key}` } : {};
+}
+
+/** Forget the key and start anew. */
+export function forgetKey() {
+  sessionStorage.removeItem(STORED);
+  location.reload();
+}
+
+/**
+ * Ask for a key; requests that wait for one share the question.
+ *
+ * @param {string} reason What the service said.
+ * @returns {Promise<boolean>} Whether one was given.
+ */
+export function askForKey(reason) {
+  asking ??= ask(reason).finally(() => {
+    asking = null;
+  });
+  return asking;
+}
+
+/** @param {string} reason @returns {Promise<boolean>} */
+function ask(reason) {
+  return new Promise((resolve) => {
+    const field = h("input", {
+      type: "password", id: "key", name: "key", autocomplete: "off", spellcheck: "false",
+      required: true, placeholder: "sp_…", "aria-describedby": "key-reason",
+    });
+    const dialog = h("dialog.ask", { "aria-labelledby": "key-title" },
+      h("form", { method: "dialog", onsubmit: () => {
+        dialog.returnValue = "given";
+      } },
+        h("h2", { id: "key-title" }, "This service asks for a key"),
+        h("p", { id: "key-reason" }, reason),
+        h("label", { for: "key" }, "Key"),
+        field,
+        h("p.hint", null, "It is kept in this tab only. Whoever runs the service makes keys with “stillpath keys”."),
+        h("div.actions", null,
+          h("button.main", { type: "submit", value: "given" }, "Use this key"),
+          h("button", { type: "button", onclick: () => dialog.close("") }, "Not now")),
+      ));
+    dialog.addEventListener("close", () => {
+      const key = field.value.trim();
+      const given = dialog.returnValue === "given" && key !== "";
+      if (given) sessionStorage.setItem(STORED, key);
+      showForget();
+      dialog.remove();
+      resolve(given);
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}
+
+/** Show the button that forgets the key while there is one. */
+export function showForget() {
+  const button = document.getElementById("forget-key");
+  if (button) button.hidden = storedKey() === null;
+}

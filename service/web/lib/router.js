@@ -1,0 +1,83 @@
+/** Views by the address's hash: `#/jobs/ID`. One is shown at a time, and ends when another comes. */
+
+import { isAbort } from "./api.js";
+import { fill, h } from "./dom.js";
+import { problemPanel } from "./problem.js";
+
+/**
+ * @typedef {object} Place Where a view is drawn.
+ * @property {HTMLElement} main
+ * @property {AbortSignal} signal Aborts when the view is left.
+ * @property {(text: string) => void} setTitle
+ * @property {string[]} params
+ *
+ * @typedef {object} Route
+ * @property {string} name
+ * @property {RegExp} pattern
+ * @property {() => Promise<{show: (place: Place) => Promise<void> | void}>} load
+ */
+
+/**
+ * Show the view of the address, now and whenever it changes.
+ *
+ * @param {HTMLElement} main
+ * @param {Route[]} routes
+ */
+export function startRouter(main, routes) {
+  let leave = new AbortController();
+  let first = true;
+  const show = async () => {
+    leave.abort();
+    const here = new AbortController();
+    leave = here;
+    const path = location.hash.replace(/^#/, "") || "/";
+    const route = routes.find((r) => r.pattern.test(path));
+    mark(route?.name ?? "");
+    fill(main);
+    window.scrollTo(0, 0);
+    const setTitle = (/** @type {string} */ text) => {
+      if (!here.signal.aborted) document.title = `${text} · Stillpath`;
+    };
+    try {
+      if (route === undefined) {
+        fill(main, h("h1", { tabindex: "-1" }, "No such page"), h("p", null, h("a", { href: "#/" }, "Start a new job")));
+        setTitle("No such page");
+      } else {
+        const params = (route.pattern.exec(path) ?? []).slice(1).map(decodeURIComponent);
+        const view = await route.load();
+        if (here.signal.aborted) return;
+        await view.show({ main, signal: here.signal, setTitle, params });
+      }
+    } catch (error) {
+      if (isAbort(error) || here.signal.aborted) return;
+      main.append(problemPanel(error, h("button", { type: "button", onclick: show }, "Try again")));
+    }
+    if (!first && !here.signal.aborted) focusHeading(main);
+    first = false;
+  };
+  addEventListener("hashchange", () => {
+    // The skip link and anchors within a page are no routes.
+    if (location.hash === "" || location.hash.startsWith("#/")) show();
+  });
+  show();
+}
+
+/**
+ * Put the focus where reading starts.
+ *
+ * @param {HTMLElement} main
+ */
+export function focusHeading(main) {
+  const heading = main.querySelector("h1");
+  if (heading === null) return main.focus();
+  heading.setAttribute("tabindex", "-1");
+  heading.focus({ preventScroll: true });
+}
+
+/** @param {string} name */
+function mark(name) {
+  for (const link of document.querySelectorAll("header nav a")) {
+    if (/** @type {HTMLElement} */ (link).dataset.route === name) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
+  }
+}

@@ -1,0 +1,89 @@
+/** Follows a job: by the service's stream of events, or by asking while there is none. */
+
+import { getJson, isAbort, request } from "./api.js";
+import { ProblemError } from "./problem.js";
+
+const FINAL = new Set(["done", "failed", "cancelled"]);
+const ASK_EVERY_MS = 1000;
+const SLOWEST_MS = 15_000;
+
+/**
+ * @param {{state: string}} job
+ * @returns {boolean} Whether nothing more will happen.
+ */
+export function isOver(job) {
+  return FINAL.has(job.state);
+}
+
+/**
+ * Call back with every new state of a job until it is over.
+ *
+ * @param {string} id
+ * @param {(job: any) => void} onJob
+ * @param {AbortSignal} signal
+ * @returns {Promise<void>} Rejected with the problem if there is no such job (any more).
+ */
+export async function watchJob(id, onJob, signal) {
+  let over = false;
+  let streams = true;
+  let wait = ASK_EVERY_MS;
+  const note = (/** @type {any} */ job) => {
+    over = isOver(job);
+    wait = ASK_EVERY_MS;
+    onJob(job);
+  };
+  while (!over) {
+    try {
+      if (streams) await follow(id, note, signal);
+      else note(await getJson(`/v1/jobs/${id}`, { signal }));
+    } catch (error) {
+      if (isAbort(error) || signal.aborted) throw error;
+      if (error instanceof ProblemError && [401, 403, 404].includes(error.status) && !streams) throw error;
+      streams = false;
+      wait = Math.min(wait * 1.5, SLOWEST_MS);
+    }
+    if (!over) await pause(wait, signal);
+  }
+}
+
+/**
+ * Read `text/event-stream` (WHATWG HTML, 9.2) as far as jobs need it.
+ *
+ * @param {string} id
+ * @param {(job: any) => void} onJob
+ * @param {AbortSignal} signal
+ */
+async function follow(id, onJob, signal) {
+  const answer = await request(`/v1/jobs/${id}/events`, {
+    headers: { Accept: "text/event-stream" }, signal,
+  });
+  if (!answer.body) throw new TypeError("no stream");
+  const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    text += value.replaceAll("\r\n", "\n").replaceAll("\r", "\n");
+    const events = text.split("\n\n");
+    text = events.pop() ?? "";
+    for (const event of events) {
+      const lines = event.split("\n");
+      const data = lines.filter((line) => line.startsWith("data:")).map((line) => line.slice(5).trimStart()).join("\n");
+      // `gone` and whatever comes later: a request says what has happened.
+      if (!lines.includes("event: job")) {
+        if (data) onJob(await getJson(`/v1/jobs/${id}`, { signal }));
+      } else onJob(JSON.parse(data));
+    }
+  }
+}
+
+/** @param {number} ms @param {AbortSignal} signal @returns {Promise<void>} */
+function pause(ms, signal) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, ms);
+    signal.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(new DOMException("nobody waits", "AbortError"));
+    }, { once: true });
+  });
+}

@@ -1,0 +1,71 @@
+/** Upload measurements, look at the fit, and keep it as a revision. */
+
+import { address, isAbort, request } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
+import { fill, h } from "../lib/dom.js";
+import { counted } from "../lib/format.js";
+import { problemPanel } from "../lib/problem.js";
+import { dropZone } from "../parts/drop-zone.js";
+import { fitPlots } from "./plots.js";
+
+const NAME = "[a-z0-9][a-z0-9_\\-]{0,63}";
+
+/**
+ * @param {{machines: any[], base: string | null, own?: boolean, signal: AbortSignal}} about `base`:
+ *   the machine that is measured (`own`), or that a new one starts from.
+ * @returns {HTMLElement}
+ */
+export function measurementPanel({ machines, base, own = false, signal }) {
+  /** @type {File[]} */
+  let files = [];
+  const result = h("div", { "aria-live": "polite" });
+  const look = h("button.main", { type: "submit", disabled: true }, "Look at the fit");
+  const name = h("input", { type: "text", id: "new-name", required: !own, pattern: NAME, maxlength: "60", autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
+  const start = h("select", { id: "base" }, machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
+  const author = h("input", { type: "text", id: "measured-by", maxlength: "100", autocomplete: "name" });
+  const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {
+    event.preventDefault();
+    send(true);
+  } },
+    dropZone({ label: "Drop measurements here, or choose them", hint: "Klipper's raw_data_*.csv or resonances_*.csv, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.npz,.gz,text/*", multiple: true,
+      onChoose: (chosen) => {
+        files = chosen;
+        look.disabled = false;
+        fill(result);
+      } }),
+    h("div.fields", null,
+      own ? null : h("div.field", null, h("label", { for: "new-name" }, "Name of your machine"), name, h("p.hint", { id: "new-name-hint" }, "Small letters, digits, - and _.")),
+      own || base !== null ? null : h("div.field", null, h("label", { for: "base" }, "Travel and limits from"), start),
+      h("div.field", null, h("label", { for: "measured-by" }, "Your name"), author)),
+    h("div.actions", null, look), result);
+
+  async function send(/** @type {boolean} */ trial) {
+    const target = own ? /** @type {string} */ (base) : name.value;
+    const body = new FormData();
+    for (const file of files) body.append("file", file, file.name);
+    look.disabled = true;
+    fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), "Identifying; this takes some ten seconds …"));
+    try {
+      const path = address(`/v1/machines/${encodeURIComponent(target)}/measurements`, {
+        trial: trial ? "true" : "", base: own ? "" : base ?? start.value, author: author.value.trim() });
+      const found = await (await request(path, { method: "POST", body, signal })).json();
+      if (!trial) {
+        announce(`Revision ${found.revision.number} of ${target} is kept.`);
+        const here = `#/machines/${encodeURIComponent(target)}`;
+        if (location.hash === here) dispatchEvent(new HashChangeEvent("hashchange"));
+        else location.hash = here;
+        return;
+      }
+      const keep = h("button.main", { type: "button", onclick: () => send(false) }, own ? "Keep as the next revision" : `Keep as ${target}`);
+      fill(result, h("h3", { tabindex: "-1" }, "The fit"), h("p.hint", null, `${counted(files.length, "file")}. Nothing is stored yet.`),
+        h("div.pair", null, found.report.axes.map((/** @type {any} */ axis) => fitPlots(axis, signal))),
+        h("div.actions", null, keep));
+      result.querySelector("h3")?.focus();
+    } catch (error) {
+      if (!isAbort(error)) fill(result, problemPanel(error));
+    }
+    look.disabled = false;
+  }
+
+  return form;
+}

@@ -1,0 +1,88 @@
+/** Plants over frequency: modulus and phase of the model, of its set, and what was measured. */
+
+import { h } from "../lib/dom.js";
+import { number } from "../lib/format.js";
+import { lineChart } from "../charts/line-chart.js";
+import { table } from "../parts/table.js";
+
+const HZ = { label: "Hz", text: (/** @type {number} */ v) => `${number(v)} Hz`, tick: (/** @type {number} */ v) => number(v) };
+
+/**
+ * @param {any[]} responses Of both axes, from the service.
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement}
+ */
+export function responsePlots(responses, signal) {
+  return h("div.pair", null, responses.map((axis) => h("div", null,
+    h("h3", null, `${axis.axis.toUpperCase()} axis`),
+    lineChart({
+      title: `Frequency response of the ${axis.axis.toUpperCase()} axis, modulus`, signal, at: axis.nominal.f_hz,
+      marks: axis.modes.map((/** @type {any} */ m) => m.f_hz), x: HZ, y: { label: "|G|, mm/mm" },
+      series: [...members(axis.members, "magnitude", axis.nominal.f_hz.length), { label: axis.members.length ? "Nominal; thin: its set" : "Nominal", values: axis.nominal.magnitude, colour: "--after", width: 2.2 }],
+    }),
+    modeTable(axis),
+    h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "Where the model was measured is not known."))));
+}
+
+/**
+ * @param {any} report Of an identification.
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement}
+ */
+export function identifiedPlots(report, signal) {
+  return h("div.identified", null, h("h3", null, "Measured and fitted"),
+    h("p.hint", null, `From ${report.sources.map((/** @type {any} */ s) => s.name).join(", ")}`),
+    h("div.pair", null, report.axes.map((/** @type {any} */ axis) => fitPlots(axis, signal))));
+}
+
+/**
+ * What an identification found for an axis: the fit over the measurement, modes and warnings.
+ *
+ * @param {any} axis
+ * @param {AbortSignal} signal
+ * @returns {HTMLElement}
+ */
+export function fitPlots(axis, signal) {
+  const letter = axis.axis.toUpperCase();
+  return h("div", null, h("h4", null, `${letter} axis: ${axis.kind}`),
+    axis.warnings.length ? h("ul.notice", null, axis.warnings.map((/** @type {string} */ w) => h("li", null, w))) : null,
+    axis.spectra.map((/** @type {any} */ s) => lineChart({
+      title: `Measured and fitted spectrum, ${letter}: ${s.label}`, signal, at: s.f_hz, x: HZ, y: { label: "(mm/s²)²/Hz" },
+      series: [{ label: "Measured", values: s.measured, colour: "--soft", width: 1.2 }, { label: "Model", values: s.predicted, colour: "--after", width: 2.2 }],
+    })),
+    axis.responses.flatMap((/** @type {any} */ r) => [lineChart({
+      title: `Measured and fitted response, ${letter}: ${r.label}`, signal, at: r.f_hz, x: HZ, y: { label: "|G|" },
+      series: [{ label: "Measured", values: r.magnitude, colour: "--before", dots: true }, { label: "Model", values: onto(axis.model, "magnitude", r.f_hz), colour: "--after", width: 2.2 }],
+    }), lineChart({
+      title: `Phase, ${letter}: ${r.label}`, signal, at: r.f_hz, x: HZ, y: { label: "phase, °" },
+      series: [{ label: "Measured", values: r.phase_deg, colour: "--before", dots: true }, { label: "Model", values: onto(axis.model, "phase_deg", r.f_hz), colour: "--after", width: 2.2 }],
+    })]),
+    modeTable(axis),
+    axis.residual === null ? null : h("p.hint", null, axis.responses.length ? `Residual of the fit: ${number(100 * axis.residual)} %` : `Residual of the fit: ${number(axis.residual)} dB rms`),
+    axis.notes.map((/** @type {string} */ note) => h("p.hint", null, note)));
+}
+
+/** @param {any} axis With `modes`. */
+function modeTable(axis) {
+  if (axis.modes.length === 0) return h("p.hint", null, "No resonances.");
+  const spread = (/** @type {number | null} */ sd, /** @type {number} */ digits) => (sd === null || sd === undefined ? "" : ` ± ${number(2 * sd, digits)}`);
+  return table(`Modes of the ${axis.axis.toUpperCase()} axis`, [{ title: "Mode", text: true }, { title: "Frequency, Hz" }, { title: "Damping ratio" }],
+    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), `${number(m.f_hz)}${spread(m.f_sd_hz, 2)}`, `${number(m.zeta)}${spread(m.zeta_sd, 2)}`]));
+}
+
+/** @param {any[]} curves @param {"magnitude"} what @param {number} length */
+function members(curves, what, length) {
+  return curves.filter((c) => c[what].length === length)
+    .map((c) => ({ label: "member", values: c[what], colour: "--member", width: 1, quiet: true }));
+}
+
+/** Values of a curve at other frequencies, linear between its own. @param {any} curve @param {string} what @param {number[]} f */
+function onto(curve, what, f) {
+  let k = 1;
+  return f.map((at) => {
+    if (at < curve.f_hz[0] || at > curve.f_hz.at(-1)) return null;
+    while (k < curve.f_hz.length - 1 && curve.f_hz[k] < at) k += 1;
+    const t = (at - curve.f_hz[k - 1]) / (curve.f_hz[k] - curve.f_hz[k - 1]);
+    return curve[what][k - 1] + t * (curve[what][k] - curve[what][k - 1]);
+  });
+}

@@ -1,0 +1,47 @@
+/** A place to drop files on, or to choose them by. */
+
+import { fill, h, uniqueId } from "../lib/dom.js";
+import { bytes } from "../lib/format.js";
+
+/**
+ * @param {{label: string, hint: string, accept?: string, multiple?: boolean,
+ *   onChoose: (files: File[]) => void}} options
+ * @returns {HTMLElement}
+ */
+export function dropZone({ label, hint, accept, multiple = false, onChoose }) {
+  const id = uniqueId("file");
+  const input = h("input", { type: "file", id, accept, multiple, "aria-describedby": `${id}-hint` });
+  const name = h("strong", null, label);
+  const more = h("small", { id: `${id}-hint` }, hint);
+  const zone = h("label.drop", { for: id }, input,
+    h("span.arrow", { "aria-hidden": "true" }), name, more);
+  const take = (/** @type {FileList | null | undefined} */ list) => {
+    const files = [...(list ?? [])].slice(0, multiple ? undefined : 1);
+    if (files.length === 0) return;
+    zone.classList.add("chosen");
+    fill(name, files.length === 1 ? files[0].name : `${files.length} files`);
+    const total = files.reduce((sum, file) => sum + file.size, 0);
+    fill(more, `${bytes(total)}${files.length > 1 ? `: ${files.map((f) => f.name).join(", ")}` : " · choose another"}`);
+    onChoose(files);
+  };
+  input.addEventListener("change", () => take(input.files));
+  // Entering a child fires `dragleave` on the zone, so that levels are counted.
+  let depth = 0;
+  zone.addEventListener("dragenter", (/** @type {DragEvent} */ event) => {
+    event.preventDefault();
+    depth += 1;
+    zone.classList.add("over");
+  });
+  zone.addEventListener("dragover", (/** @type {DragEvent} */ event) => event.preventDefault());
+  zone.addEventListener("dragleave", () => {
+    depth = Math.max(0, depth - 1);
+    zone.classList.toggle("over", depth > 0);
+  });
+  zone.addEventListener("drop", (/** @type {DragEvent} */ event) => {
+    event.preventDefault();
+    depth = 0;
+    zone.classList.remove("over");
+    take(event.dataTransfer?.files);
+  });
+  return zone;
+}

@@ -1,0 +1,93 @@
+/** A field to choose a machine by typing a part of its name (ARIA combobox with a listbox). */
+
+import { fill, h } from "../lib/dom.js";
+
+/**
+ * @typedef {{name: string, title: string, origin: string, kinematics: string,
+ *   problem: string | null}} Machine
+ */
+
+/**
+ * @param {Machine[]} machines
+ * @param {string | null} chosen Name of the machine that is chosen at first.
+ * @param {(name: string | null) => void} onChoose
+ * @returns {HTMLElement}
+ */
+export function machinePicker(machines, chosen, onChoose) {
+  const usable = machines.filter((m) => m.problem === null);
+  const list = h("ul.options", { role: "listbox", id: "machine-options", "aria-label": "Machines", hidden: true });
+  const input = h("input", {
+    type: "text", id: "machine", role: "combobox", autocomplete: "off", spellcheck: "false",
+    placeholder: "Type to search", "aria-autocomplete": "list", "aria-expanded": "false",
+    "aria-controls": "machine-options", "aria-describedby": "machine-hint",
+  });
+  const hint = h("p.hint", { id: "machine-hint" });
+  /** @type {Machine[]} */
+  let shown = [];
+  let active = -1;
+  let current = usable.find((m) => m.name === chosen) ?? null;
+
+  const tell = () => fill(hint, current
+    ? `${current.name} · ${current.kinematics} · ${current.origin}`
+    : "A compensated file fits one machine only: choose the one that will print it.");
+  const open = (/** @type {boolean} */ isOpen) => {
+    list.hidden = !isOpen;
+    input.setAttribute("aria-expanded", String(isOpen));
+    if (!isOpen) input.removeAttribute("aria-activedescendant");
+  };
+  const draw = () => {
+    fill(list, shown.map((m, k) => h("li", {
+      role: "option", id: `machine-option-${k}`, "aria-selected": String(k === active),
+      onpointerdown: (/** @type {Event} */ event) => {
+        event.preventDefault(); // the field keeps the focus
+        choose(m);
+      },
+    }, h("span", null, m.title), h("small", null, `${m.name} · ${m.origin}`))),
+    shown.length ? null : h("li.none", { role: "option", "aria-selected": "false", "aria-disabled": "true" }, "No machine has this in its name."));
+    if (active >= 0 && shown.length) {
+      input.setAttribute("aria-activedescendant", `machine-option-${active}`);
+      list.children[active].scrollIntoView({ block: "nearest" });
+    } else input.removeAttribute("aria-activedescendant");
+  };
+  const search = (/** @type {string} */ text) => {
+    const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+    shown = usable.filter((m) => words.every((w) => `${m.title} ${m.name}`.toLowerCase().includes(w)));
+    active = shown.length && text ? 0 : shown.findIndex((m) => m === current);
+    draw();
+    open(true);
+  };
+  const choose = (/** @type {Machine | null} */ machine) => {
+    current = machine;
+    input.value = machine?.title ?? "";
+    open(false);
+    tell();
+    onChoose(machine?.name ?? null);
+  };
+
+  input.addEventListener("input", () => search(input.value));
+  input.addEventListener("click", () => {
+    if (list.hidden) search("");
+  });
+  input.addEventListener("focus", () => input.select());
+  input.addEventListener("blur", () => choose(current));
+  input.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    if (step) {
+      event.preventDefault();
+      if (list.hidden) search("");
+      else if (shown.length) {
+        active = (active + step + shown.length) % shown.length;
+        draw();
+      }
+    } else if (event.key === "Enter" && !list.hidden) {
+      event.preventDefault();
+      if (shown[active]) choose(shown[active]);
+    } else if (event.key === "Escape" && !list.hidden) {
+      event.preventDefault();
+      choose(current);
+    }
+  });
+  input.value = current?.title ?? "";
+  tell();
+  return h("div.picker", null, h("label", { for: "machine" }, "Machine"), input, list, hint);
+}

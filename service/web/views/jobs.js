@@ -1,0 +1,120 @@
+/** The list of jobs: newest first, by state, a page at a time. */
+
+import { getJson, isAbort, request } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
+import { confirmed } from "../lib/dialog.js";
+import { fill, h } from "../lib/dom.js";
+import { bytes, duration, um, when } from "../lib/format.js";
+import { problemPanel } from "../lib/problem.js";
+import { isOver } from "../lib/watch.js";
+import { stateBadge } from "../parts/state.js";
+
+const STATES = [["", "All"], ["queued", "Waiting"], ["running", "Running"], ["done", "Done"], ["failed", "Failed"], ["cancelled", "Cancelled"]];
+const PAGE = 25;
+const REFRESH_MS = 2000;
+
+/** @param {import("../lib/router.js").Place} place */
+export async function show({ main, signal, setTitle }) {
+  setTitle("Jobs");
+  let state = "";
+  /** Cursors of the pages before this one, and of this one. @type {(string | null)[]} */
+  let cursors = [null];
+  /** @type {any} */
+  let page = { jobs: [], next: null };
+  const list = h("div.jobs");
+  const pager = h("nav.pager", { "aria-label": "Pages of jobs" });
+  const fault = h("div");
+  const filter = h("div.choices", { role: "group", "aria-label": "Show jobs that are" },
+    STATES.map(([value, text]) => h("button", {
+      type: "button", "aria-pressed": String(value === state), dataset: { value },
+      onclick: (/** @type {Event} */ event) => {
+        state = value;
+        cursors = [null];
+        for (const other of filter.children) other.setAttribute("aria-pressed", String(other === event.currentTarget));
+        reload(true);
+      },
+    }, text)));
+  fill(main, h("div.head", null, h("h1", null, "Jobs"), h("a.button.main.end", { href: "#/" }, "New job")), h("div.filter", null, filter), fault, list, pager);
+
+  async function reload(tells = false) {
+    try {
+      page = await getJson("/v1/jobs", { query: { state, limit: PAGE, cursor: cursors.at(-1) }, signal });
+      fill(fault);
+      draw();
+      if (tells) announce(page.jobs.length ? `${page.jobs.length} jobs on this page` : "No jobs");
+    } catch (error) {
+      if (!isAbort(error)) fill(fault, problemPanel(error));
+    }
+  }
+
+  function draw() {
+    const focused = /** @type {HTMLElement} */ (document.activeElement)?.dataset?.focus;
+    fill(list, page.jobs.length
+      ? h("ul.plain", null, page.jobs.map(row))
+      : h("p.empty", null, state ? "No jobs are in this state." : "No jobs yet."));
+    fill(pager,
+      h("button", { type: "button", disabled: cursors.length < 2, onclick: () => {
+        cursors.pop();
+        reload(true);
+      } }, "Newer"),
+      h("button", { type: "button", disabled: !page.next, onclick: () => {
+        cursors.push(page.next);
+        reload(true);
+      } }, "Older"));
+    pager.hidden = cursors.length < 2 && !page.next;
+    if (focused) /** @type {HTMLElement | null} */ (list.querySelector(`[data-focus="${CSS.escape(focused)}"]`))?.focus();
+  }
+
+  function row(/** @type {any} */ job) {
+    const over = isOver(job);
+    return h("li.job-row", { dataset: { job: job.id } },
+      h("div.what", null,
+        h("a.name", { href: `#/jobs/${job.id}`, dataset: { focus: `open-${job.id}` } }, job.source_name),
+        h("p.hint", null, `${job.machine} · ${job.options?.method ?? ""} · ${bytes(job.source_bytes)} · ${when(job.created_at)}`)),
+      h("div.outcome", null, outcome(job)),
+      stateBadge(job.state),
+      h("button.quiet", { type: "button", dataset: { focus: `end-${job.id}` }, "aria-label": `${over ? "Delete" : "Cancel"} ${job.source_name}`,
+        onclick: () => (over ? remove(job) : cancel(job)) }, over ? "Delete" : "Cancel"));
+  }
+
+  async function cancel(/** @type {any} */ job) {
+    if (!await confirmed({ title: "Cancel this job?", text: `${job.source_name} is not finished. It can be handed in again.`, yes: "Cancel the job", no: "Let it run" })) return;
+    await change(() => request(`/v1/jobs/${job.id}/cancel`, { method: "POST", signal }), `${job.source_name} is cancelled.`);
+  }
+
+  async function remove(/** @type {any} */ job) {
+    if (!await confirmed({ title: "Delete this job?", text: `${job.source_name}, its result and its report are deleted for good.`, yes: "Delete" })) return;
+    await change(() => request(`/v1/jobs/${job.id}`, { method: "DELETE", signal }), `${job.source_name} is deleted.`);
+  }
+
+  async function change(/** @type {() => Promise<any>} */ act, /** @type {string} */ said) {
+    try {
+      await act();
+      announce(said);
+      await reload();
+      /** @type {HTMLElement | null} */ (main.querySelector("h1"))?.focus();
+    } catch (error) {
+      if (!isAbort(error)) fill(fault, problemPanel(error));
+    }
+  }
+
+  await reload();
+  const timer = setInterval(() => {
+    if (!document.hidden && (cursors.length === 1 || page.jobs.some((/** @type {any} */ j) => !isOver(j)))) reload();
+  }, REFRESH_MS);
+  signal.addEventListener("abort", () => clearInterval(timer));
+}
+
+/** @param {any} job */
+function outcome(job) {
+  if (job.state === "running") return [h("progress", { max: "1", value: String(job.progress), "aria-label": `Progress of ${job.source_name}` }), h("small", null, job.stage)];
+  if (job.state === "queued") return h("small", null, job.queue_position ? `${job.queue_position} before it` : "next");
+  if (job.state === "failed") return h("small.bad", null, job.error?.detail ?? job.error?.title ?? "");
+  const figures = job.summary;
+  if (job.state !== "done" || !figures) return null;
+  if (Number.isFinite(figures.after_um)) {
+    return h("span.figures", null, h("span.before", null, um(figures.before_um)), " → ", h("span.after", null, um(figures.after_um)), " µm",
+      h("small", null, duration(figures.written_s)));
+  }
+  return Number.isFinite(figures.before_um) ? h("span.figures", null, `${um(figures.before_um)} µm`) : null;
+}

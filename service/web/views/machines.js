@@ -1,0 +1,45 @@
+/** The machines that jobs can name: one's own first, then those that are built in. */
+
+import { getJson } from "../lib/api.js";
+import { fill, h } from "../lib/dom.js";
+import { measurementPanel } from "../machine/measurement.js";
+
+/** @param {import("../lib/router.js").Place} place */
+export async function show({ main, signal, setTitle }) {
+  setTitle("Machines");
+  const machines = await getJson("/v1/machines", { signal });
+  const own = machines.filter((/** @type {any} */ m) => m.origin === "own");
+  const builtin = machines.filter((/** @type {any} */ m) => m.origin !== "own");
+  const list = h("div");
+  const search = h("input", { type: "search", id: "find", placeholder: "Name or title", oninput: () => draw() });
+  const draw = () => {
+    const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
+    const fits = (/** @type {any} */ m) => words.every((/** @type {string} */ w) => `${m.title} ${m.name}`.toLowerCase().includes(w));
+    fill(list, group("Your own", own.filter(fits), own.length ? null : "None yet. Upload a measurement below, or put a document with the API."),
+      group("Built in", builtin.filter(fits), null));
+  };
+  draw();
+  fill(main,
+    h("div.head", null, h("h1", null, "Machines"), h("div.find.end", null, h("label.sr", { for: "find" }, "Find a machine"), search)),
+    h("p.lead", null, "A compensator is as good as the model of the machine. Built-in machines are single printers that somebody measured; yours is another one."),
+    list,
+    h("section", null, h("h2", null, "A machine of your own"),
+      measurementPanel({ machines, base: null, signal })));
+}
+
+/** @param {string} title @param {any[]} machines @param {string | null} empty */
+function group(title, machines, empty) {
+  if (machines.length === 0 && empty === null) return null;
+  return h("section", null, h("h2", null, title),
+    machines.length ? h("ul.cards", null, machines.map(card)) : h("p.hint", null, empty));
+}
+
+/** @param {any} machine */
+function card(machine) {
+  return h("li.card", null,
+    h("h3", null, h("a.cover", { href: `#/machines/${encodeURIComponent(machine.name)}` }, machine.title)),
+    machine.problem
+      ? h("p.bad", null, machine.problem)
+      : [h("p.hint", null, h("code", null, machine.name), ` · ${machine.kinematics}`),
+        machine.number ? h("p.hint", null, `Revision ${machine.number}${machine.approved === machine.number ? ", approved" : machine.approved ? `; ${machine.approved} is approved` : ""}`) : h("p.hint.source", null, machine.source)]);
+}

@@ -1,0 +1,154 @@
+/** Hand in a file: drop it, name the machine, send it. */
+
+import { getJson, isAbort, upload } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
+import { fill, h } from "../lib/dom.js";
+import { bytes } from "../lib/format.js";
+import { problemPanel } from "../lib/problem.js";
+import { dropZone } from "../parts/drop-zone.js";
+import { machinePicker } from "../parts/machine-picker.js";
+
+const LAST_MACHINE = "stillpath.machine";
+const FILES = ".gcode,.g,.gco,.nc,.bgcode,.3mf,text/*";
+const METHODS = [
+  ["", [["fbf", "Compensate"]]],
+  ["Approximate inverses", [["zpetc", "ZPETC"], ["ebzpetc", "Extended-bandwidth ZPETC"], ["ts", "Truncated series"], ["zmetc", "ZMETC"], ["npz-ignore", "NPZ-ignore"]]],
+  ["Firmware shapers", [["shaper:zv", "ZV"], ["shaper:mzv", "MZV"], ["shaper:ei", "EI"], ["shaper:2hump_ei", "2-hump EI"], ["shaper:3hump_ei", "3-hump EI"]]],
+  ["", [["none", "None: measure only"]]],
+];
+const DIALECTS = [["", "As the machine's firmware reads it"], ["klipper", "Klipper"], ["marlin", "Marlin"], ["prusa", "Prusa"], ["bambu", "Bambu"], ["reprapfirmware", "RepRapFirmware"]];
+
+/** @param {import("../lib/router.js").Place} place */
+export async function show({ main, signal, setTitle }) {
+  setTitle("New job");
+  const heading = [
+    h("h1", null, "New job"),
+    h("p.lead", null, "Hand in a sliced file. You get one back that keeps the nozzle on its path, with a report of what was measured on it."),
+  ];
+  fill(main, heading);
+  const machines = await getJson("/v1/machines", { signal });
+  /** @type {File | null} */
+  let file = null;
+  let machine = remembered();
+  if (!machines.some((/** @type {any} */ m) => m.name === machine && m.problem === null)) machine = null;
+
+  const send = h("button.main.large", { type: "submit", disabled: true }, "Compensate");
+  const status = h("div", { "aria-live": "polite" });
+  const ready = () => {
+    send.disabled = !file || !machine;
+  };
+  const method = select("method", METHODS);
+  const tolerance = h("input", { type: "number", id: "tolerance", name: "tolerance_um", min: "0.5", max: "50", step: "0.5", value: "2", required: true });
+  const options = moreOptions();
+  method.addEventListener("change", () => {
+    fill(send, method.value === "none" ? "Measure" : "Compensate");
+  });
+  const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {
+    event.preventDefault();
+    submit();
+  } },
+    dropZone({
+      label: "Drop a G-code file here, or choose one", hint: ".gcode, .bgcode or sliced .3mf", accept: FILES,
+      onChoose: ([chosen]) => {
+        file = chosen;
+        ready();
+        announce(`${chosen.name}, ${bytes(chosen.size)}, is chosen.`);
+      },
+    }),
+    h("div.fields.main-fields", null,
+      machinePicker(machines, machine, (name) => {
+        machine = name;
+        ready();
+      }),
+      field("method", "Method", method),
+      field("tolerance", "Tolerance, µm", tolerance, "How far the written path may be from the computed one.")),
+    options.element,
+    h("div.actions", null, send),
+    status);
+  fill(main, h("div.narrow", null, heading, form));
+  ready();
+
+  async function submit() {
+    if (!file || !machine) return;
+    remember(machine);
+    const sending = new AbortController();
+    signal.addEventListener("abort", () => sending.abort());
+    const bar = h("progress", { max: "1", value: "0", "aria-label": "Sent" });
+    const text = h("span", null, "Sending …");
+    const name = file.name;
+    send.disabled = true;
+    fill(status, h("div.sending", null, bar, h("div.row", null, text,
+      h("button", { type: "button", onclick: () => sending.abort() }, "Cancel"))));
+    try {
+      const query = { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read() };
+      const job = await upload("/v1/jobs", query, file, (share) => {
+        bar.value = share;
+        fill(text, share < 1 ? `Sending: ${Math.floor(100 * share)} % of ${bytes(file?.size)}` : "Received; being stored …");
+      }, sending.signal);
+      location.hash = `#/jobs/${job.id}`;
+    } catch (error) {
+      fill(status, isAbort(error) ? h("p.hint", null, "Not sent.") : problemPanel(error));
+      ready();
+    }
+  }
+}
+
+/** What few need, folded away. */
+function moreOptions() {
+  const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
+  const robust = select("robust", [["", [["off", "The nominal plant: fastest"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
+  const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
+  const plate = h("input", { type: "number", id: "plate", min: "1", step: "1", placeholder: "the only one" });
+  const times = select("times", [["", [["new", "Follow the new motion"], ["kept", "Stay as they are"]]]]);
+  const dialect = select("dialect", [["", DIALECTS]]);
+  const fresh = h("input", { type: "checkbox", id: "fresh" });
+  const element = h("details.more", null, h("summary", null, "More options"),
+    h("div.fields", null,
+      field("robust", "Design for", robust),
+      field("basis", "Basis functions", basis),
+      field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
+      field("dialect", "File is written for", dialect),
+      field("times", "The slicer's times", times),
+      field("plate", "Plate of a 3MF package", plate)),
+    h("label.check", { for: "fresh" }, fresh, "Compute anew even if the same file was done before"));
+  const read = () => ({
+    basis: basis.value, robust: robust.value, along: along.value, plate: plate.value,
+    times: times.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "",
+  });
+  return { element, read };
+}
+
+/**
+ * @param {string} id
+ * @param {any[]} groups Of [title, [value, text][]].
+ */
+function select(id, groups) {
+  return h("select", { id }, groups.map(([title, entries]) => {
+    const options = entries.map((/** @type {string[]} */ [value, text]) => h("option", { value }, text));
+    return title ? h("optgroup", { label: title }, options) : options;
+  }).flat());
+}
+
+/** @param {string} id @param {string} label @param {Element} control @param {string} [hint] */
+function field(id, label, control, hint) {
+  if (hint) control.setAttribute("aria-describedby", `${id}-hint`);
+  return h("div.field", null, h("label", { for: id }, label), control, hint ? h("p.hint", { id: `${id}-hint` }, hint) : null);
+}
+
+/** @returns {string | null} */
+function remembered() {
+  try {
+    return localStorage.getItem(LAST_MACHINE);
+  } catch {
+    return null;
+  }
+}
+
+/** @param {string} name */
+function remember(name) {
+  try {
+    localStorage.setItem(LAST_MACHINE, name);
+  } catch {
+    // Storage may be blocked; the machine is then chosen each time.
+  }
+}
