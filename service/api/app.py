@@ -31,6 +31,7 @@ from service.api.guard import Guard, hosts_of
 from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.limits import Limits
+from service.database.documents import open_documents
 from service.database.engine import open_database
 from service.deliveries.printers import load_printers
 from service.deliveries.sender import Sender
@@ -141,12 +142,12 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     if state.keys_required:
         await run_in_threadpool(announce_first_key, state.keys, settings.first_key)
     state.machines = Resolver(
-        MachineStore(settings.data_dir / "machines"),
+        MachineStore(open_documents(settings, engine, "machines")),
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
     state.identifications = identifications.Identifications(
-        Archive(settings.data_dir / "identifications")
+        Archive(open_documents(settings, engine, "identifications"))
     )
     state.layers = assets.Layers(storage)
     state.intake = Intake(settings, state.store, storage, state.machines, state.printers)

@@ -15,6 +15,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.pool import NullPool
 
 from service.database.migrations import LATEST
 
@@ -52,6 +53,8 @@ _ON_POSTGRESQL: dict[str, Any] = {
 class StoreError(RuntimeError):
     """The database cannot be used; the message says what to do."""
 
+    exit_code = 1
+
 
 class DatabaseAway(StoreError):
     """The database does not answer, or not in time; trying again later may help."""
@@ -84,10 +87,11 @@ def database_url(settings: Settings) -> URL:
     return url
 
 
-def open_database(settings: Settings) -> Engine:
+def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     """Return the database with the schema of this version, made or migrated if need be.
 
-    Several processes may do so at once. The caller closes it with ``dispose``.
+    Several processes may do so at once. The caller closes it with ``dispose``; if it is not
+    `pooled`, there is nothing to close, and every transaction opens a connection of its own.
 
     Raises
     ------
@@ -97,7 +101,7 @@ def open_database(settings: Settings) -> Engine:
     url = database_url(settings)
     if url.get_backend_name() == "sqlite" and url.database:
         Path(url.database).parent.mkdir(parents=True, exist_ok=True)
-    engine = make_engine(url)
+    engine = make_engine(url, pooled=pooled)
     try:
         migrate(engine)
         if (
@@ -119,17 +123,18 @@ def open_database(settings: Settings) -> Engine:
     return engine
 
 
-def make_engine(url: URL) -> Engine:
+def make_engine(url: URL, *, pooled: bool = True) -> Engine:
     """Return an engine for a database as it is, without a look at its schema."""
+    pool: dict[str, Any] = (
+        {"pool_size": 8, "max_overflow": 8} if pooled else {"poolclass": NullPool}
+    )
     if url.get_backend_name() == "sqlite":
-        engine = create_engine(url, pool_size=8, max_overflow=8)
+        engine = create_engine(url, **pool)
         event.listen(engine, "connect", _prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
         return engine
     given = {name: value for name, value in _ON_POSTGRESQL.items() if name not in url.query}
-    return create_engine(
-        url, pool_size=8, max_overflow=8, pool_timeout=10, pool_pre_ping=True, connect_args=given
-    )
+    return create_engine(url, **pool, pool_pre_ping=True, connect_args=given)
 
 
 def migrate(engine: Engine) -> None:

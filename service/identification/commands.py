@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import ModelError
-from service.machines.commands import By, Message, data_dir, open_machines, who
+from service.machines.commands import By, Message, open_documents, open_machines, who
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -191,7 +191,7 @@ def run(
     made = _stored(machines, machine, found.machine, sources, who(by), message, expected)
     if made is not None:
         # Where the service looks for them.
-        Archive(data_dir() / "identifications").keep(found.report)
+        Archive(open_documents("identifications")).keep(found.report)
     if report is not None:
         write_identification(found.report, report)
     _write(output, found.machine)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperGroup
@@ -12,12 +12,18 @@ from typer.core import TyperGroup
 from models.errors import ModelError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from models.machine import Machine
+    from service.machines.documents import Documents
     from service.machines.resolve import Resolver
     from service.machines.revision import Revision
     from service.machines.settings import MachineSettings
+    from service.settings import Settings
 
-__all__ = ["app", "data_dir", "open_machines", "who"]
+__all__ = ["app", "data_dir", "open_documents", "open_machines", "who"]
+
+_Made = TypeVar("_Made")
 
 
 class _Group(TyperGroup):
@@ -52,10 +58,27 @@ def open_machines() -> Resolver:
 
     settings = _settings()
     return Resolver(
-        MachineStore(data_dir() / "machines"),
+        MachineStore(open_documents("machines")),
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
+
+
+def open_documents(name: str) -> Documents:
+    """Return where this user's ``machines`` or ``identifications`` lie.
+
+    A folder, unless STILLPATH_DATABASE_URL names a PostgreSQL database.
+    """
+    from service.machines.documents import DocumentFolder
+
+    if _settings().database_url is not None:
+        from service.database import documents, engine
+
+        settings = _service_settings()
+        if engine.database_url(settings).get_backend_name() != "sqlite":
+            # Without a pool nothing is left open behind a command.
+            return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
+    return DocumentFolder(data_dir() / name)
 
 
 def data_dir() -> Path:
@@ -350,13 +373,24 @@ def who(by: str | None) -> str:
 
 
 def _settings() -> MachineSettings:
+    from service.machines.settings import MachineSettings
+
+    return _checked(MachineSettings.from_environment)
+
+
+def _service_settings() -> Settings:
+    from service.settings import Settings
+
+    return _checked(Settings)
+
+
+def _checked(make: Callable[[], _Made]) -> _Made:
     from pydantic import ValidationError
 
     from models.store import explain
-    from service.machines.settings import MachineSettings
 
     try:
-        return MachineSettings.from_environment()
+        return make()
     except ValidationError as error:
         raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
 

@@ -21,6 +21,8 @@ class MachineSettings(BaseModel):
     ----------
     data_dir : Path, optional
         Machines lie in its folder `machines`; by default in the user's folder for data.
+    database_url : str, optional
+        Of a PostgreSQL database, in which machines lie instead.
     require_approval : bool
         Jobs use approved revisions of machines only.
     measurement_max_age_days : float
@@ -30,6 +32,7 @@ class MachineSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     data_dir: Path | None = None
+    database_url: str | None = None
     require_approval: bool = False
     measurement_max_age_days: Annotated[float, Field(gt=0)] = 180.0
 
