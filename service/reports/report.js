@@ -166,7 +166,7 @@
       const width = canvas.parentElement.clientWidth;
       const height = Math.round(Math.min(Math.max(width * Math.min(tall / wide, 1.1), 200), 560));
       const dots = window.devicePixelRatio || 1;
-      canvas.style.height = height + "px";
+      canvas.style.aspectRatio = width + " / " + height;  // on paper it becomes narrower
       canvas.width = width * dots; canvas.height = height * dots;
       const pen = canvas.getContext("2d"), to = place(canvas), error = view.error[name] || [];
       pen.scale(dots, dots);
@@ -210,7 +210,8 @@
       $("layer-name").textContent = `${view.layer}, z ${view.z} mm`;
       slider.setAttribute("aria-valuetext", `layer ${view.layer}, z ${view.z} millimetres`);
       $("left-name").textContent = label.before || "before";
-      $("right-name").textContent = choices.length > 1 ? "" : label[shown];
+      $("right-name").textContent = label[shown];
+      $("right-name").className = choices.length > 1 ? "paper" : "";  // the buttons say it
       paint(left, view, "before");
       if (shown) paint(right, view, shown);
       legend();

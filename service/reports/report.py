@@ -17,6 +17,7 @@ import numpy as np
 
 from gcode.slicers.features import feature_title
 from service.pipeline.result import Channel, GroupFigures, Result
+from service.reports.figures import spectrum_figures
 from service.reports.pages import asset, content_hash, rendered, write_texts
 
 __all__ = ["render_report", "write_report"]
@@ -71,6 +72,7 @@ def render_report(result: Result) -> str:
         rows=_rows(result.channels),
         features=features[:_FEATURES_SHOWN],
         widest=_widest(features),
+        spectra=spectrum_figures(result),
         put_back=result.put_back[:_PUT_BACK_SHOWN],
         script=script,
         script_hash=content_hash(script),
