@@ -1,4 +1,4 @@
-"""What all tests share: quiet numerical libraries, and the folder of shared test data."""
+"""What all tests share: quiet numerical libraries, the folder of shared test data, PostgreSQL."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ import tempfile
 from pathlib import Path
 
 import pytest
+
+from tests.service.database.postgres import MISSING as _NO_POSTGRESQL
+from tests.service.database.postgres import is_installed, postgres_server, postgres_url
+
+__all__ = ["postgres_server", "postgres_url", "shared_dir"]
 
 # Before numpy and numba are imported anywhere.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -39,29 +44,38 @@ def shared_dir() -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give the marker to whatever uses the fixture, so that `-m shared` finds all of them."""
     for item in items:
-        if "shared_dir" in getattr(item, "fixturenames", ()):
+        names = getattr(item, "fixturenames", ())
+        if "shared_dir" in names:
             item.add_marker("shared")
+        if "postgres_server" in names:
+            item.add_marker("postgresql")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Judge the marker, whichever way a test finds its data."""
-    if item.get_closest_marker("shared") is not None and _shared() is None:
-        if _in_ci():
-            pytest.fail(_MISSING)
-        pytest.skip(_MISSING)
+    """Judge the markers, whichever way a test finds its data."""
+    for marker, is_there, missing in (
+        ("shared", lambda: _shared() is not None, _MISSING),
+        ("postgresql", is_installed, _NO_POSTGRESQL),
+    ):
+        if item.get_closest_marker(marker) is not None and not is_there():
+            if _in_ci():
+                pytest.fail(missing)
+            pytest.skip(missing)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Say it loudly when a part of the evidence was left out."""
-    skipped = [
-        report
-        for report in terminalreporter.getreports("skipped")
-        if "no shared test data" in str(report.longrepr).lower()
-    ]
-    if skipped:
-        terminalreporter.write_line(
-            f"NOT CHECKED: {len(skipped)} tests need the shared test data (STILLPATH_SHARED)",
-            yellow=True,
-            bold=True,
-        )
+    for missing, need in (
+        (_MISSING, "the shared test data (STILLPATH_SHARED)"),
+        (_NO_POSTGRESQL, "PostgreSQL"),
+    ):
+        skipped = [
+            report
+            for report in terminalreporter.getreports("skipped")
+            if missing in str(report.longrepr)
+        ]
+        if skipped:
+            terminalreporter.write_line(
+                f"NOT CHECKED: {len(skipped)} tests need {need}", yellow=True, bold=True
+            )

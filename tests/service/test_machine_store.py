@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from datetime import UTC, date, datetime
 from pathlib import Path
 
@@ -19,6 +20,8 @@ import pytest
 
 from models.errors import ModelError
 from models.store import builtin_machines, load_machine
+from service.database.documents import DocumentTable
+from service.database.engine import open_database
 from service.machines.diff import diff
 from service.machines.resolve import PinnedMachine, Resolver, user_data_dir
 from service.machines.revision import (
@@ -29,6 +32,7 @@ from service.machines.revision import (
 )
 from service.machines.store import MachineStore
 from service.machines.transfer import export_history, import_file
+from service.settings import Settings
 from tests.service.machines import make_machine, make_plants, with_accel
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,28 +44,42 @@ def store(tmp_path: Path) -> MachineStore:
     return MachineStore(tmp_path / "machines")
 
 
+@pytest.fixture(
+    params=["folder", "sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)]
+)
+def any_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[MachineStore]:
+    """A store of each kind: in files, and in both databases."""
+    if request.param == "folder":
+        yield MachineStore(tmp_path / "machines")
+        return
+    url = request.getfixturevalue("postgres_url") if request.param == "postgresql" else None
+    engine = open_database(Settings(data_dir=tmp_path, database_url=url))
+    yield MachineStore(DocumentTable(engine, "machines"))
+    engine.dispose()
+
+
 def files_of(store_root: Path) -> list[str]:
     return sorted(str(p.relative_to(store_root)) for p in store_root.rglob("*") if p.is_file())
 
 
-def test_a_revision_remembers_who_when_why_and_from_what(store: MachineStore):
+def test_a_revision_remembers_who_when_why_and_from_what(any_store: MachineStore):
     source = source_file("raw_data_x.csv", b"#time,accel_x\n")
-    made = store.add_revision(
+    made = any_store.add_revision(
         "mine", make_machine(), author="anna", message="first", sources=[source], when=MARCH
     )
-    assert store.current("mine") == made
+    assert any_store.current("mine") == made
     assert (made.number, made.parent, made.author, made.message) == (1, None, "anna", "first")
     assert made.when == MARCH
     # Of `printf '#time,accel_x\n' | sha256sum`.
     assert made.sources[0].sha256.startswith("7ebf24107606")
     assert made.machine == make_machine()
-    assert store.names() == ["mine"]
+    assert any_store.names() == ["mine"]
 
 
-def test_the_same_machine_again_is_no_change(store: MachineStore):
-    first = store.add_revision("mine", make_machine(), author="anna")
-    assert store.add_revision("mine", make_machine(), author="bob") == first
-    assert len(store.history("mine")) == 1
+def test_the_same_machine_again_is_no_change(any_store: MachineStore):
+    first = any_store.add_revision("mine", make_machine(), author="anna")
+    assert any_store.add_revision("mine", make_machine(), author="bob") == first
+    assert len(any_store.history("mine")) == 1
 
 
 def test_history_is_never_rewritten(store: MachineStore, tmp_path: Path):
@@ -81,64 +99,64 @@ def test_history_is_never_rewritten(store: MachineStore, tmp_path: Path):
     ]
 
 
-def test_a_change_on_an_old_state_is_refused(store: MachineStore):
-    store.add_revision("mine", make_machine(), author="anna", expected=0)
+def test_a_change_on_an_old_state_is_refused(any_store: MachineStore):
+    any_store.add_revision("mine", make_machine(), author="anna", expected=0)
     with pytest.raises(Conflict, match="already"):
-        store.add_revision("mine", make_machine(), author="bob", expected=0)
-    store.add_revision("mine", with_accel(make_machine(), 3e3), author="bob", expected=1)
+        any_store.add_revision("mine", make_machine(), author="bob", expected=0)
+    any_store.add_revision("mine", with_accel(make_machine(), 3e3), author="bob", expected=1)
     with pytest.raises(Conflict, match=r"revision 2, not 1 .* diff mine 1 2"):
-        store.add_revision("mine", with_accel(make_machine(), 4e3), author="eve", expected=1)
-    assert len(store.history("mine")) == 2
+        any_store.add_revision("mine", with_accel(make_machine(), 4e3), author="eve", expected=1)
+    assert len(any_store.history("mine")) == 2
 
 
-def test_update_axis_leaves_everything_else(store: MachineStore):
-    store.add_revision("mine", with_accel(make_machine(), 7777.0), author="anna")
+def test_update_axis_leaves_everything_else(any_store: MachineStore):
+    any_store.add_revision("mine", with_accel(make_machine(), 7777.0), author="anna")
     plants = make_plants(49.8, on=date(2026, 3, 2))
-    before = store.current("mine").machine
-    after = store.update_axis("mine", {"x": plants}, author="bob", message="measured").machine
+    before = any_store.current("mine").machine
+    after = any_store.update_axis("mine", {"x": plants}, author="bob", message="measured").machine
     assert after.axes["x"] == plants
     assert after.axes["y"] == before.axes["y"]
     assert {change.place.split(".")[1] for change in diff(before, after)} == {"x"}
     with pytest.raises(UnknownMachine, match="other"):
-        store.update_axis("other", {"x": plants}, author="bob")
-    assert store.names() == ["mine"]
+        any_store.update_axis("other", {"x": plants}, author="bob")
+    assert any_store.names() == ["mine"]
 
 
 @pytest.mark.parametrize("name", builtin_machines())
-def test_names_of_built_in_machines_are_reserved(store: MachineStore, name: str):
+def test_names_of_built_in_machines_are_reserved(any_store: MachineStore, name: str):
     with pytest.raises(Conflict, match="built-in"):
-        store.add_revision(name, load_machine(name), author="anna")
+        any_store.add_revision(name, load_machine(name), author="anna")
 
 
 @pytest.mark.parametrize("name", ["", "..", "../x", "a/b", "Mine", "x" * 65, ".trash", "mine\n"])
-def test_what_cannot_be_a_name(store: MachineStore, name: str):
-    assert name not in store
+def test_what_cannot_be_a_name(any_store: MachineStore, name: str):
+    assert name not in any_store
     with pytest.raises(ModelError, match="cannot be a machine's name"):
-        store.add_revision(name, make_machine(), author="anna")
+        any_store.add_revision(name, make_machine(), author="anna")
     with pytest.raises(UnknownMachine):
-        store.current(name)
+        any_store.current(name)
 
 
-def test_a_machine_keeps_its_name(store: MachineStore):
+def test_a_machine_keeps_its_name(any_store: MachineStore):
     with pytest.raises(ModelError, match="'mine', not 'yours'"):
-        store.add_revision("yours", make_machine("mine"), author="anna")
-    assert store.names() == []
+        any_store.add_revision("yours", make_machine("mine"), author="anna")
+    assert any_store.names() == []
 
 
-def test_approval(store: MachineStore):
-    store.add_revision("mine", with_accel(make_machine(), 3e3), author="anna")
-    store.add_revision("mine", with_accel(make_machine(), 4e3), author="anna")
-    assert store.usable("mine", require_approval=False).number == 2
+def test_approval(any_store: MachineStore):
+    any_store.add_revision("mine", with_accel(make_machine(), 3e3), author="anna")
+    any_store.add_revision("mine", with_accel(make_machine(), 4e3), author="anna")
+    assert any_store.usable("mine", require_approval=False).number == 2
     with pytest.raises(NotApproved, match=r"approve mine --revision 2"):
-        store.usable("mine", require_approval=True)
-    made = store.approve("mine", 1, author="bob", when=MARCH)
-    assert store.approve("mine", 1, author="eve") == made
-    assert store.usable("mine", require_approval=True).number == 1
-    store.approve("mine", 2, author="bob")
-    store.add_revision("mine", with_accel(make_machine(), 5e3), author="anna")
-    assert store.usable("mine", require_approval=True).number == 2
+        any_store.usable("mine", require_approval=True)
+    made = any_store.approve("mine", 1, author="bob", when=MARCH)
+    assert any_store.approve("mine", 1, author="eve") == made
+    assert any_store.usable("mine", require_approval=True).number == 1
+    any_store.approve("mine", 2, author="bob")
+    any_store.add_revision("mine", with_accel(make_machine(), 5e3), author="anna")
+    assert any_store.usable("mine", require_approval=True).number == 2
     with pytest.raises(UnknownMachine, match="no revision 9; it has 1 to 3"):
-        store.approve("mine", 9, author="bob")
+        any_store.approve("mine", 9, author="bob")
 
 
 def test_an_approval_holds_for_the_very_machine_only(store: MachineStore, tmp_path: Path):
@@ -150,28 +168,28 @@ def test_an_approval_holds_for_the_very_machine_only(store: MachineStore, tmp_pa
         store.usable("mine", require_approval=True)
 
 
-def test_delete_can_be_undone(store: MachineStore):
+def test_delete_can_be_undone(any_store: MachineStore):
     for accel in (3e3, 4e3):
-        store.add_revision("mine", with_accel(make_machine(), accel), author="anna", when=MARCH)
-    store.approve("mine", 1, author="bob")
-    history, approvals = store.history("mine"), store.approvals("mine")
-    store.delete("mine")
-    assert store.names() == []
+        any_store.add_revision("mine", with_accel(make_machine(), accel), author="anna", when=MARCH)
+    any_store.approve("mine", 1, author="bob")
+    history, approvals = any_store.history("mine"), any_store.approvals("mine")
+    any_store.delete("mine")
+    assert any_store.names() == []
     with pytest.raises(UnknownMachine):
-        store.current("mine")
-    assert store.restore("mine") == history[-1]
-    assert (store.history("mine"), store.approvals("mine")) == (history, approvals)
+        any_store.current("mine")
+    assert any_store.restore("mine") == history[-1]
+    assert (any_store.history("mine"), any_store.approvals("mine")) == (history, approvals)
 
 
-def test_the_last_one_deleted_comes_back(store: MachineStore):
+def test_the_last_one_deleted_comes_back(any_store: MachineStore):
     for author in ("anna", "bob"):
-        store.add_revision("mine", make_machine(), author=author)
-        store.delete("mine")
-    assert store.restore("mine").author == "bob"
+        any_store.add_revision("mine", make_machine(), author=author)
+        any_store.delete("mine")
+    assert any_store.restore("mine").author == "bob"
     with pytest.raises(Conflict, match="already"):
-        store.restore("mine")
+        any_store.restore("mine")
     with pytest.raises(UnknownMachine, match="trash"):
-        store.restore("other")
+        any_store.restore("other")
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,6 @@ from sqlalchemy import Engine
 
 from service.database.engine import open_database
 from service.settings import Settings
-from tests.service.database.postgres import postgres_server, postgres_url
-
-__all__ = ["postgres_server", "postgres_url"]
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])

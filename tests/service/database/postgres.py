@@ -1,11 +1,9 @@
 """A PostgreSQL server for the tests, of the programs that are installed.
 
-Fixtures, for use in any test module or `conftest.py`::
-
-    from tests.service.database.postgres import postgres_server, postgres_url
-
-`postgres_server` runs for the whole session; `postgres_url` is a new, empty database for each
-test. `PostgresServer` is for tests that stop or kill a server of their own.
+`tests/conftest.py` offers the fixtures to all: `postgres_server` runs for the whole session,
+`postgres_url` is a new, empty database for each test, `PostgresServer` is for tests that stop or
+kill a server of their own. Tests that ask for them by `getfixturevalue` carry the marker
+`postgresql`; all others are given it.
 """
 
 from __future__ import annotations
@@ -22,10 +20,9 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
-import psycopg
 import pytest
 
-__all__ = ["MISSING", "PostgresServer", "postgres_server", "postgres_url"]
+__all__ = ["MISSING", "PostgresServer", "is_installed", "postgres_server", "postgres_url"]
 
 MISSING = "no PostgreSQL: install Debian's `postgresql`, or put its initdb and postgres on the PATH"
 
@@ -64,6 +61,8 @@ class PostgresServer:
 
     def start(self) -> None:
         """Start it and wait until it answers."""
+        import psycopg  # not before it is needed: every test run comes by here
+
         assert self._programs is not None
         assert self._process is None
         arguments = ["-D", str(self.folder / "data"), "-p", str(self.port), "-k", str(self.folder)]
@@ -96,6 +95,8 @@ class PostgresServer:
 
     def new_database(self) -> str:
         """Make an empty database and return its address for STILLPATH_DATABASE_URL."""
+        import psycopg
+
         name = f"t{uuid.uuid4().hex[:12]}"
         with psycopg.connect(self._dsn("postgres"), autocommit=True) as connection:
             connection.execute(f"CREATE DATABASE {name}".encode())
@@ -103,6 +104,8 @@ class PostgresServer:
 
     def drop_database(self, url: str) -> None:
         """Drop a database and whoever is connected to it."""
+        import psycopg
+
         name = url.rpartition("/")[2]
         with psycopg.connect(self._dsn("postgres"), autocommit=True) as connection:
             connection.execute(f"DROP DATABASE {name} WITH (FORCE)".encode())
@@ -111,13 +114,15 @@ class PostgresServer:
         return f"host=127.0.0.1 port={self.port} user=stillpath dbname={database} connect_timeout=5"
 
 
+def is_installed() -> bool:
+    """Return whether there is a PostgreSQL to run."""
+    return _programs() is not None
+
+
 @pytest.fixture(scope="session")
 def postgres_server() -> Iterator[PostgresServer]:
-    """Run a server for the session; skips where PostgreSQL is not installed."""
-    if _programs() is None:
-        if os.environ.get("CI", "").lower() in ("1", "true", "yes"):
-            pytest.fail(MISSING)
-        pytest.skip(MISSING)
+    """Run a server for the session."""
+    assert is_installed(), MISSING  # a test is stopped before, by its marker
     folder = Path(tempfile.mkdtemp(prefix="sp-pg-"))
     folder.chmod(0o755)
     server = PostgresServer(folder / "server")
