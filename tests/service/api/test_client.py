@@ -1,0 +1,324 @@
+"""The client, and the command line that uses it, against a real server."""
+
+from __future__ import annotations
+
+import http.server
+import json
+import os
+import signal
+import socketserver
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.client import Client, ClientError
+from tests.service.test_server import PRETEND, ROOT, server, until
+
+STILLPATH = [sys.executable, "-c", "from service.cli import main; main()"]
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with server(PRETEND, tmp_path_factory.mktemp("data")) as (http_client, _):
+        yield str(http_client.base_url).rstrip("/")
+
+
+@pytest.fixture
+def client(address: str) -> Iterator[Client]:
+    with Client(address) as opened:
+        yield opened
+
+
+def part(folder: Path, content: str) -> Path:
+    path = folder / "part.gcode"
+    path.write_text(content)
+    return path
+
+
+def test_from_file_to_file(client: Client, tmp_path: Path):
+    source = part(tmp_path, "nap 1\nG1 X1\n")
+    told: list[Any] = []
+    made = client.submit(source, machine="ender3", tell=lambda stage, share: told.append(stage))
+    assert made.is_new
+    states: list[str] = []
+    job = client.result_of(made, tell=lambda job: states.append(job.state.value))
+    assert states[-1] == "done"
+    target = client.fetch(job, tmp_path / "out.gcode", tell=lambda stage, _: told.append(stage))
+    assert target.read_text() == "; compensated\nnap 1\nG1 X1\n"
+    assert {"sending", "fetching"} <= set(told)
+    assert client.report(job.id)["machine"] == "ender3"
+    folder = client.save_report(job.id, tmp_path / "report")
+    assert {path.name for path in folder.iterdir()} == {"report.html", "report.json"}
+    assert not client.submit(source, machine="ender3").is_new
+    assert job.id in [each.id for each in client.jobs(state=["done"], limit=1)]
+    assert "ender3" in [machine["name"] for machine in client.machines()]
+    assert client.machine("ender3")["name"] == "ender3"
+    client.delete(job.id)
+    client.delete(job.id)
+    with pytest.raises(ClientError, match="no job") as caught:
+        client.job(job.id)
+    assert (caught.value.status, caught.value.is_refused) == (404, True)
+    assert {p.name for p in tmp_path.iterdir()} == {"part.gcode", "out.gcode", "report"}
+
+
+@pytest.mark.parametrize(
+    ("content", "machine", "words", "refused"),
+    [
+        ("bad\n", "ender3", "line 7|X1e400", True),
+        ("crash\n", "ender3", "RuntimeError", False),
+        ("G1 X1\n", "nope", "nope", True),
+        ("", "ender3", "no bytes", True),
+    ],
+)
+def test_why_it_was_not_done(
+    client: Client, tmp_path: Path, content: str, machine: str, words: str, refused: bool
+):
+    with pytest.raises(ClientError, match=words) as caught:
+        client.result_of(client.submit(part(tmp_path, content), machine=machine))
+    assert caught.value.is_refused == refused
+    assert caught.value.problem["title"]
+
+
+def test_cancelling_and_giving_up(client: Client, tmp_path: Path):
+    made = client.submit(part(tmp_path, "slow\n"), machine="ender3")
+    with pytest.raises(ClientError, match="given up"):
+        client.wait(made.id, timeout_s=0.5)
+    assert client.cancel(made.id).state == "cancelled"
+    with pytest.raises(ClientError, match="cancelled"):
+        client.result_of(made)
+    with pytest.raises(ClientError, match="cancelled"):
+        client.fetch(made.id, tmp_path / "out.gcode")
+    assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]
+
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    again = client.submit(part(tmp_path, "slow\n"), machine="ender3")
+    with pytest.raises(KeyboardInterrupt):
+        client.result_of(again, tell=interrupt)
+    assert client.job(again.id).state == "cancelled"
+
+
+@pytest.mark.parametrize("address", ["nas:8000", "ftp://nas", "http://", ""])
+def test_what_is_no_address(address: str):
+    with pytest.raises(ClientError, match="http://127"):
+        Client(address)
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    answer: Callable[[Handler], None]
+
+    def _serve(self) -> None:
+        type(self).answer(self)
+
+    do_GET = do_POST = do_DELETE = _serve
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def give(self, status: int, body: bytes, **headers: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Length", headers.pop("length", str(len(body))))
+        for name, value in headers.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        self.wfile.write(body)
+
+
+@contextmanager
+def pretending(answer: Callable[[Handler], None]) -> Iterator[str]:
+    """A server that answers as told."""
+    kind = type("Told", (Handler,), {"answer": staticmethod(answer)})
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), kind) as found:
+        found.daemon_threads = True
+        thread = threading.Thread(target=found.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{found.server_address[1]}"
+        finally:
+            found.shutdown()
+            thread.join()
+
+
+def read_body(handler: Handler) -> bytes:
+    return handler.rfile.read(int(handler.headers.get("Content-Length", 0)))
+
+
+def job_document(**fields: Any) -> bytes:
+    from service.api.schemas import JobView
+
+    (example,) = JobView.model_config["json_schema_extra"]["examples"]
+    return json.dumps(example | fields).encode()
+
+
+def test_an_upload_is_repeated_with_the_same_key(tmp_path: Path):
+    keys: list[str] = []
+
+    def answer(handler: Handler) -> None:
+        assert read_body(handler) == b"G1 X1"
+        keys.append(handler.headers["Idempotency-Key"])
+        if len(keys) == 1:
+            handler.close_connection = True  # nobody knows whether it arrived
+        elif len(keys) == 2:
+            handler.give(503, b"{}", Retry_After="0")
+        else:
+            handler.give(202, job_document())
+
+    with pretending(answer) as address, Client(address) as client:
+        assert client.submit(part(tmp_path, "G1 X1"), machine="ender3").is_new
+    assert len(keys) == 3
+    assert len(set(keys)) == 1
+
+
+def test_a_broken_download_is_taken_up_again_or_told(tmp_path: Path):
+    content = b"0123456789" * 1000
+    tag = '"abc"'
+    asked: list[str | None] = []
+
+    def answer(handler: Handler) -> None:
+        asked.append(handler.headers.get("Range"))
+        if len(asked) == 1:
+            handler.give(200, content[:3000], length=str(len(content)), ETag=tag)
+            handler.close_connection = True
+        else:
+            assert handler.headers["If-Range"] == tag
+            handler.give(206, content[3000:], ETag=tag)
+
+    with pretending(answer) as address, Client(address) as client:
+        client.fetch("a" * 32, tmp_path / "out")
+    assert (tmp_path / "out").read_bytes() == content
+    assert asked == [None, "bytes=3000-"]
+
+    def damaged(handler: Handler) -> None:
+        handler.give(200, content, ETag=f'"{"0" * 64}"')
+
+    with (
+        pretending(damaged) as address,
+        Client(address) as client,
+        pytest.raises(ClientError, match="damaged"),
+    ):
+        client.fetch("a" * 32, tmp_path / "other")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_it_asks_where_events_do_not_come_through():
+    states = iter(["queued", "running", "done"])
+
+    def answer(handler: Handler) -> None:
+        if handler.path.endswith("/events"):
+            handler.give(200, b"<html>", Content_Type="text/html")
+        else:
+            handler.give(200, job_document(state=next(states)))
+
+    with pretending(answer) as address, Client(address) as client:
+        assert client.wait("a" * 32).state == "done"
+
+
+def test_strangers_and_redirections():
+    def html(handler: Handler) -> None:
+        handler.give(200, b"<html>")
+
+    strange, there = "not as a Stillpath server", r"moved to http://elsewhere\.invalid"
+    with (
+        pretending(html) as address,
+        Client(address, "sp_key") as client,
+        pytest.raises(ClientError, match=strange),
+    ):
+        client.machines()
+
+    def moved(handler: Handler) -> None:
+        handler.give(301, b"", Location="http://elsewhere.invalid/")
+
+    with (
+        pretending(moved) as address,
+        Client(address, "sp_key") as client,
+        pytest.raises(ClientError, match=there),
+    ):
+        client.machines()
+
+
+def test_a_server_that_is_away_is_given_up():
+    with pretending(lambda handler: None) as address:
+        pass
+    with Client(address, patience_s=0.3) as client, pytest.raises(ClientError) as caught:
+        client.machines()
+    assert caught.value.exit_code == 1
+    assert address in str(caught.value)
+
+
+def run(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*STILLPATH, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        timeout=300,
+        check=False,
+    )
+
+
+def test_compensate_with_a_server(address: str, tmp_path: Path):
+    source = part(tmp_path, "G1 X31\n")
+    target = tmp_path / "out.gcode"
+    chosen = ("compensate", source, "-m", "ender3", "-o", target)
+    done = run(*chosen, "--server", address, "--report", tmp_path / "report")
+    assert done.returncode == 0, done.stderr
+    assert target.read_text() == "; compensated\nG1 X31\n"
+    assert "contour rms" in done.stdout
+    assert (tmp_path / "report" / "report.html").exists()
+    source.write_text("bad\n")
+    done = run(*chosen, STILLPATH_SERVER=address)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "X1e400" in done.stderr
+    assert target.read_text() == "; compensated\nG1 X31\n"
+    done = run("jobs", "list", "--server", "nas")
+    assert (done.returncode, "http://127" in done.stderr) == (2, True)
+
+
+def test_the_commands_of_jobs(address: str, client: Client, tmp_path: Path):
+    made = client.submit(part(tmp_path, "G1 X41\n"), machine="ender3", batch="cli")
+    assert run("jobs", "wait", made.id, STILLPATH_SERVER=address).returncode == 0
+    listed = run("jobs", "list", "--batch", "cli", STILLPATH_SERVER=address)
+    assert made.id in listed.stdout
+    assert "part.gcode" in listed.stdout
+    shown = json.loads(run("jobs", "show", made.id, STILLPATH_SERVER=address).stdout)
+    assert shown["state"] == "done"
+    target = tmp_path / "got.gcode"
+    fetched = run("jobs", "fetch", made.id, "-o", target, STILLPATH_SERVER=address)
+    assert (fetched.returncode, fetched.stdout) == (0, f"{target}\n")
+    assert target.read_text() == "; compensated\nG1 X41\n"
+    late = run("jobs", "cancel", made.id, STILLPATH_SERVER=address)
+    assert (late.returncode, "nothing to cancel" in late.stderr) == (2, True)
+    assert run("jobs", "delete", made.id, STILLPATH_SERVER=address).returncode == 0
+    gone = run("jobs", "show", made.id, STILLPATH_SERVER=address)
+    assert (gone.returncode, "no job" in gone.stderr) == (2, True)
+    assert "STILLPATH_SERVER" in run("jobs", "show", made.id).stderr
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_command_cancels_its_job(
+    address: str, client: Client, tmp_path: Path, number: int, code: int
+):
+    source = part(tmp_path, f"slow {code}\n")
+    command = [*STILLPATH, "compensate", str(source), "-m", "ender3", "-o", str(tmp_path / "out")]
+    process = subprocess.Popen(
+        [*command, "--server", address],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    job = until(lambda: next(iter(client.jobs(state=["running"])), None), 120)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "interrupted" in said
+    assert until(lambda: client.job(job.id).state == "cancelled")
+    assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]

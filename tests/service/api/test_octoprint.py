@@ -1,0 +1,71 @@
+"""A slicer's "send to printer": the requests of PrusaSlicer, Cura and OrcaSlicer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient
+
+from tests.service.api.test_submitting import opened
+from tests.service.test_api import assert_problem, over, until
+
+PRINTERS = """
+[printers.left]
+kind = "octoprint"
+url = "http://127.0.0.1:9"
+machine = "ender3"
+method = "shaper:ei"
+"""
+FORM = {"select": (None, "false"), "path": (None, "")}
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "printers.toml").write_text(PRINTERS)
+    with opened(folder, printers=folder / "printers.toml") as found:
+        yield found
+
+
+def test_the_test_of_the_connection(client: TestClient):
+    for where in ("/api/version", "/printers/left/api/version", "/printers/ender3/api/version"):
+        found = client.get(where).json()
+        assert found["text"].startswith("OctoPrint")
+        assert {"api", "server"} <= found.keys()
+    assert_problem(client.get("/printers/nope/api/version"), 404, "nope", "left")
+
+
+@pytest.mark.parametrize("where", ["", "/printers/left"])
+def test_a_file_for_a_printer(client: TestClient, where: str):
+    sent = FORM | {"print": (None, "false"), "file": ("gear.gcode", b"G1 X1\n")}
+    answer = client.post(f"{where}/api/files/local", files=sent)
+    assert answer.status_code == 201, answer.text
+    found = answer.json()
+    assert found["done"] is True
+    assert found["files"]["local"]["name"] == "gear.gcode"
+    assert found["files"]["local"]["origin"] == "local"
+    assert answer.headers["location"] == f"http://localhost{found['job']}"
+    job = until(client, found["job"], over)
+    assert (job["state"], job["printer"], job["print"]) == ("done", "left", False)
+    assert job["options"]["method"] == "shaper:ei"
+
+
+def test_a_file_for_a_machine(client: TestClient):
+    sent = FORM | {"file": ("gear.gcode", b"G1 X2\n")}
+    answer = client.post("/printers/ender3/api/files/local", files=sent)
+    job = until(client, answer.json()["job"], over)
+    assert (job["machine"], job["printer"]) == ("ender3", None)
+    with_print = sent | {"print": (None, "true")}
+    refused = client.post("/printers/ender3/api/files/local", files=with_print)
+    assert_problem(refused, 422, "printer")
+
+
+def test_what_is_wrong(client: TestClient, tmp_path: Path):
+    sent = FORM | {"file": ("gear.gcode", b"G1 X2\n")}
+    assert_problem(client.post("/printers/nope/api/files/local", files=sent), 422, "nope")
+    assert_problem(client.post("/printers/left/api/files/local", files=FORM), 422, "file name")
+    assert_problem(client.post("/printers/a%0ab/api/files/local", files=sent), 404)
+    with opened(tmp_path) as alone:
+        assert_problem(alone.post("/api/files/local", files=sent), 422, "/printers/NAME")
