@@ -103,12 +103,14 @@ def revoke(
 def first(data_dir: DataDir = None) -> None:
     """Make the first key, with all scopes, before the service's first start, and print it."""
     with _opened(data_dir) as engine:
-        secret = _store(engine).create_first()
-    if secret is None:
-        raise ModelError(
-            "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` "
-            "makes another"
-        )
+        store = _store(engine)
+        secret = store.create_first()
+        if secret is None:
+            raise ModelError(
+                "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` "
+                "makes another"
+            )
+        _note(engine, "key.create", store.find(secret))
     typer.echo(secret)
 
 

@@ -18,7 +18,7 @@ _PATTERNS = (
     # Authorization and X-Api-Key as somebody may quote them.
     (
         re.compile(
-            r"((?:proxy-)?authorization|x-api-key)(['\"]?\s*[:=,]\s*b?['\"]?)"
+            r"((?:proxy-)?authorization|x-api-key)(['\"]?\s*[:=,]\s*(?:b?['\"])?)"
             r"(?:(?:bearer|basic|digest)\s+)?[^\s'\",;)]+",
             re.IGNORECASE,
         ),

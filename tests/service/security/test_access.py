@@ -1,0 +1,154 @@
+"""Keys, limits and the audit log at the application."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.api import create_app
+from service.settings import Settings
+from tests.service.runners import pretend
+
+FIRST = "sp_" + "f" * 32
+ADMIN = {"X-Api-Key": FIRST}
+WISH = {"name": "slicer", "owner": "ada", "scopes": ["read", "submit"]}
+
+
+def open_client(folder: Path, *, keys: bool = True, **settings: Any) -> TestClient:
+    given = {"requests_per_minute": 100_000, "first_key": FIRST} | settings
+    app = create_app(Settings(data_dir=folder, **given), keys_required=keys, runner=pretend)
+    return TestClient(
+        app,
+        base_url="http://localhost",
+        client=("203.0.113.7", 50000),
+        raise_server_exceptions=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    with open_client(tmp_path_factory.mktemp("data")) as opened:
+        yield opened
+
+
+def audit(client: TestClient, **query: Any) -> list[dict[str, Any]]:
+    return client.get("/v1/audit", params=query, headers=ADMIN).json()["entries"]
+
+
+def test_a_key_from_its_making_to_its_end(client: TestClient):
+    answer = client.post("/v1/keys", json=WISH | {"expires_in_days": 2}, headers=ADMIN)
+    assert answer.status_code == 201
+    assert answer.headers["cache-control"] == "no-store"
+    made = answer.json()
+    mine = {"Authorization": f"Bearer {made['key']}"}
+    assert client.get("/v1/jobs", headers=mine).status_code == 200
+    listed = client.get("/v1/keys", headers=ADMIN)
+    assert made["key"] not in listed.text
+    [shown] = [key for key in listed.json() if key["id"] == made["id"]]
+    assert shown["used_at"] is not None
+    assert (shown["owner"], shown["scopes"]) == ("ada", ["read", "submit"])
+    assert client.delete(f"/v1/keys/{made['id']}", headers=ADMIN).status_code == 204
+    refused = client.get("/v1/jobs", headers=mine)
+    assert refused.status_code == 401
+    assert "revoked" in refused.json()["detail"]
+    assert client.delete("/v1/keys/nobody", headers=ADMIN).status_code == 404
+    actions = [(row["action"], row["subject"]) for row in audit(client)]
+    assert ("key.create", made["id"]) in actions
+    assert ("key.revoke", made["id"]) in actions
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"owner": "../x"},
+        {"name": ""},
+        {"scopes": []},
+        {"scopes": ["everything"]},
+        {"expires_in_days": 0},
+        {"expires_in_days": 1e300},
+        {"more": 1},
+        {"name": "a\nb"},
+    ],
+)
+def test_odd_wishes_are_refused(client: TestClient, change: dict[str, Any]):
+    assert client.post("/v1/keys", json=WISH | change, headers=ADMIN).status_code == 422
+
+
+def test_the_audit_log_tells_who_did_what(client: TestClient):
+    mine = client.post("/v1/keys", json=WISH, headers=ADMIN).json()
+    headers = {"X-Api-Key": mine["key"]}
+    job = client.post("/v1/jobs?machine=ender3", content=b"slow", headers=headers).json()
+    assert client.post(f"/v1/jobs/{job['id']}/cancel", headers=headers).status_code == 200
+    assert client.delete(f"/v1/jobs/{job['id']}", headers=headers).status_code == 204
+    rows = {row["action"]: row for row in audit(client) if row["subject"] == job["id"]}
+    assert set(rows) == {"submit", "cancel", "delete"}
+    for row in rows.values():
+        assert (row["owner"], row["key_id"], row["remote"]) == ("ada", mine["id"], "203.0.113.7")
+    assert rows["submit"]["details"] == {
+        "machine": "ender3",
+        "revision": job["machine_revision"],
+        "source_sha256": job["source_sha256"],
+    }
+
+
+def test_changes_of_machines_are_in_the_audit_log(client: TestClient):
+    document = client.get("/v1/machines/ender3", headers=ADMIN).json() | {"name": "mine"}
+    put = client.put("/v1/machines/mine", json=document, headers=ADMIN)
+    assert put.status_code == 201
+    assert client.post("/v1/machines/mine/revisions/1/approve", headers=ADMIN).status_code == 200
+    assert client.delete("/v1/machines/mine", headers=ADMIN).status_code == 204
+    actions = [row["action"] for row in audit(client) if row["subject"] == "mine"]
+    assert actions == ["machine.delete", "machine.approve", "machine.change"]
+
+
+def test_who_was_turned_away_is_written_once_a_minute(client: TestClient):
+    for _ in range(20):
+        assert client.get("/v1/jobs", headers={"X-Api-Key": "sp_" + "z" * 32}).status_code == 401
+    rows = audit(client, action="denied", limit=1000)
+    assert 1 <= len([row for row in rows if row["details"]["why"].startswith("401")]) <= 2
+    assert "zzz" not in str(rows)
+
+
+def test_the_audit_log_has_pages(client: TestClient):
+    for _ in range(5):
+        client.post("/v1/keys", json=WISH, headers=ADMIN)
+    everything = [row["id"] for row in audit(client, limit=1000)]
+    assert everything == sorted(everything, reverse=True)
+    found: list[int] = []
+    query: dict[str, Any] = {"limit": 2}
+    while query.get("before", 1) is not None:
+        page = client.get("/v1/audit", params=query, headers=ADMIN).json()
+        found += [row["id"] for row in page["entries"]]
+        query["before"] = page["next_before"]
+    assert found == everything
+
+
+def test_requests_are_limited_but_watching_is_not(tmp_path: Path):
+    with open_client(tmp_path, requests_per_minute=20) as client:
+        job = client.post("/v1/jobs?machine=ender3", content=b"G1 X1", headers=ADMIN).json()
+        for _ in range(60):
+            assert client.get(f"/v1/jobs/{job['id']}", headers=ADMIN).status_code == 200
+        answers = [client.get("/v1/printers", headers=ADMIN) for _ in range(40)]
+        refused = [answer for answer in answers if answer.status_code == 429]
+        assert refused
+        assert int(refused[0].headers["retry-after"]) >= 1
+        # Whoever has no key is counted apart, and cannot use up what belongs to a key.
+        statuses = {client.get("/v1/printers").status_code for _ in range(60)}
+        assert statuses == {401, 429}
+        assert client.get("/healthz").status_code == 200
+
+
+def test_without_keys_this_computer_is_answered_and_a_wrong_key_is_not(tmp_path: Path):
+    with open_client(tmp_path, keys=False) as client:
+        assert client.get("/v1/jobs").status_code == 200
+        assert client.get("/v1/keys").json() == []  # no first key was made
+        assert client.get("/v1/jobs", headers={"X-Api-Key": "sp_" + "z" * 32}).status_code == 401
+        made = client.post("/v1/keys", json=WISH).json()["key"]
+        job = client.post("/v1/jobs?machine=ender3", content=b"G1 X1").json()
+        hers = {"X-Api-Key": made}
+        assert client.get(f"/v1/jobs/{job['id']}", headers=hers).status_code == 404
+        assert client.post("/v1/keys", json=WISH, headers=hers).status_code == 403
