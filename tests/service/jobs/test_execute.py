@@ -1,0 +1,220 @@
+"""One attempt, in this process: whatever happens, the row says it and the files agree."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import pytest
+
+from service.jobs import worker
+from service.jobs.state import Cancelled, Job, JobState, Lost
+from service.jobs.watch import STUCK_EXIT_CODE
+from service.jobs.worker import Workplace, execute
+from service.pipeline.progress import Progress
+from service.storage import StorageError
+from tests.service.jobs.site import Site, until
+from tests.service.runners import light
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path / "data")
+    yield site
+    site.close()
+
+
+@dataclass
+class Bench:
+    """A workplace, and what happened at it."""
+
+    site: Site
+    limits: dict[str, Any] = field(default_factory=dict)
+    reason: str | None = None
+    ends: list[int] = field(default_factory=list)
+
+    def run(self, job_id: str, runner: Any = light, storage: Any = None) -> Job:
+        workplace = Workplace(
+            self.site.settings.model_copy(update=self.limits),
+            self.site.store,
+            storage or self.site.storage,
+            self.site.data_dir / "scratch",
+            interrupted=lambda: self.reason,
+            end=self.ends.append,
+        )
+        execute(job_id, workplace, runner)
+        scratch = self.site.data_dir / "scratch"
+        assert not scratch.exists() or not list(scratch.iterdir())
+        return self.site.get(job_id)
+
+
+def test_a_job_is_done(site: Site):
+    job = Bench(site).run(site.submit("G1 X1"))
+    assert (job.state, job.attempt, job.progress) == (JobState.DONE, 1, 1.0)
+    assert job.summary["after_um"] == 20.0
+    site.check_files()
+
+
+def test_a_job_is_claimed_once(site: Site):
+    job_id = site.submit("G1 X1")
+    first = Bench(site).run(job_id)
+    assert Bench(site).run(job_id) == first
+    execute("0" * 32, Workplace(site.settings, site.store, site.storage, site.data_dir), light)
+
+
+@pytest.mark.parametrize(("word", "status"), [("bad", 422), ("crash", 500)])
+def test_a_job_that_cannot_be_done_says_why(site: Site, word: str, status: int):
+    job = Bench(site).run(site.submit(word))
+    assert job.state is JobState.FAILED
+    assert job.problem["status"] == status
+    assert "secret" not in str(job.problem)
+    site.check_files()
+
+
+def during(job_id: str, site: Site, act: Any) -> Thread:
+    thread = Thread(target=lambda: (site.running(job_id), act()))
+    thread.start()
+    return thread
+
+
+def test_a_cancel_stops_the_work(site: Site):
+    job_id = site.submit("slow")
+    thread = during(job_id, site, lambda: site.cancel(job_id))
+    assert Bench(site).run(job_id).state is JobState.CANCELLED
+    thread.join()
+    site.check_files()
+
+
+def test_a_deleted_job_stops_the_work(site: Site):
+    job_id = site.submit("slow")
+    thread = during(job_id, site, lambda: site.store.forget(job_id))
+    with pytest.raises(AssertionError):
+        Bench(site).run(job_id)
+    thread.join()
+    site.check_files()
+
+
+def test_a_lost_job_stops_and_its_files_do_not_count(site: Site):
+    job_id = site.submit("nap 1")
+    lost = Lost(1, time.time(), "test", 2, blame=True)
+    thread = during(job_id, site, lambda: site.store.apply(job_id, lost))
+    assert Bench(site).run(job_id).state is JobState.QUEUED
+    thread.join()
+    assert Bench(site).run(job_id).output == f"jobs/{job_id}/2"
+    site.check_files()
+
+
+def test_an_attempt_that_finishes_too_late_changes_nothing(site: Site):
+    job_id = site.submit("G1 X1")
+
+    def late(task: Any, progress: Any) -> dict[str, Any]:
+        summary = light(task, progress)
+        site.store.apply(job_id, Lost(1, time.time(), "test", 3))
+        other = Workplace(site.settings, site.store, site.storage, site.data_dir / "other")
+        execute(job_id, other, light)
+        return summary
+
+    job = Bench(site).run(job_id, late)
+    assert (job.state, job.output) == (JobState.DONE, f"jobs/{job_id}/2")
+    site.check_files()
+
+
+def test_a_worker_that_is_stopped_gives_its_job_back(site: Site):
+    bench = Bench(site)
+    job_id = site.submit("slow")
+    thread = during(job_id, site, lambda: setattr(bench, "reason", "the worker was stopped"))
+    job = bench.run(job_id)
+    thread.join()
+    assert (job.state, job.losses) == (JobState.QUEUED, 0)
+
+
+def test_too_long_is_a_failure_that_names_the_limit(site: Site):
+    job = Bench(site, {"max_job_s": 0.1}).run(site.submit("slow"))
+    assert job.state is JobState.FAILED
+    assert "STILLPATH_MAX_JOB_S" in job.problem["detail"]
+    site.check_files()
+
+
+def test_too_large_is_a_failure_that_names_the_limit_and_ends_the_process(site: Site):
+    bench = Bench(site, {"max_job_bytes": 10 << 20})
+    job = bench.run(site.submit("slow"))
+    assert job.state is JobState.FAILED
+    assert "STILLPATH_MAX_JOB_BYTES" in job.problem["detail"]
+    assert bench.ends == [0]
+
+
+def test_a_runner_that_does_not_listen_costs_its_process(site: Site):
+    bench = Bench(site, {"cancel_grace_s": 0.1})
+    job_id = site.submit("G1")
+
+    def deaf(task: Any, progress: Any) -> dict[str, Any]:
+        site.cancel(job_id)
+        until(lambda: bench.ends)
+        return light(task, lambda _: None)
+
+    assert bench.run(job_id, deaf).state is JobState.CANCELLED
+    assert bench.ends == [STUCK_EXIT_CODE]
+
+
+def test_progress_reaches_the_row(site: Site):
+    job_id = site.submit("G1")
+
+    def shows(task: Any, progress: Any) -> dict[str, Any]:
+        progress(Progress("measuring", 0.25, 1.0, 1.0, 9.0))
+        job = until(lambda: (job := site.get(job_id)).stage == "measuring" and job)
+        assert (job.progress, job.eta_s) == (0.25, 9.0)
+        return light(task, progress)
+
+    assert Bench(site).run(job_id, shows).state is JobState.DONE
+
+
+class _Broken:
+    """A storage that takes nothing for some time."""
+
+    def __init__(self, storage: Any, error: StorageError, times: int) -> None:
+        self._storage = storage
+        self._error = error
+        self.times = times
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._storage, name)
+
+    def put(self, key: str, file: Path) -> None:
+        if self.times > 0:
+            self.times -= 1
+            raise self._error
+        self._storage.put(key, file)
+
+
+def test_a_storage_that_is_away_for_a_moment_is_waited_for(site: Site):
+    broken = _Broken(site.storage, StorageError(5, "away", "s3://b"), 2)
+    assert Bench(site).run(site.submit("G1"), storage=broken).state is JobState.DONE
+    site.check_files()
+
+
+def test_a_storage_that_stays_away_is_the_reason_in_the_end(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(worker, "_PATIENCE_S", 0.0)
+    broken = _Broken(site.storage, StorageError(5, "away", "s3://b"), 99)
+    job_id = site.submit("G1")
+    assert Bench(site).run(job_id, storage=broken).state is JobState.QUEUED
+    job = Bench(site).run(job_id, storage=broken)
+    assert job.state is JobState.FAILED
+    assert "away" in job.problem["detail"]
+
+
+def test_a_full_disk_is_not_waited_for(site: Site):
+    broken = _Broken(site.storage, StorageError(28, "No space left", "/"), 1)
+    job = Bench(site).run(site.submit("G1"), storage=broken)
+    assert (job.state, job.problem["status"]) == (JobState.FAILED, 507)
+    site.check_files()
+
+
+def test_a_cancel_of_a_job_that_is_over_is_too_late(site: Site):
+    job = Bench(site).run(site.submit("G1"))
+    assert site.store.apply(job.id, Cancelled(time.time())) is None

@@ -1,0 +1,218 @@
+"""One computer, real processes, and what can happen to them: no job is lost, none is done twice."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from service.database.engine import DatabaseAway
+from service.jobs.state import JobState
+from tests.service.jobs.site import ROOT, Process, Site, until
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(os.name != "posix", reason="kills processes"),
+]
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path / "data")
+    yield site
+    site.close()
+
+
+def worker_pid(site: Site, job_id: str) -> int:
+    return int(site.running(job_id).worker.rsplit(":", 1)[1])
+
+
+def test_a_worker_that_is_killed_costs_its_job_one_attempt(site: Site):
+    with site.work() as process:
+        job_id, other = site.submit("slow-once 1"), site.submit("G1")
+        os.kill(worker_pid(site, job_id), signal.SIGKILL)
+        job = site.ended(job_id)
+        assert (job.state, job.attempt, job.losses) == (JobState.DONE, 2, 1)
+        assert site.ended(other).attempt == 1
+        assert process.family()
+    site.check_files()
+
+
+def test_a_job_that_kills_every_worker_fails_and_the_others_go_on(site: Site):
+    with site.work():
+        killer, other = site.submit("die"), site.submit("G1")
+        job = site.ended(killer)
+        assert (job.state, job.attempt) == (JobState.FAILED, 2)
+        assert "its process ended" in job.problem["detail"]
+        assert site.ended(other).state is JobState.DONE
+    site.check_files()
+
+
+def test_a_service_that_is_killed_takes_its_workers_along_and_its_jobs_up_again(site: Site):
+    with site.work() as first:
+        job_id, waiting = site.submit("slow-once 1"), site.submit("G1")
+        site.running(job_id)
+        family = first.family()
+        first.kill()
+        until(lambda: not any(_lives(process) for process in family))
+        assert site.get(job_id).state is JobState.RUNNING
+    with site.work():
+        job = site.ended(job_id)
+        assert (job.state, job.attempt, job.losses) == (JobState.DONE, 2, 0)
+        assert site.ended(waiting).state is JobState.DONE
+    site.check_files()
+
+
+@pytest.mark.parametrize("to", ["service", "everybody"])
+def test_a_service_that_is_stopped_gives_its_jobs_back(site: Site, to: str):
+    with site.work() as first:
+        job_id = site.submit("slow-once 1")
+        site.running(job_id)
+        family = first.family()
+        if to == "everybody":  # as a supervisor does
+            for process in family:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.send_signal(signal.SIGTERM)
+        assert first.stop() == 0
+        assert not any(_lives(process) for process in family)
+        job = site.get(job_id)
+        assert (job.state, job.losses) == (JobState.QUEUED, 0)
+    with site.work():
+        assert site.ended(job_id).state is JobState.DONE
+    site.check_files()
+
+
+def test_a_cancel_frees_the_worker_and_a_deaf_one_is_ended(site: Site):
+    with site.work(cancel_grace_s=1.0):
+        slow = site.submit("slow")
+        pid = worker_pid(site, slow)
+        site.cancel(slow)
+        following = site.submit("G1")
+        job = site.ended(following)
+        assert (job.state, worker_pid_of(job.worker)) == (JobState.DONE, pid)
+        deaf = site.submit("deaf")
+        site.running(deaf)
+        site.cancel(deaf)
+        following = site.submit("G1")
+        job = site.ended(following)
+        assert (job.state, job.attempt) == (JobState.DONE, 1)
+        assert worker_pid_of(job.worker) != pid
+        assert site.get(deaf).state is JobState.CANCELLED
+    site.check_files()
+
+
+def test_limits_end_a_job_and_nothing_else(site: Site):
+    with site.work(max_job_s=2.0, cancel_grace_s=1.0, max_job_bytes=400 << 20):
+        ids = [site.submit(text) for text in ("deaf", "grow 600", "G1")]
+        long, large, good = (site.ended(job_id) for job_id in ids)
+        assert "STILLPATH_MAX_JOB_S" in long.problem["detail"]
+        assert "STILLPATH_MAX_JOB_BYTES" in large.problem["detail"]
+        assert good.state is JobState.DONE
+    site.check_files()
+
+
+def test_silence_is_a_loss(site: Site):
+    with site.work(heartbeat_timeout_s=2.0, max_attempts=3):
+        job_id = site.submit("slow-once 1")
+        pid = worker_pid(site, job_id)
+        os.kill(pid, signal.SIGSTOP)  # neither dead nor alive
+        until(lambda: site.get(job_id).state is JobState.QUEUED)
+        os.kill(pid, signal.SIGCONT)
+        job = site.ended(job_id)
+        assert (job.state, job.losses) == (JobState.DONE, 1)
+    site.check_files()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounts a small disk")
+def test_a_full_disk_fails_jobs_with_a_reason_and_spoils_nothing(tmp_path: Path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(disk)], check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("may not mount")
+    try:
+        site = Site(disk / "data")
+        try:
+            with site.work():
+                small, large = site.submit("G1"), site.submit("long 100")
+                after = site.submit("G1")
+                assert site.ended(small).state is JobState.DONE
+                job = site.ended(large)
+                assert (job.state, job.problem["status"]) == (JobState.FAILED, 507)
+                assert "free space" in job.problem["detail"]
+                assert site.ended(after).state is JobState.DONE
+            site.check_files()
+        finally:
+            site.close()
+    finally:
+        subprocess.run(["umount", "--lazy", str(disk)], check=True)
+
+
+def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
+    """Kill and start the service again and again, while jobs come in."""
+    ids: list[str] = []
+    stop = threading.Event()
+
+    def submit() -> None:
+        while not stop.is_set() and len(ids) < 40:
+            with contextlib.suppress(DatabaseAway):
+                ids.append(site.submit("nap 0.15"))
+            time.sleep(0.2)
+
+    submitter = threading.Thread(target=submit)
+    submitter.start()
+    try:
+        for n in range(3):
+            with site.work(workers=2) as process:
+                done = site.store.counts()[JobState.DONE]
+                until(lambda done=done: site.store.counts()[JobState.DONE] > done + 2)
+                time.sleep(0.05 * n)
+                process.kill()
+    finally:
+        stop.set()
+        submitter.join()
+    with site.work(workers=2):
+        for job_id in ids:
+            assert site.ended(job_id).state is JobState.DONE
+    site.check_files()
+
+
+def test_the_real_road_survives_the_death_of_its_worker(site: Site):
+    source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
+    main = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
+    with site.process(main) as process:
+        job_id = site.submit(source.read_text())
+        job = until(lambda: (j := site.running(job_id)).stage == "compensating" and j)
+        os.kill(worker_pid_of(job.worker), signal.SIGKILL)
+        job = site.ended(job_id, 600)
+        assert (job.state, job.attempt) == (JobState.DONE, 2), job.problem
+        assert job.summary["after_um"] < job.summary["before_um"]
+        assert _is_alive(process)
+    names = {stat.key.split("/", 3)[3] for stat in site.storage.list(f"{job.output}/")}
+    assert names > {"report/report.html", "report/report.json", f"result/{job.result_name}"} - {""}
+
+
+def worker_pid_of(name: str | None) -> int:
+    assert name is not None
+    return int(name.rsplit(":", 1)[1])
+
+
+def _lives(process: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    return False
+
+
+def _is_alive(process: Process) -> bool:
+    return psutil.pid_exists(process.pid)

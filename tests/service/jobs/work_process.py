@@ -1,0 +1,29 @@
+"""What an API process does besides answering: `python work_process.py RUNNER`."""
+
+import signal
+import sys
+import threading
+
+if __name__ == "__main__":
+    from service.database.engine import open_database
+    from service.environment import prepare_environment
+    from service.jobs.store import JobStore
+    from service.jobs.work import Work
+    from service.logs import configure_logging
+    from service.settings import Settings
+    from service.storage.opened import open_storage
+    from tests.service import runners
+
+    prepare_environment()
+    configure_logging()
+    settings = Settings()
+    engine = open_database(settings)
+    work = Work(settings, JobStore(engine), open_storage(settings), getattr(runners, sys.argv[1]))
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    work.start()
+    print("working", flush=True)
+    ended.wait()
+    work.stop()
+    engine.dispose()
