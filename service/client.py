@@ -447,7 +447,7 @@ class Client:
                 download.tag = answer.headers.get("etag")
                 expected = have + int(answer.headers.get("content-length", -1 - have))
                 try:
-                    for chunk in answer.iter_raw(_CHUNK_BYTES):
+                    for chunk in answer.iter_raw():  # as it comes: what came is kept
                         file.write(chunk)
                         download.digest.update(chunk)
                         if tell is not None:

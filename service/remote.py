@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -222,6 +223,7 @@ def _print_figures(report: dict[str, Any]) -> None:
     from service.console import print_result
     from service.pipeline.result import Result
 
+    report["track"] = _numbers(report.get("track"))
     try:
         result = Result.model_validate(report)
     except ValidationError:
@@ -232,3 +234,12 @@ def _print_figures(report: dict[str, Any]) -> None:
 
 def _runs(job: JobView) -> bool:
     return job.state.value == "running"
+
+
+def _numbers(read: Any) -> Any:
+    """Turn null into NaN, which is how JSON writes it."""
+    if isinstance(read, dict):
+        return {name: _numbers(value) for name, value in read.items()}
+    if isinstance(read, list):
+        return [_numbers(value) for value in read]
+    return math.nan if read is None else read

@@ -19,6 +19,15 @@ __all__ = ["router"]
 _RETRY = b"retry: 1000\n\n"
 _HEARTBEAT_S = 15
 _SEND_TIMEOUT_S = 30
+_SCHEMA = {
+    "type": "object",
+    "properties": {
+        "event": {"type": "string", "enum": ["job", "gone"]},
+        "id": {"type": "string"},
+        "data": {"type": "string", "description": "A `JobView` as JSON."},
+        "retry": {"type": "integer"},
+    },
+}
 _EXAMPLE = """\
 retry: 1000
 
@@ -39,7 +48,7 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
             "description": "An event `job` for every change, with the job as `GET /v1/jobs/{id}` "
             "shows it; the stream ends with the job. `gone`: it was deleted.",
             "content": {
-                "text/event-stream": {"schema": {"type": "string"}, "example": _EXAMPLE},
+                "text/event-stream": {"schema": _SCHEMA, "example": _EXAMPLE},
             },
         },
         **responses(404),

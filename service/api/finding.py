@@ -48,7 +48,9 @@ async def find_done(request: Request, job_id: str, caller: Caller) -> Job:
             raise Problem(409, "The job failed", f"There is no result: {why}", error=job.problem)
         case JobState.CANCELLED:
             raise Problem(
-                409, "The job was cancelled", "There is no result; hand the file in again."
+                409,
+                "The job was cancelled",
+                "The job was cancelled, so there is no result; hand the file in again.",
             )
         case _:
             raise Problem(

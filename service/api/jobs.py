@@ -34,7 +34,7 @@ def upload_body(required_form: bool = False) -> dict[str, object]:
             "required": ["file"],
             "properties": {
                 "file": {"type": "string", "format": "binary"},
-                "print": {"type": "string", "enum": ["true", "false"]},
+                "print": {"type": "string", "examples": ["true", "false"]},
             },
         }
     }

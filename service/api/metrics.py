@@ -40,6 +40,7 @@ router = APIRouter(tags=["health"])
         200: {"content": {"text/plain": {"example": 'stillpath_jobs{state="queued"} 0.0\n'}}},
         **responses(401, 403, 429),
     },
+    openapi_extra={"security": [{"bearer": []}, {"key": []}, {}]},
     summary="Figures for Prometheus",
 )
 async def read_metrics(request: Request, _: Operator) -> Response:

@@ -14,6 +14,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
+from starlette.routing import Match
 
 from service.database.engine import DatabaseAway
 from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
@@ -21,6 +22,7 @@ from service.storage.base import StorageError
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
 
+_METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _SHOWN = 200
 """Characters of a wrong value that are repeated."""
@@ -75,10 +77,13 @@ def install(app: FastAPI) -> None:
     async def _http(request: Request, error: HTTPException) -> Response:
         title = HTTPStatus(error.status_code).phrase
         detail = str(error.detail)
+        headers = dict(error.headers or {})
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            headers["Allow"] = _allowed(request)
         if detail == title:
             called = f"{request.method} {request.url.path}"
             detail = f"{called}: {title.lower()}; /openapi.json lists what there is."
-        return problem_response(problem(error.status_code, title, detail), error.headers)
+        return problem_response(problem(error.status_code, title, detail), headers)
 
     @app.exception_handler(DatabaseAway)
     async def _no_database(request: Request, error: DatabaseAway) -> Response:
@@ -125,6 +130,16 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         }
         for status in statuses
     }
+
+
+def _allowed(request: Request) -> str:
+    """Return the methods that the path takes; its first route knows only its own."""
+    scopes = {method: {**request.scope, "method": method} for method in _METHODS}
+    return ", ".join(
+        method
+        for method, scope in scopes.items()
+        if any(route.matches(scope)[0] is Match.FULL for route in request.app.routes)
+    )
 
 
 def _away(request: Request, title: str, error: Exception) -> Response:

@@ -12,7 +12,7 @@ from tests.service.api.test_submitting import opened
 from tests.service.test_api import assert_problem, over, until
 
 PRINTERS = """
-[printers.left]
+[printer.left]
 kind = "octoprint"
 url = "http://127.0.0.1:9"
 machine = "ender3"
