@@ -8,6 +8,10 @@ import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
 import { fitPlots } from "./plots.js";
 
+const TEST = [
+  ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "133.3"], ["hz_per_sec", "Hz per second", "1"],
+  ["accel_per_hz", "Acceleration per Hz, mm/s", "60"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400"],
+];
 const NAME = "[a-z0-9][a-z0-9_\\-]{0,63}";
 
 /**
@@ -23,6 +27,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
   const name = h("input", { type: "text", id: "new-name", required: !own, pattern: NAME, maxlength: "60", autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
   const start = h("select", { id: "base" }, machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
   const author = h("input", { type: "text", id: "measured-by", maxlength: "100", autocomplete: "name" });
+  const test = testOptions();
   const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {
     event.preventDefault();
     send(true);
@@ -37,6 +42,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
       own ? null : h("div.field", null, h("label", { for: "new-name" }, "Name of your machine"), name, h("p.hint", { id: "new-name-hint" }, "Small letters, digits, - and _.")),
       own || base !== null ? null : h("div.field", null, h("label", { for: "base" }, "Travel and limits from"), start),
       h("div.field", null, h("label", { for: "measured-by" }, "Your name"), author)),
+    test.element,
     h("div.actions", null, look), result);
 
   async function send(/** @type {boolean} */ trial) {
@@ -47,7 +53,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), "Identifying; this takes some ten seconds …"));
     try {
       const path = address(`/v1/machines/${encodeURIComponent(target)}/measurements`, {
-        trial: trial ? "true" : "", base: own ? "" : base ?? start.value, author: author.value.trim() });
+        trial: trial ? "true" : "", base: own ? "" : base ?? start.value, author: author.value.trim(), ...test.read() });
       const found = await (await request(path, { method: "POST", body, signal })).json();
       if (!trial) {
         announce(`Revision ${found.revision.number} of ${target} is kept.`);
@@ -68,4 +74,17 @@ export function measurementPanel({ machines, base, own = false, signal }) {
   }
 
   return form;
+}
+
+/** How the test was run, where it was not Klipper's default; folded away. */
+function testOptions() {
+  const inputs = TEST.map(([name, , hint]) => h("input", { type: "number", id: `test-${name}`, min: "0", step: "any", placeholder: hint }));
+  const axis = h("select", { id: "test-axis" }, [["", "As the files say"], ["x", "X"], ["y", "Y"]].map(([value, text]) => h("option", { value }, text)));
+  const element = h("details", null, h("summary", null, "How the test was run"),
+    h("p.hint", null, "Needed for raw logs only, where the test did not have Klipper's default values."),
+    h("div.fields", null,
+      h("div.field", null, h("label", { for: "test-axis" }, "Axis"), axis),
+      TEST.map(([name, label], k) => h("div.field", null, h("label", { for: `test-${name}` }, label), inputs[k]))));
+  const read = () => ({ axis: axis.value, ...Object.fromEntries(TEST.map(([name], k) => [name, inputs[k].value])) });
+  return { element, read };
 }

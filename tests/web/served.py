@@ -1,0 +1,93 @@
+"""A service in a process of its own, as `stillpath serve` runs it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx2
+
+__all__ = ["GEAR", "PATIENCE_MS", "Service", "running"]
+
+ROOT = Path(__file__).resolve().parents[2]
+GEAR = ROOT / "examples" / "cura_ender3_gear24.gcode"
+SERVE = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
+PATIENCE_MS = 240_000
+"""For whatever a job or an identification takes on a loaded machine."""
+_ADDRESS = re.compile(r"stillpath: (http\S+?)/?\s*$")
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service."""
+
+    url: str
+    api: httpx2.Client
+
+    def submit(self, content: bytes, name: str, **query: Any) -> str:
+        """Hand a file in; return the job's id."""
+        asked = {"machine": "ender3", "name": name} | query
+        answer = self.api.post("/v1/jobs", params=asked, content=content)
+        assert answer.status_code in (200, 202), answer.text
+        return str(answer.json()["id"])
+
+    def finished(self, job_id: str) -> dict[str, Any]:
+        """Wait until a job is over."""
+
+        def ask() -> dict[str, Any] | None:
+            job: dict[str, Any] = self.api.get(f"/v1/jobs/{job_id}").json()
+            return job if job["state"] in ("done", "failed", "cancelled") else None
+
+        return until(ask)
+
+
+def until(wanted: Callable[[], Any]) -> Any:
+    deadline = time.monotonic() + PATIENCE_MS / 1e3
+    while time.monotonic() < deadline:
+        found = wanted()
+        if found:
+            return found
+        time.sleep(0.1)
+    raise AssertionError("waited in vain")
+
+
+@contextmanager
+def running(data_dir: Path, key: str | None = None, **environment: str) -> Iterator[Service]:
+    """Run `stillpath serve`; its log lies in the folder."""
+    variables = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    headers = {} if key is None else {"X-Api-Key": key}
+    data_dir.mkdir(parents=True, exist_ok=True)
+    with (data_dir / "log").open("w") as log:
+        process = subprocess.Popen(
+            [*SERVE, "--data-dir", str(data_dir / "data")],
+            stdout=subprocess.PIPE, stderr=log, text=True, env=variables, cwd=data_dir,
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            lines = iter(process.stdout.readline, "")
+            url = next(
+                u[1] for line in lines if (u := re.match(r"stillpath: (http\S+?)/?\s*$", line))
+            )
+            with httpx2.Client(base_url=url, timeout=60, headers=headers) as api:
+                until(lambda: _is_ready(api))
+                yield Service(url, api)
+        finally:
+            process.terminate()
+            process.wait(timeout=60)
+            if process.stdout is not None:
+                process.stdout.close()
+
+
+def _is_ready(api: httpx2.Client) -> bool:
+    try:
+        return api.get("/readyz").status_code == 200
+    except httpx2.TransportError:
+        return False

@@ -1,0 +1,121 @@
+"""Every view for everybody: axe-core in both themes, narrow screens, keys only, themes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Page, expect
+
+from tests.web.machines import put
+from tests.web.served import Service
+from tests.web.visitor import Visitor
+
+PHONE = {"width": 390, "height": 844}
+VIEWS = ["new", "jobs", "job", "machines", "machine", "own"]
+
+
+@pytest.fixture(scope="module")
+def show(service: Service, gear: dict[str, Any]) -> Callable[..., Page]:
+    """Open a view and wait until all of it is there."""
+    put(service, "shown")
+    views = {
+        "new": ("#/", "form"),
+        "jobs": ("#/jobs", ".job-row"),
+        "job": (f"#/jobs/{gear['id']}", ".stage[data-renderer]:not([aria-busy])"),
+        "machines": ("#/machines", ".cards"),
+        "machine": ("#/machines/annex-k3", ".plot canvas"),
+        "own": ("#/machines/shown", ".row-actions"),
+    }
+
+    def opened(visitor: Visitor, view: str, **options: Any) -> Page:
+        address, there = views[view]
+        page = visitor.open(address, **options)
+        page.locator(there).first.wait_for()
+        page.wait_for_load_state("networkidle")
+        return page
+
+    return opened
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("view", VIEWS)
+def test_axe_finds_nothing(visitor: Visitor, show: Callable[..., Page], view: str, theme: str):
+    page = show(visitor, view, color_scheme=theme)
+    for details in page.locator("main details > summary").all():
+        details.click()
+    visitor.shoot(page, f"{view}-{theme}")
+    found = Axe().run(page).response["violations"]
+    serious = [
+        (v["id"], [node["html"] for node in v["nodes"]][:3])
+        for v in found
+        if v["impact"] in ("serious", "critical")
+    ]
+    assert serious == []
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_phone_needs_no_sideways_scrolling(
+    visitor: Visitor, show: Callable[..., Page], view: str, theme: str
+):
+    page = show(visitor, view, viewport=PHONE, color_scheme=theme, has_touch=True, is_mobile=True)
+    visitor.shoot(page, f"{view}-phone-{theme}")
+    wide, inner = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide <= inner == PHONE["width"]
+
+
+def test_the_theme_follows_the_system_and_the_switch(visitor: Visitor, show: Callable[..., Page]):
+    page = show(visitor, "new", color_scheme="dark")
+    ground = "getComputedStyle(document.body).backgroundColor"
+    dark = page.evaluate(ground)
+    page.emulate_media(color_scheme="light")
+    light = page.evaluate(ground)
+    assert light != dark
+    switch = page.get_by_role("button", name="Theme")
+    switch.click()
+    expect(switch).to_have_accessible_name("Theme: light")
+    switch.click()
+    expect(switch).to_have_accessible_name("Theme: dark")
+    assert page.evaluate(ground) == dark
+    page.reload()
+    page.locator("h1").wait_for()
+    assert page.evaluate(ground) == dark  # remembered
+    page.get_by_role("button", name="Theme").click()
+    assert page.evaluate(ground) == light  # as the system
+
+
+def test_tapping_the_path_reads_it(visitor: Visitor, show: Callable[..., Page]):
+    page = show(visitor, "job", viewport=PHONE, has_touch=True, is_mobile=True)
+    page.get_by_role("button", name="Worst point of this layer").tap()
+    spot = page.locator(".stage .mark:visible").first.bounding_box()
+    assert spot is not None
+    page.locator(".stage").focus()
+    page.keyboard.press("Escape")
+    page.touchscreen.tap(spot["x"] + 8, spot["y"] + 8)
+    expect(page.locator(".layers .readout")).to_contain_text("Line ")
+
+
+def test_everything_can_be_reached_by_keyboard(visitor: Visitor, show: Callable[..., Page]):
+    page = show(visitor, "new")
+    page.locator("body").click(position={"x": 2, "y": 2})
+    reached = []
+    for _ in range(16):
+        page.keyboard.press("Tab")
+        reached.append(page.evaluate("(e => e.id || e.textContent.trim())(document.activeElement)"))
+    wanted = {
+        "New job",
+        "Jobs",
+        "Machines",
+        "theme",
+        "machine",
+        "method",
+        "tolerance",
+        "More options",
+    }
+    assert wanted <= set(reached), reached
+    page.get_by_role("link", name="Skip to content").focus()
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "main"

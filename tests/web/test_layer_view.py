@@ -1,0 +1,151 @@
+"""The layer view of a finished job: slider, keys, pointer, and what it does without WebGL."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.web.visitor import Visitor
+
+NO_WEBGL = """
+const get = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+  return kind.startsWith("webgl") ? null : get.call(this, kind, ...rest);
+};
+"""
+
+
+def opened(visitor: Visitor, job: dict[str, Any], **options: Any) -> Page:
+    page = visitor.open(f"#/jobs/{job['id']}", **options)
+    settled(page)
+    page.locator(".stage").scroll_into_view_if_needed()
+    return page
+
+
+def settled(page: Page) -> None:
+    expect(page.locator(".stage[data-renderer]:not([aria-busy])")).to_be_visible()
+
+
+def test_the_slider_shows_layer_after_layer(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(visitor, gear)
+    slider = page.get_by_role("slider", name="Layer")
+    count = int(slider.get_attribute("max") or 0) + 1
+    assert count > 5
+    before = page.locator(".stage").screenshot()
+    slider.focus()
+    page.keyboard.press("Home")
+    settled(page)
+    expect(page.locator(".layers output")).to_contain_text(f"1 of {count}")
+    assert "Layer" in (slider.get_attribute("aria-valuetext") or "")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    settled(page)
+    expect(page.locator(".layers output")).to_contain_text(f"3 of {count}")
+    page.get_by_role("button", name="Layer below").click()
+    expect(page.locator(".layers output")).to_contain_text(f"2 of {count}")
+    settled(page)
+    assert page.locator(".stage").screenshot() != before
+
+
+def test_neighbours_are_fetched_before_they_are_asked_for(visitor: Visitor, gear: dict[str, Any]):
+    page = visitor.open("#/")
+    asked: list[int] = []
+    page.on(
+        "request",
+        lambda r: asked.extend(int(n) for n in re.findall(r"/layers/(\d+)$", r.url)),
+    )
+    page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
+    settled(page)
+    page.wait_for_load_state("networkidle")
+    middle = asked[0]
+    assert {middle - 1, middle + 1} <= set(asked)
+    assert len(asked) == len(set(asked)) <= 6  # of a long print only what is looked at
+    asked.clear()
+    page.get_by_role("slider", name="Layer").focus()
+    page.keyboard.press("ArrowRight")
+    settled(page)
+    assert middle + 1 not in asked
+
+
+@pytest.mark.parametrize("renderer", ["webgl", "canvas"])
+def test_the_pointer_reads_line_feature_and_error(
+    visitor: Visitor, gear: dict[str, Any], renderer: str
+):
+    page = opened(visitor, gear, script=NO_WEBGL if renderer == "canvas" else "")
+    stage = page.locator(".stage")
+    assert stage.get_attribute("data-renderer") == renderer
+    visitor.shoot(page, f"layers-{renderer}")
+    page.get_by_role("button", name="Worst point of this layer").click()
+    readout = page.locator(".layers .readout")
+    expect(readout).to_have_text(re.compile(r"Line \d+ · .+ · As sliced .+ µm, Compensated .+ µm"))
+    worst = readout.inner_text()
+    marks = stage.locator(".mark:visible")
+    expect(marks).to_have_count(2)
+    spot = marks.first.bounding_box()
+    assert spot is not None
+    page.mouse.move(5, 5)
+    stage.focus()
+    page.keyboard.press("Escape")
+    expect(readout).to_contain_text("Point at the path")
+    page.mouse.move(spot["x"] + 8, spot["y"] + 8, steps=3)
+    expect(readout).to_have_text(re.compile(r"Line \d+"))
+    assert worst.split(" · ")[1]  # a feature by name
+
+
+def test_keys_and_wheel_zoom_and_walk(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(visitor, gear)
+    stage = page.locator(".stage")
+    whole = stage.screenshot()
+    stage.focus()
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_timeout(200)
+    near = stage.screenshot()
+    assert near != whole
+    page.keyboard.press(".")
+    readout = page.locator(".layers .readout")
+    first = readout.inner_text()
+    assert first.startswith("Line ")
+    for _ in range(40):
+        page.keyboard.press(".")
+    assert readout.inner_text() != first
+    page.keyboard.press("Escape")
+    page.keyboard.press("0")
+    box = stage.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + box["width"] / 4, box["y"] + box["height"] / 2)
+    scrolled = page.evaluate("scrollY")
+    page.mouse.wheel(0, -600)
+    page.wait_for_timeout(200)
+    assert page.evaluate("scrollY") == scrolled  # the picture took the wheel
+    page.keyboard.press("]")
+    expect(page.locator(".layers output")).not_to_contain_text("11 of")
+    visitor.shoot(page, "layers-zoomed")
+
+
+def test_one_channel_at_a_time_and_all_layers_as_a_table(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(visitor, gear)
+    expect(page.locator(".stage .pane")).to_have_count(2)
+    choice = page.get_by_role("group", name="What the view shows")
+    choice.get_by_role("button", name="As sliced").click()
+    expect(page.locator(".stage .pane")).to_have_count(1)
+    page.get_by_text("All layers as a table").click()
+    table = page.get_by_role("region", name=re.compile(r"^Contour error of \d+ layers"))
+    table.get_by_role("button", name="2", exact=True).click()
+    expect(page.get_by_role("slider", name="Layer")).to_be_focused()
+
+
+def test_curves_are_read_by_keys_and_as_tables(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(visitor, gear)
+    plot = page.get_by_role("group", name=re.compile("^Contour error along the print"))
+    expect(plot.locator("canvas")).to_be_visible()
+    plot.focus()
+    page.keyboard.press("End")
+    figure = page.locator("figure.chart").filter(has=plot)
+    expect(figure.locator(".readout")).to_have_text(re.compile(r"^\d+:\d\d: As sliced .+ µm"))
+    figure.get_by_text("Show as a table").click()
+    expect(figure.get_by_role("table")).to_contain_text("Compensated")

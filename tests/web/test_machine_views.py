@@ -1,0 +1,80 @@
+"""Machines on the page: plants over frequency, revisions, measurements."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from playwright.sync_api import expect
+
+from tests.models.identification.recordings import QUICK_QUERY, quick_raw
+from tests.web.machines import put
+from tests.web.served import Service
+from tests.web.visitor import Visitor
+
+
+def test_machines_are_listed_and_found(visitor: Visitor, service: Service):
+    put(service, "listed")
+    page = visitor.open("#/machines")
+    expect(page.get_by_role("link", name="My printer").first).to_be_visible()
+    page.get_by_role("searchbox", name="Find a machine").fill("voron 2")
+    expect(page.locator(".cards .card")).to_have_count(1)
+    visitor.shoot(page, "machines")
+    page.get_by_role("link", name=re.compile("Voron 2.4")).click()
+    expect(page.get_by_role("heading", name="X axis")).to_be_visible()
+    expect(page.get_by_role("region", name="Modes of the X axis")).to_contain_text("65.5")
+    expect(page.locator(".plot canvas")).to_have_count(2)
+    visitor.shoot(page, "machine-builtin")
+
+
+def test_revisions_are_compared_approved_and_brought_back(visitor: Visitor, service: Service):
+    put(service, "changed")
+    page = visitor.open("#/machines/changed")
+    page.get_by_role("button", name="Show differences").click()
+    expect(page.get_by_role("region", name="Differences from 1 to 2")).to_contain_text("4321")
+    page.get_by_role("button", name="Approve revision 2").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Your name").fill("clara")
+    visitor.shoot(page, "machine-approve")
+    dialog.get_by_role("button", name="Approve").click()
+    revisions = page.get_by_role("region", name="Revisions, newest first")
+    expect(revisions).to_contain_text("clara")
+    page.get_by_role("button", name="Go back to revision 1").click()
+    page.get_by_role("dialog").get_by_role("button", name="Go back").click()
+    expect(revisions).to_contain_text("Back to 1")
+    history = service.api.get("/v1/machines/changed/revisions").json()["revisions"]
+    assert [r["restored"] for r in history] == [None, None, 1]
+    assert history[1]["approval"]["author"] == "clara"
+    visitor.shoot(page, "machine-own")
+
+
+def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tmp_path: Path):
+    put(service, "measured")
+    recording = quick_raw()
+    file = tmp_path / recording.name
+    file.write_bytes(recording.content)
+    page = visitor.open("#/machines/measured")
+    page.locator("input[type=file]").set_input_files(file)
+    page.get_by_text("How the test was run").click()
+    for name, value in QUICK_QUERY.items():
+        page.locator(f"#test-{name}").fill(str(value))
+    page.get_by_role("button", name="Look at the fit").click()
+    expect(page.get_by_role("heading", name="The fit")).to_be_focused()
+    expect(page.get_by_role("region", name="Modes of the X axis").last).to_contain_text("42")
+    visitor.shoot(page, "machine-fit")
+    assert len(service.api.get("/v1/machines/measured/revisions").json()["revisions"]) == 2
+    page.get_by_role("button", name="Keep as the next revision").click()
+    expect(page.get_by_role("heading", name="Measured and fitted")).to_be_visible()
+    assert len(service.api.get("/v1/machines/measured/revisions").json()["revisions"]) == 3
+    visitor.shoot(page, "machine-identified")
+
+
+def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "raw_data_x_broken.csv"
+    file.write_text("#time,accel_x,accel_y,accel_z\n0,1,2\n")
+    visitor.expected = {422}
+    page = visitor.open("#/machines/ender3")
+    page.locator("input[type=file]").set_input_files(file)
+    page.get_by_label("Name of your machine").fill("mine")
+    page.get_by_role("button", name="Look at the fit").click()
+    expect(page.get_by_role("alert")).to_contain_text("raw_data_x_broken.csv")

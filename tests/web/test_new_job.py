@@ -1,0 +1,186 @@
+"""From a file to the finished report, and what may go wrong on the way."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.web.served import GEAR, Service, running
+from tests.web.visitor import Visitor
+
+_SECTIONS = (
+    "Error of the nozzle",
+    "Layer by layer",
+    "Along the print",
+    "Spectra at the resonances",
+    "By feature",
+    "Put back as it came",
+)
+KEY = "sp_" + "0123456789abcdef" * 2
+
+
+def choose_machine(page: Page, typed: str) -> None:
+    field = page.get_by_role("combobox", name="Machine")
+    field.fill(typed)
+    page.keyboard.press("Enter")
+
+
+def hand_in(page: Page, file: Path, machine: str = "ender") -> None:
+    page.locator("input[type=file]").set_input_files(file)
+    choose_machine(page, machine)
+    page.get_by_role("button", name="Compensate").click()
+
+
+def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "wheel.gcode"
+    file.write_bytes(b"; another file\n" + GEAR.read_bytes())
+    page = visitor.open()
+    expect(page.get_by_role("button", name="Compensate")).to_be_disabled()
+    hand_in(page, file)
+    page.wait_for_url("**/#/jobs/*")
+    expect(page.locator("h1")).to_have_text("wheel.gcode")
+    expect(page.get_by_role("progressbar", name="Progress")).to_be_visible()
+    visitor.shoot(page, "progress")
+    expect(page.locator(".headline")).to_contain_text("times smaller")
+    before, after = (page.locator(f".headline .{name}") for name in ("before", "after"))
+    assert float(after.inner_text()) < float(before.inner_text()) / 3
+    for title in _SECTIONS:
+        expect(page.get_by_role("heading", name=title)).to_be_visible()
+    assert page.title() == "wheel.gcode · Stillpath"
+    # The heading has the focus, so that reading starts there.
+    assert page.evaluate("document.activeElement.tagName") == "H1"
+    with page.expect_download() as download:
+        page.get_by_role("link", name=re.compile("^G-code")).click()
+    assert download.value.suggested_filename == "wheel.stillpath.gcode"
+    assert download.value.path().read_bytes().count(b"\n") > 1000
+    with page.context.expect_page() as report:
+        page.get_by_role("link", name=re.compile("^Report")).click()
+    expect(report.value.locator("h1")).to_have_text("wheel.gcode")
+
+
+def test_the_machine_is_found_by_typing_and_remembered(visitor: Visitor):
+    page = visitor.open()
+    field = page.get_by_role("combobox", name="Machine")
+    field.fill("voron")
+    options = page.get_by_role("listbox").get_by_role("option")
+    expect(options).to_have_count(2)
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    expect(field).to_have_value(re.compile("Voron"))
+    expect(page.get_by_role("listbox")).to_be_hidden()
+    chosen = field.input_value()
+    field.fill("nothing of that name")
+    expect(page.get_by_role("listbox")).to_contain_text("No machine")
+    page.keyboard.press("Escape")
+    expect(field).to_have_value(chosen)
+
+
+def test_a_file_that_is_no_gcode_is_refused_with_the_reason(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "photo.gcode"
+    file.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 40)
+    page = visitor.open()
+    hand_in(page, file)
+    problem = page.get_by_role("alert")
+    expect(problem).to_be_visible()
+    assert len(problem.inner_text()) > 60  # what, where and the remedy
+    expect(page.locator(".badge[data-state=failed]")).to_be_visible()
+    visitor.shoot(page, "failed")
+
+
+def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "empty.gcode"
+    file.write_bytes(b"")
+    visitor.expected = {422}
+    page = visitor.open()
+    hand_in(page, file)
+    expect(page.get_by_role("alert")).to_contain_text("empty")
+
+
+def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):
+    # Robust designs take long enough to be stopped in the middle.
+    long = b"; to be stopped\n" + GEAR.read_bytes() * 4
+    name = "long.gcode"
+    job = service.submit(long, name, robust="minimax")
+    page = visitor.open(f"#/jobs/{job}")
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("not finished")
+    visitor.shoot(page, "cancel")
+    dialog.get_by_role("button", name="Let it run").click()
+    expect(page.get_by_role("button", name="Cancel", exact=True)).to_be_focused()
+    page.get_by_role("button", name="Cancel", exact=True).click()
+    page.get_by_role("dialog").get_by_role("button", name="Cancel the job").click()
+    expect(page.locator(".badge[data-state=cancelled]")).to_be_visible()
+    assert service.finished(job)["state"] == "cancelled"
+
+    page.get_by_role("link", name="Jobs", exact=True).first.click()
+    page.get_by_role("button", name="Cancelled").click()
+    row = page.locator(f"[data-job='{job}']")
+    row.get_by_role("button", name=f"Delete {name}").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    assert service.api.get(f"/v1/jobs/{job}").status_code == 404
+
+
+def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear: dict[str, str]):
+    small = GEAR.read_bytes()[:200]
+    made = [service.submit(b"; %d\n" % k + small, f"part{k:02}.gcode") for k in range(28)]
+    service.finished(made[-1])
+    page = visitor.open("#/jobs")
+    rows = page.locator(".job-row")
+    expect(rows).to_have_count(25)
+    page.get_by_role("button", name="Older").click()
+    expect(page.get_by_role("button", name="Newer")).to_be_enabled()
+    expect(page.get_by_role("link", name="part00.gcode")).to_be_visible()
+    page.get_by_role("button", name="Newer").click()
+    expect(page.get_by_role("link", name="part27.gcode")).to_be_visible()
+    page.get_by_role("button", name="Done", exact=True).click()
+    expect(page.get_by_role("link", name="gear.gcode").first).to_be_visible()
+    for job in made:
+        service.api.delete(f"/v1/jobs/{job}")
+
+
+def test_a_job_that_is_not_there(visitor: Visitor):
+    visitor.expected = {404}
+    page = visitor.open("#/nowhere")
+    expect(page.locator("h1")).to_have_text("No such page")
+    page.goto(f"{visitor.url}/#/jobs/{'0' * 32}")
+    expect(page.get_by_role("alert")).to_contain_text("no job")
+
+
+@pytest.fixture(scope="module")
+def guarded(browser: Browser, tmp_path_factory: pytest.TempPathFactory):
+    """A service that asks for a key."""
+    folder = tmp_path_factory.mktemp("guarded")
+    with running(folder, KEY, STILLPATH_KEYS="true", STILLPATH_FIRST_KEY=KEY) as found:
+        yield found
+
+
+def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "gear.gcode"
+    file.write_bytes(GEAR.read_bytes())
+    visitor.expected = {401}
+    page = visitor.open(at=guarded.url)
+    dialog = page.get_by_role("dialog")
+    expect(dialog).to_contain_text("asks for a key")
+    visitor.shoot(page, "key")
+    expect(page.get_by_label("Key", exact=True)).to_be_focused()
+    page.get_by_label("Key", exact=True).fill("sp_" + "wrong" * 8)
+    page.get_by_role("button", name="Use this key").click()
+    expect(dialog).to_contain_text("asks for a key")
+    page.get_by_label("Key", exact=True).fill(KEY)
+    page.get_by_role("button", name="Use this key").click()
+    hand_in(page, file)
+    expect(page.locator(".headline")).to_contain_text("times smaller")
+    expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("link", name=re.compile("^G-code")).click()
+    assert download.value.suggested_filename == "gear.stillpath.gcode"
+    # The key is in the tab and nowhere else: neither in an address nor in lasting storage.
+    assert KEY not in page.url
+    assert KEY not in page.evaluate("JSON.stringify({...localStorage}) + document.cookie")
+    page.get_by_role("button", name="Forget key").click()
+    expect(page.get_by_role("dialog")).to_contain_text("asks for a key")

@@ -1,0 +1,56 @@
+"""Somebody who looks at pages, and keeps what they complain of."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from playwright.sync_api import Browser, BrowserContext, Page
+
+from tests.web.served import PATIENCE_MS
+
+__all__ = ["Visitor"]
+
+
+@dataclass
+class Visitor:
+    """Opens pages, and keeps what they complain of."""
+
+    browser: Browser
+    url: str
+    artefacts: Path
+    complaints: list[str] = field(default_factory=list)
+    expected: set[int] = field(default_factory=set)
+    """Statuses of answers that the test provokes; browsers log them as errors."""
+    contexts: list[BrowserContext] = field(default_factory=list)
+
+    def open(
+        self, view: str = "#/", *, at: str | None = None, script: str = "", **options: Any
+    ) -> Page:
+        """Open a view in a fresh context; `script` runs before the page's own."""
+        context = self.browser.new_context(
+            **{"reduced_motion": "reduce", "viewport": {"width": 1280, "height": 900}} | options
+        )
+        self.contexts.append(context)
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        if script:
+            page.add_init_script(script)
+        page.on("console", self._note)
+        page.on("pageerror", lambda error: self.complaints.append(f"uncaught: {error}"))
+        page.goto(f"{at or self.url}/{view}")
+        page.locator("h1").wait_for()
+        return page
+
+    def shoot(self, page: Page, name: str) -> None:
+        """Keep a screenshot of the whole page."""
+        page.screenshot(path=self.artefacts / f"{name}.png", full_page=True)
+
+    def _note(self, message: Any) -> None:
+        if message.type not in ("error", "warning"):
+            return
+        status = re.search(r"the server responded with a status of (\d+)", message.text)
+        if status is None or int(status[1]) not in self.expected:
+            self.complaints.append(f"{message.type}: {message.text}")
