@@ -104,13 +104,8 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     engine = make_engine(url, pooled=pooled)
     try:
         migrate(engine)
-        if (
-            settings.database_url is None
-            and (old := Path(settings.data_dir) / "jobs.sqlite3").exists()
-        ):
-            from service.database.old_jobs import take_over
-
-            take_over(old, engine)
+        if settings.database_url is None:
+            _take_over_old_jobs(Path(settings.data_dir), engine)
     except DBAPIError as error:
         engine.dispose()
         raise StoreError(
