@@ -140,9 +140,8 @@ def build_timeline(
             start[i] = now + lead_s
             row_start[rows] = start[i] + offset[:-1]
             now = dt_s * np.ceil((start[i] + offset[-1] + tail_s) / dt_s - _GRID_EPS)
-            if rests:
-                # However short: a stretch has a sample of its own behind the rest.
-                now = max(now, dt_s * rests[-1][1])
+            # However short: a stretch has a sample of its own behind the rest.
+            now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now
     samples = int(np.ceil(now / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
     moved = replace(phases, t_s=row_start)

@@ -214,7 +214,7 @@ class StreamWriter:
         if self._is_move(code):
             # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
             return _held_back(line) if re.search(rb"[XYZEIJK]", code) else line
-        if _SET_POSITION.match(code) and state.absolute_e:
+        if _SET_POSITION.match(code) and (state.absolute_e or piece.modal_after.absolute_e):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
             line = _shifted_e(line, (extruded_mm - planned) / state.extrude_factor)
