@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -79,7 +80,9 @@ class There:
             self._client.save_report(job.id, scratch.report)
         except ClientError as error:
             raise _failure_of(error) from None
-        return Made(Figures.model_validate(job.summary or {}), 0.0)
+        report = json.loads((scratch.report / "report.json").read_bytes())
+        figures = {**(job.summary or {}), "warnings": report.get("warnings", [])}
+        return Made(Figures.model_validate(figures), 0.0)
 
     def close(self) -> None:
         """See `Works`."""

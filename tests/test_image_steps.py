@@ -1,0 +1,151 @@
+"""The image's steps in a clean folder, and the service from what they made: no engine needed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from tests.dockerfile import Image, build, context_of
+
+ROOT = Path(__file__).parents[1]
+KEY = "sp_" + "k" * 32
+NOBODY = 65534
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="an image of Linux")]
+
+
+@pytest.fixture(scope="module")
+def image() -> Iterator[Image]:
+    # Beside pytest's folders, which nobody but their owner may enter.
+    root = Path(tempfile.mkdtemp(prefix="stillpath-image-"))
+    root.chmod(0o755)
+    try:
+        if not _reaches_pypi():
+            pytest.skip("NOT CHECKED: the image's steps need PyPI")
+        yield build(ROOT / "Dockerfile", context_of(ROOT, root / "context"), root)
+    finally:
+        shutil.rmtree(root)
+
+
+def _reaches_pypi() -> bool:
+    command = ["python3", "-m", "pip", "download", "--quiet", "--no-deps", "--dest"]
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run([*command, folder, "editables==0.5"], capture_output=True)
+    return done.returncode == 0
+
+
+def as_nobody() -> dict[str, int]:
+    return {"user": NOBODY, "group": NOBODY} if os.geteuid() == 0 else {}
+
+
+@contextmanager
+def running(image: Image, port: int) -> Iterator[subprocess.Popen[str]]:
+    """Run the image's command as somebody who owns nothing but /data."""
+    data = Path(image.environment["STILLPATH_DATA_DIR"])
+    if os.geteuid() == 0:
+        os.chown(data, NOBODY, NOBODY)
+    # What the host puts into any container, and nothing else.
+    environment = image.environment | {"STILLPATH_FIRST_KEY": KEY, "HOME": str(data)}
+    with subprocess.Popen(
+        [part.replace("8000", str(port)) for part in image.command],
+        executable=shutil.which(image.command[0], path=environment["PATH"]),
+        env=environment,
+        cwd=data,
+        stdout=subprocess.PIPE,
+        text=True,
+        **as_nobody(),
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+def until_ready(client: httpx2.Client, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 300
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            if client.get("/readyz").status_code == 200:
+                return
+        except httpx2.TransportError:
+            pass
+        time.sleep(0.2)
+    raise AssertionError("the service does not get ready")
+
+
+def test_the_image_says_how_it_is_run(image: Image):
+    assert image.user == "10001:10001"
+    assert image.stop_signal == "SIGTERM"
+    assert image.command[:2] == ["stillpath", "serve"]
+    assert "readyz" in image.healthcheck[-1]
+
+
+def test_it_serves_without_the_sources_and_writes_only_data(image: Image):
+    port = free_port()
+    installed = Path(image.environment["NUMBA_CACHE_DIR"]).parent
+    before = {path: path.stat().st_mtime_ns for path in installed.rglob("*") if path.is_file()}
+    kernels = [path for path in before if path.suffix == ".nbc"]
+    assert len(kernels) > 20, "no kernels were made in advance"
+    for folder in (image.root / "context", image.root / "done-build"):
+        if folder.exists():
+            folder.rename(folder.with_name(f"{folder.name}-gone"))
+    if os.geteuid() != 0:
+        subprocess.run(["chmod", "-R", "a-w", str(installed)], check=True)
+    headers = {"X-Api-Key": KEY}
+    with (
+        running(image, port) as process,
+        httpx2.Client(base_url=f"http://127.0.0.1:{port}", headers=headers, timeout=60) as client,
+    ):
+        until_ready(client, process)
+        check = [part.replace("8000", str(port)) for part in image.healthcheck]
+        python = shutil.which(check[0], path=image.environment["PATH"])
+        assert python is not None
+        assert python.startswith(str(installed))
+        subprocess.run([python, *check[1:]], env=image.environment, check=True, **as_nobody())
+        where = subprocess.run(
+            [python, "-c", "import service; print(service.__file__)"],
+            env=image.environment,
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert where.stdout.startswith(str(installed))
+
+        assert client.get("/v1/jobs", headers={"X-Api-Key": "sp_" + "x" * 32}).status_code == 401
+        text = (ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode").read_bytes()
+        answer = client.post("/v1/jobs", params={"machine": "ender3"}, content=text)
+        assert answer.status_code == 202, answer.text
+        deadline = time.monotonic() + 600
+        while time.monotonic() < deadline:
+            job = client.get(answer.headers["location"]).json()
+            if job["state"] in ("done", "failed"):
+                break
+            time.sleep(0.5)
+        assert job["state"] == "done", job
+        assert b"; Processed by stillpath" in client.get(job["links"]["result"]).content
+        assert client.get("/").status_code == 200
+
+        process.send_signal(getattr(signal, image.stop_signal))
+        process.wait(timeout=60)
+        assert process.returncode == 0
+    if os.geteuid() != 0:
+        subprocess.run(["chmod", "-R", "u+w", str(installed)], check=True)
+    after = {path: path.stat().st_mtime_ns for path in installed.rglob("*") if path.is_file()}
+    assert after == before
