@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,6 +39,7 @@ __all__ = [
 
 _FILE = "stillpath.sqlite3"
 _BUSY_TIMEOUT_MS = 30_000
+_LINE = threading.Lock()
 # Taken by whoever changes the schema; a number that nobody else in the database uses.
 _MIGRATION_LOCK = 0x57111_0000
 _ON_POSTGRESQL: dict[str, Any] = {
@@ -175,7 +177,7 @@ def writing(engine: Engine) -> Iterator[Connection]:
     ------
     DatabaseAway
     """
-    with _plainly(engine), engine.begin() as connection:
+    with _turn(engine), _plainly(engine), engine.begin() as connection:
         yield connection
 
 
@@ -196,6 +198,23 @@ def insert(connection: Connection, table: Table) -> Any:
     if connection.dialect.name == "postgresql":
         return postgresql.insert(table)
     return sqlite.insert(table)
+
+
+@contextmanager
+def _turn(engine: Engine) -> Iterator[None]:
+    """Let the writers of this process wait in line: SQLite's own waiting starves some for long."""
+    if engine.dialect.name != "sqlite":
+        yield
+        return
+    if not _LINE.acquire(timeout=_BUSY_TIMEOUT_MS / 1000):
+        raise DatabaseAway(
+            f"the database {_shown(engine)} is not free after {_BUSY_TIMEOUT_MS / 1000:g} s; "
+            "see whether its disk still answers"
+        )
+    try:
+        yield
+    finally:
+        _LINE.release()
 
 
 @contextmanager
