@@ -38,12 +38,13 @@ def serve(
     """
     settings = _settings(data_dir=data_dir, workers=workers)
 
-    from service.security.keys import UnsafeBinding
+    from service.deliveries.printers import PrinterFileError
+    from service.security.keys import KeyRefused, UnsafeBinding
     from service.server import serve_forever
 
     try:
         serve_forever(settings, host, port)
-    except UnsafeBinding as error:
+    except (UnsafeBinding, KeyRefused, PrinterFileError) as error:
         raise typer.TyperException(str(error)) from None
 
 

@@ -142,12 +142,8 @@ class KeyStore:
         KeyRefused
             If `secret` does not look like a key.
         """
-        if secret is not None and _FORM.fullmatch(secret) is None:
-            raise KeyRefused(
-                f"the first key must be {KEY_PREFIX!r} and at least 32 characters of A-Z a-z 0-9 _ "
-                "-; python -c \"import secrets; print('sp_' + secrets.token_urlsafe(24))\" makes "
-                "one (STILLPATH_FIRST_KEY)"
-            )
+        if secret is not None:
+            _check_form(secret)
         with reading(self._engine) as connection:
             if connection.execute(select(keys.c.id).limit(1)).first() is not None:
                 return None
@@ -224,7 +220,11 @@ def keys_needed(settings: Settings, host: str) -> bool:
     ------
     UnsafeBinding
         If keys are switched off for an address that other computers can reach.
+    KeyRefused
+        If the first key of the settings does not look like one.
     """
+    if settings.first_key is not None:
+        _check_form(settings.first_key.get_secret_value())
     local = is_loopback(host)
     if settings.keys is None:
         return not local
@@ -249,6 +249,15 @@ def announce_first_key(store: KeyStore, given: SecretStr | None) -> None:
         # Straight to whoever started the service: a log would keep it.
         sys.stdout.write(f"stillpath: first key, with all scopes, shown this once: {made}\n")
         sys.stdout.flush()
+
+
+def _check_form(secret: str) -> None:
+    if _FORM.fullmatch(secret) is None:
+        raise KeyRefused(
+            f"the first key must be {KEY_PREFIX!r} and 32 to 128 characters of A-Z a-z 0-9 _ -; "
+            "python -c \"import secrets; print('sp_' + secrets.token_urlsafe(24))\" makes one "
+            "(STILLPATH_FIRST_KEY)"
+        )
 
 
 def _check(key: Key) -> None:

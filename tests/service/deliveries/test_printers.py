@@ -143,6 +143,7 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
     assert "may have been started" in (delivery.error or "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prints", [False, True])
 def test_a_sender_killed_in_between(tmp_path: Path, prints: bool):
     """An upload is done again; one that starts a print is not."""

@@ -158,6 +158,7 @@ def test_two_senders_send_each_once(tmp_path: Path):
         assert {check(seen)["job"]["id"] for seen in listener.seen} == {job.id for job in jobs}
 
 
+@pytest.mark.slow
 def test_a_sender_killed_in_between_is_followed_by_another(tmp_path: Path):
     """The receiver got it and the sender never heard so: it is sent once more, not lost."""
     holding = [True]

@@ -217,3 +217,30 @@ def test_commands(
     rows = call("audit")[1].splitlines()[1:]
     assert [row.split("\t")[4] for row in rows] == ["key.revoke", "key.create", "key.create"]
     assert [row.action for row in AuditLog(engine).page(action="key.revoke")] == ["key.revoke"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "words"),
+    [
+        ("STILLPATH_FIRST_KEY", "hunter2", "first key must be"),
+        ("STILLPATH_KEYS", "false", "can be reached from other computers"),
+        ("STILLPATH_PRINTERS", "/nowhere/printers.toml", "cannot be read"),
+    ],
+)
+def test_a_service_that_would_be_unsafe_does_not_start(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    setting: str,
+    value: str,
+    words: str,
+):
+    from service.cli import run
+
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv(setting, value)
+    assert run(["serve", "--host", "0.0.0.0", "--port", "0"]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.out == ""
+    assert "hunter2" not in said.err
