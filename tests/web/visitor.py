@@ -45,8 +45,9 @@ class Visitor:
         return page
 
     def shoot(self, page: Page, name: str) -> None:
-        """Keep a screenshot of the whole page."""
-        page.screenshot(path=self.artefacts / f"{name}.png", full_page=True)
+        """Keep a screenshot of the whole page, or of the window if a dialog lies over it."""
+        whole = page.locator("dialog[open]").count() == 0
+        page.screenshot(path=self.artefacts / f"{name}.png", full_page=whole)
 
     def _note(self, message: Any) -> None:
         if message.type not in ("error", "warning"):

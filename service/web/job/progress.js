@@ -11,7 +11,7 @@ const ANNOUNCE_EVERY = 0.25;
  */
 export function progressPanel() {
   const bar = h("progress", { max: "1", "aria-label": "Progress" });
-  const stage = h("p.stage");
+  const stage = h("p.doing");
   const left = h("p.hint.left");
   const share = h("p.share", { "aria-hidden": "true" });
   const element = h("section.card.progress", { "aria-label": "Progress" }, h("div.row", null, stage, share), bar, left);

@@ -10,7 +10,7 @@ const THIN = "\u202f";
  */
 export function um(value) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  return value >= 100 ? grouped(Math.round(value)) : value.toFixed(value >= 10 ? 1 : 2);
+  return value >= 99.95 ? grouped(Math.round(value)) : value.toFixed(value >= 9.995 ? 1 : 2);
 }
 
 /**
@@ -28,7 +28,7 @@ export function grouped(value) {
  */
 export function number(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (value !== 0 && (Math.abs(value) >= 1e5 || Math.abs(value) < 1e-3)) {
+  if (value !== 0 && (Math.abs(value) >= 1e5 || Math.abs(value) < 1e-5)) {
     return value.toExponential(digits - 1).replace("e+", "e");
   }
   return String(Number(value.toPrecision(Math.max(digits, Math.ceil(Math.log10(Math.abs(value) + 1))))));
@@ -40,7 +40,7 @@ export function number(value, digits = 3) {
  */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
-  if (seconds < 60) return `${seconds.toFixed(seconds >= 10 ? 1 : 2)} s`;
+  if (seconds < 59.95) return `${seconds.toFixed(seconds >= 9.995 ? 1 : 2)} s`;
   const whole = Math.round(seconds);
   const hours = Math.floor(whole / 3600);
   const minutes = Math.floor(whole / 60) % 60;

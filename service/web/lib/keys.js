@@ -30,11 +30,12 @@ export function forgetKey() {
 /**
  * Ask for a key; requests that wait for one share the question.
  *
- * @param {string} reason What the service said.
+ * @param {string} reason What the service said of the one that was shown.
  * @returns {Promise<boolean>} Whether one was given.
  */
 export function askForKey(reason) {
-  asking ??= ask(reason).finally(() => {
+  // Without one before, nothing is wrong yet.
+  asking ??= ask(storedKey() === null ? "Enter one to hand in files and to see your own jobs." : reason).finally(() => {
     asking = null;
   });
   return asking;

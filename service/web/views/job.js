@@ -62,7 +62,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
   }
 
   function deleteButton(/** @type {any} */ job) {
-    return h("button.quiet", { type: "button", onclick: () => act(async () => {
+    return h("button", { type: "button", onclick: () => act(async () => {
       if (!await confirmed({ title: "Delete this job?", text: `${job.source_name}, its result and its report are deleted for good.`, yes: "Delete" })) return;
       await request(`/v1/jobs/${job.id}`, { method: "DELETE", signal });
       announce(`${job.source_name} is deleted.`);
