@@ -30,7 +30,7 @@ def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
     """Put a road in place that does what `road.behave` says."""
     seen = types.SimpleNamespace(behave=lambda: None, options=None, machine=None, rate_hz=None)
 
-    def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None):
+    def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None, **_):
         seen.machine, seen.options = machine.name, options
         seen.behave()
         if progress is not None:

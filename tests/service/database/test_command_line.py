@@ -1,0 +1,77 @@
+"""The command line on machines that several computers share, and on a database that is away."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.cli import run
+from tests.service.machines import make_machine
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(autouse=True)
+def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+    return tmp_path / "data"
+
+
+def machine_file(folder: Path) -> Path:
+    file = folder / "mine.json"
+    file.write_text(make_machine("mine").model_dump_json())
+    return file
+
+
+def test_machines_in_the_database(
+    postgres_url: str,
+    tmp_path: Path,
+    data_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    monkeypatch.setenv("STILLPATH_DATABASE_URL", postgres_url)
+    assert run(["machines", "import", str(machine_file(tmp_path))]) == 0
+    assert run(["machines", "history", "mine"]) == 0
+    assert not (data_dir / "machines").exists()
+    # Seen by whoever names the same database, and by nobody else.
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "elsewhere"))
+    assert run(["machines", "show", "mine"]) == 0
+    monkeypatch.delenv("STILLPATH_DATABASE_URL")
+    assert run(["machines", "show", "mine"]) == 2
+    assert "mine" in capsys.readouterr().err
+
+
+def test_machines_beside_a_sqlite_database_stay_files(
+    tmp_path: Path, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("STILLPATH_DATABASE_URL", f"sqlite:///{tmp_path / 'db'}")
+    assert run(["machines", "import", str(machine_file(tmp_path))]) == 0
+    assert (data_dir / "machines" / "mine" / "000001.json").exists()
+    assert not (tmp_path / "db").exists()
+
+
+def test_a_database_that_is_away_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("STILLPATH_DATABASE_URL", "postgresql://anna:geheim@127.0.0.1:1/x")
+    assert run(["machines"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "127.0.0.1:1/x does not answer" in error
+    assert "geheim" not in error
+
+
+@pytest.mark.parametrize("arguments", [["compensate", "--help"], ["machines"]])
+def test_commands_without_a_database_do_not_load_it(arguments: list[str]):
+    code = (
+        "import sys; from service.cli import run; "
+        f"assert run({arguments!r}) == 0; "
+        "heavy = {'sqlalchemy', 'alembic', 'psycopg', 'distributed'} & {*sys.modules}; "
+        "sys.exit(' '.join(heavy) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
