@@ -7,6 +7,8 @@ and matters here:
   future: so futures are dropped when they are done, and a job is claimed in the database.
 - Cancelling a task does not stop one that runs: so workers ask the database.
 - Workers end when their scheduler does: so `stillpath worker` starts them again.
+- A worker of a `LocalCluster` that is away for longer than ``lost-worker-timeout`` is written off for
+  good: so that is long, and we have it replaced ourselves.
 - Whoever reaches a scheduler can run anything on its workers: so ours listens on loopback only, and
   one elsewhere belongs into a closed network or behind TLS (``tls://..``, Dask's own settings).
 """
@@ -55,6 +57,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.nanny.pre-spawn-environ": {},
     # Jobs compute for minutes without letting the event loop in.
     "distributed.admin.tick.limit": "1h",
+    "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.comm.timeouts.connect": f"{_TIMEOUT_S}s",
     "distributed.diagnostics.nvml": False,
 }
@@ -119,7 +122,10 @@ class Cluster:
         """
         with self._explained() as client:
             threads = client.sync(client.scheduler.ncores, callback_timeout=_TIMEOUT_S)
-        return sum(threads.values())
+            slots = sum(threads.values())
+            if self._local is not None and slots < self._settings.workers:
+                _replace_ended(self._local, self._settings.workers)
+        return slots
 
     def submit(self, job: Job, when_done: Callable[[], object]) -> Future:
         """Hand a job over; `when_done` is called from another thread when its task is over.
@@ -198,6 +204,19 @@ def prepare_dask() -> None:
 def runner_name(runner: Runner) -> str:
     """Return the ``module:name`` of a runner."""
     return f"{runner.__module__}:{runner.__qualname__}"
+
+
+def _replace_ended(local: LocalCluster, workers: int) -> None:
+    """Start workers for those that ended for good; what is starting anyway is let alone."""
+    from distributed.core import Status
+
+    def drop() -> None:
+        for name, nanny in list(local.workers.items()):
+            if nanny.status in (Status.closed, Status.failed):
+                del local.workers[name]
+
+    local.loop.add_callback(drop)
+    local.scale(workers)
 
 
 def _kill(pid: int | None) -> None:

@@ -27,7 +27,7 @@ __all__ = ["ROOT", "Process", "Site", "until"]
 
 ROOT = Path(__file__).resolve().parents[3]
 WORK = [sys.executable, str(Path(__file__).with_name("work_process.py"))]
-PATIENCE_S = 240.0
+PATIENCE_S = 600.0
 
 
 class Site:
