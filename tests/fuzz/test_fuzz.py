@@ -82,9 +82,13 @@ FOUND = {
         "N1 G1 X2.0000 Y1.5000\nN2 G1 Z-.02 F5.\nN3 G0 X2.5000 Y1.5000\nN4 G1 Z-.02 F5.\n"
         "N5 G1 X2.8000 F20.\n"
     ),
+    "G92 E counts where E is absolute later": (
+        "G28\nM83\nG1 X10 Y5 F3000\nG92 E5\nM82\nG1 X40 Y40 E5.3\nM400\nG1 X45 Y40 E.1 F3000\n"
+    ),
 }
 
-FOUND_IN_MARLIN = (
+NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
+NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
     "G1 X119.971 Y118.323 E5.34247\nG1 E1.84247 F3600\nG2 X119.495 Y117.807 I-265.097 J244.069"
     " E1.50880\n"
@@ -95,8 +99,9 @@ FOUND_IN_MARLIN = (
 
 
 @pytest.mark.slow
-def test_no_line_passes_a_rest_that_takes_no_time(tmp_path: Path, cache: Path) -> None:
-    data = tagged(FOUND_IN_MARLIN.encode())
+@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS])
+def test_moves_and_rests_that_take_no_time(text: str, tmp_path: Path, cache: Path) -> None:
+    data = tagged(text.encode())
     through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)
 
 

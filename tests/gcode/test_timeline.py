@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from hypothesis import strategies as st
 from gcode.pieces import Piece
 from gcode.sampler import sample_phases
 from gcode.timeline import Timeline, build_timeline, group_rows
+from gcode.types import Phases
 from models.machine import Machine
 from models.store import load_machine
 from tests.gcode.cutting import HEAD, pieces_of
@@ -118,3 +121,13 @@ def test_standing_behind_the_end(piece: Piece) -> None:
     np.testing.assert_allclose(
         long.position_mm[:, n:].T, np.tile(piece.moves.end_mm[-1], (150, 1)), atol=1e-9
     )
+
+
+def test_a_stretch_of_no_time_has_a_sample(piece: Piece) -> None:
+    """Marlin swallows a move of less than a step; a segment must be able to end behind it."""
+    rows = Phases(**{f.name: getattr(piece.phases, f.name)[:1] for f in fields(Phases)})
+    none = np.zeros(1)
+    phases = replace(rows, accel_s=none, cruise_s=none, decel_s=none)
+    line = build_timeline(phases, group_rows(phases), none, DT_S)
+    assert line.end_s.tolist() == [DT_S]
+    assert line.position_mm.shape[1] == 2
