@@ -125,7 +125,7 @@ def create_app(
         keys,
         metrics,
     ):
-        app.include_router(part.router, responses=problems.responses(401, 403, 429, 503))
+        app.include_router(part.router, responses=problems.responses(401, 403, 422, 429, 503))
     return app
 
 

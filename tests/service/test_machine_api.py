@@ -220,6 +220,7 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
         report=tmp_path / "report",
         cache_dir=tmp_path / "cache",
     )
+    task.target.parent.mkdir()
     task.source.write_text("G28\nG1 X50 Y50 F6000\nG1 X60 Y50 E1\nG1 X60 Y70 E2\n")
     Resolver(store).for_job("mine").write(task.machine_file)
     store.delete("mine")

@@ -62,6 +62,7 @@ def test_the_api_is_as_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     data = tmp_path / "data"
     data.mkdir()
     with server(PRETEND, data) as (client, _):
+        client.get("/openapi.json", timeout=120)  # made at the first request
         command = ["--config-file", str(settings), "run", f"{client.base_url}openapi.json"]
         options = ["--checks", "all", "--max-examples", "10", "--request-timeout", "300"]
         done = subprocess.run(
