@@ -59,7 +59,8 @@ class Settings(MachineSettings, BaseSettings):
     printers : Path, optional
         TOML file of printers that results can be forwarded to.
     webhook_targets : list of str
-        ``host`` or ``host:port`` that webhooks may be sent to.
+        ``host`` or ``host:port`` that webhooks may be sent to, by https; ``http://host:port`` for
+        plain http.
     webhook_secret : str, optional
         Signs webhooks (HMAC-SHA256); without it there are none.
     """

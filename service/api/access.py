@@ -68,7 +68,8 @@ def _admin(request: Request, shown: _Shown) -> Caller:
 
 def _operator(request: Request, shown: _Shown) -> Caller:
     remote = _remote(request)
-    if shown is None and is_loopback(remote or ""):
+    # By name, too: a page of somebody else can make this computer's browser ask.
+    if shown is None and is_loopback(remote or "") and is_loopback(request.url.hostname or ""):
         return _local(remote)
     return _allowed(request, shown, Scope.ADMIN)
 

@@ -15,7 +15,8 @@ from service.api.finding import JobId, find, no_such_job
 from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.problems import Problem, responses
-from service.api.schemas import JobPage, JobQuery, JobView
+from service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
+from service.deliveries.sender import Sender
 from service.jobs.state import Cancelled, Job, JobState
 from service.jobs.store import BadCursor, JobStore
 from service.security.audit import record
@@ -147,6 +148,12 @@ async def read_job(request: Request, job_id: JobId, caller: Watcher) -> JobView:
     """Return state, stage, progress and, once it is known, the time still needed."""
     job = await find(request, job_id, caller)
     (view,) = await _views(request.app.state.store, [job])
+    if job.state.is_final and (job.webhook or job.printer):
+        sender: Sender = request.app.state.deliveries
+        view.deliveries = [
+            DeliveryView.of(delivery)
+            for delivery in await run_in_threadpool(sender.deliveries_of, job_id)
+        ]
     return view
 
 

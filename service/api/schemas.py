@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from service.deliveries.targets import read_url
 from service.jobs.state import Job, JobState
 from service.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
@@ -16,7 +17,10 @@ from service.pipeline.options import (
     RobustMode,
 )
 
-__all__ = ["Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
+if TYPE_CHECKING:
+    from service.deliveries.rows import Delivery
+
+__all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
 
 _EXAMPLE: dict[str, Any] = {
     "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
@@ -54,6 +58,7 @@ _EXAMPLE: dict[str, Any] = {
     "started_at": "2025-01-31T12:00:00Z",
     "finished_at": None,
     "error": None,
+    "deliveries": [],
     "links": {
         "self": "/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
         "events": "/v1/jobs/5f2c8e0e6c0d4a3f9d1b7a52c4e86f10/events",
@@ -168,6 +173,32 @@ class Links(BaseModel):
     trajectories: str | None = None
 
 
+class DeliveryView(BaseModel):
+    """A webhook or an upload to a printer, and what became of it."""
+
+    kind: Literal["webhook", "printer"]
+    target: str = Field(description="The printer, or the webhook's address without its path.")
+    state: Literal["waiting", "sending", "done", "failed"]
+    attempts: int
+    next_at: datetime | None = Field(description="When it is tried again; null: it is not.")
+    error: str | None = Field(description="What went wrong the last time.")
+
+    @classmethod
+    def of(cls, delivery: Delivery) -> DeliveryView:
+        """Return the view of a delivery."""
+        kind, target = delivery.kind, delivery.target
+        return cls.model_validate(
+            {
+                "kind": kind,
+                "target": str(read_url(target)) if kind == "webhook" else target,
+                "state": delivery.state,
+                "attempts": delivery.attempts,
+                "next_at": _moment(delivery.next_at) if delivery.state == "waiting" else None,
+                "error": delivery.error,
+            }
+        )
+
+
 class JobView(BaseModel):
     """A job as its owner sees it."""
 
@@ -202,6 +233,9 @@ class JobView(BaseModel):
     finished_at: datetime | None
     error: dict[str, Any] | None = Field(
         description="Why the job failed, as a problem document (RFC 9457)."
+    )
+    deliveries: list[DeliveryView] = Field(
+        default=[], description="What goes out once it is over; empty in lists and events."
     )
     links: Links
 

@@ -107,6 +107,10 @@ class Sender:
         """Look at the table now."""
         self._wake.set()
 
+    def deliveries_of(self, job_id: str) -> list[Delivery]:
+        """Return what goes out for a job, and how that stands."""
+        return rows.deliveries_of(self._engine, [job_id]).get(job_id, [])
+
     def _run(self) -> None:
         away = False
         while not self._stopping.is_set():

@@ -236,6 +236,8 @@ def test_metrics_are_for_admins_and_this_computer(world: World):
     local = TestClient(world.app, base_url="http://localhost", client=("127.0.0.1", 50000))
     assert local.get("/metrics").status_code == 200
     assert local.get("/v1/jobs").status_code == 401
+    rebound = {"Host": "evil.example"}
+    assert local.get("/metrics", headers=rebound).status_code == 401
 
 
 def _undescribed(router: Any) -> Iterator[str]:
