@@ -7,8 +7,8 @@ and matters here:
   future: so futures are dropped when they are done, and a job is claimed in the database.
 - Cancelling a task does not stop one that runs: so workers ask the database.
 - Workers end when their scheduler does: so `stillpath worker` starts them again.
-- A worker of a `LocalCluster` that is away for longer than ``lost-worker-timeout`` is written off for
-  good: so that is long, and we have it replaced ourselves.
+- A worker of a `LocalCluster` that is away for longer than ``lost-worker-timeout`` is written off
+  for good: so that is long, and we have it replaced ourselves.
 - Whoever reaches a scheduler can run anything on its workers: so ours listens on loopback only, and
   one elsewhere belongs into a closed network or behind TLS (``tls://..``, Dask's own settings).
 """
@@ -122,7 +122,7 @@ class Cluster:
         """
         with self._explained() as client:
             threads = client.sync(client.scheduler.ncores, callback_timeout=_TIMEOUT_S)
-            slots = sum(threads.values())
+            slots = int(sum(threads.values()))
             if self._local is not None and slots < self._settings.workers:
                 _replace_ended(self._local, self._settings.workers)
         return slots
