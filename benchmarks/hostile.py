@@ -6,6 +6,9 @@ peak of resident memory. MISS marks what is more than linear, too large, or ends
 result or a `GcodeError`.
 
     python benchmarks/hostile.py [NAME ...] [--scale .1] [--methods none,fbf] [--machine ender3]
+        [--firmware marlin]
+
+The full sizes of `tests.fuzz.hostile` are the second ones of ``--scale .5``.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from models.store import load_machine
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file
 from tests.fuzz.hostile import HOSTILE, pieces
+from tests.fuzz.machines import KINDS, machine_of
 
 _EXAMPLE = Path(__file__).parents[1] / "examples" / "ps_ender3_pauses_hept24f.gcode"
 _NOISE_S = 1.0
@@ -36,6 +40,8 @@ _MOST_RSS_MB = 600.0
 def main() -> int:
     arguments = _arguments()
     machine = load_machine(arguments.machine)
+    if arguments.firmware:
+        machine = machine_of(arguments.firmware, arguments.machine)
     methods = arguments.methods.split(",")
     missed = 0
     with tempfile.TemporaryDirectory() as name:
@@ -120,6 +126,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--methods", default="none,fbf")
     parser.add_argument("--machine", default="ender3")
+    parser.add_argument("--firmware", choices=KINDS, help="another than the machine's own")
     parser.add_argument("--limit-mb", type=float, default=3000.0)
     parser.add_argument("--timeout-s", type=float, default=600.0)
     return parser.parse_args()
