@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
+import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Route, expect
 
 from tests.web.visitor import Visitor
 
+LAYERS, POINTS = 3000, 100_000
 NO_WEBGL = """
 const get = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
@@ -149,3 +152,67 @@ def test_curves_are_read_by_keys_and_as_tables(visitor: Visitor, gear: dict[str,
     expect(figure.locator(".readout")).to_have_text(re.compile(r"^\d+:\d\d: As sliced .+ µm"))
     figure.get_by_text("Show as a table").click()
     expect(figure.get_by_role("table")).to_contain_text("Compensated")
+
+
+def long_print() -> tuple[dict[str, Any], bytes]:
+    """Index and tile of a print of 6 GB of layer data: a spiral, worst at its end."""
+    turn = np.linspace(0, 600 * np.pi, POINTS)
+    radius = np.linspace(1, 100, POINTS)
+    error = np.linspace(0, 400, POINTS).astype("<u2")
+    on = np.ones(POINTS, "u1")
+    on[0], error[0] = 0, 65535
+    columns = [
+        (radius * np.cos(turn)).astype("<f4"),
+        (radius * np.sin(turn)).astype("<f4"),
+        np.arange(1, POINTS + 1, dtype="<u4"),
+        error,
+        error // 10,
+        np.zeros(POINTS, "u1"),
+        on,
+    ]
+    tile = b"".join(c.tobytes() + bytes(-c.nbytes % 4) for c in columns)
+    figures = {"before": 20.0, "after": 2.0}
+    layers = [
+        {"n": k, "name": str(k), "z_mm": round(0.2 * (k + 1), 3), "points": POINTS, "seconds": 60.0}
+        | {"offset": k * len(tile), "bytes": len(tile), "rms_um": figures, "max_um": figures}
+        for k in range(LAYERS)
+    ]
+    index = {"version": 1, "channels": ["before", "after"], "features": ["outer wall"]}
+    return index | {"scale_um": 40, "bounds_mm": [-100, -100, 100, 100], "layers": layers}, tile
+
+
+def test_a_long_print_is_fetched_as_far_as_it_is_looked_at(visitor: Visitor, gear: dict[str, Any]):
+    index, tile = long_print()
+    asked: list[int] = []
+
+    def answer(route: Route) -> None:
+        k = route.request.url.rpartition("/")[2]
+        if k == "layers":
+            route.fulfill(body=json.dumps(index), content_type="application/json")
+            return
+        asked.append(int(k))
+        route.fulfill(body=tile, content_type="application/octet-stream")
+
+    page = visitor.open("#/")
+    page.route(re.compile(r"/layers(/\d+)?$"), answer)
+    page.goto(f"{visitor.url}/#/jobs/{gear['id']}")
+    settled(page)
+    slider = page.get_by_role("slider", name="Layer")
+    slider.evaluate(
+        """slider => {
+          for (let k = 0; k < 1000; k += 1) {
+            slider.value = k;
+            slider.dispatchEvent(new Event("input"));
+          }
+        }"""
+    )
+    settled(page)
+    expect(page.locator(".layers output")).to_contain_text(f"1000 of {LAYERS}")
+    assert 999 in asked
+    assert len(asked) < 30  # not a thousand
+    page.get_by_role("button", name="Worst point of this layer").click()
+    expect(page.locator(".layers .readout")).to_have_text(
+        f"Line {POINTS} · outer wall · As sliced 40.0 µm, Compensated 4.00 µm"
+    )
+    page.get_by_text("All layers as a table").click()
+    assert page.locator(".layers tbody tr").count() <= 100  # the rest when it is asked for

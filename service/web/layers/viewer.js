@@ -29,8 +29,9 @@ export async function layerView(where, labels, signal) {
   /** @type {import("./tiles.js").Tile | null} */
   let tile = null;
   let shown = -1; // the layer that is drawn
-  let wanted = -1; // the layer that the slider names
+  let wanted = -1; // the layer that the slider names; it may still be on its way
   let marked = -1;
+  let isLoading = false;
 
   const last = index.layers.length - 1;
   const slider = h("input", { type: "range", id: "layer", min: "0", max: String(last), value: "0", step: "1", disabled: last === 0 });
@@ -49,9 +50,8 @@ export async function layerView(where, labels, signal) {
     stage.setChannels(mode === "both" ? both : [mode]);
   }
 
-  async function go(/** @type {number} */ k) {
+  function go(/** @type {number} */ k) {
     if (k < 0 || k > last || k === wanted) return;
-    const direction = k >= wanted ? 1 : -1;
     wanted = k;
     slider.value = String(k);
     const layer = index.layers[k];
@@ -59,21 +59,29 @@ export async function layerView(where, labels, signal) {
     fill(name, `${k + 1} of ${last + 1}`, h("small", null, `z ${layer.z_mm} mm`));
     slider.setAttribute("aria-valuetext", `Layer ${layer.name}, z ${layer.z_mm} millimetres`);
     stage.element.setAttribute("aria-label", `Path of layer ${text}, coloured by contour error. Arrow keys move, plus and minus zoom, brackets change the layer, comma and full stop walk along the path.`);
+    if (!isLoading) load();
+  }
+
+  /** Show the layer that is wanted; those that the slider passed meanwhile are left out. */
+  async function load() {
+    isLoading = true;
     stage.element.setAttribute("aria-busy", "true");
-    try {
-      const found = await tiles.get(k, direction);
-      if (wanted !== k || signal.aborted) return;
-      [tile, shown] = [found, k];
-      stage.setTile(tile);
-      point(-1);
-      fill(fault);
-      stage.element.removeAttribute("aria-busy");
-    } catch (error) {
-      if (isAbort(error) || wanted !== k) return;
-      wanted = shown;
-      stage.element.removeAttribute("aria-busy");
-      fill(fault, problemPanel(error));
+    while (shown !== wanted && !signal.aborted) {
+      const k = wanted;
+      try {
+        tile = await tiles.get(k, k >= shown ? 1 : -1);
+        shown = k;
+        stage.setTile(tile);
+        point(-1);
+        fill(fault);
+      } catch (error) {
+        if (isAbort(error)) break;
+        fill(fault, problemPanel(error));
+        if (wanted === k) wanted = shown;
+      }
     }
+    stage.element.removeAttribute("aria-busy");
+    isLoading = false;
   }
 
   function point(/** @type {number} */ k) {
