@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import structlog
 
+from service.jobs.preload import quiet_dask
 from service.jobs.state import Job
 from service.jobs.worker import Runner, run_job
 from service.settings import Settings
@@ -37,7 +38,6 @@ _TIMEOUT_S = 10
 _SECRETS = {"first_key", "webhook_secret"}
 
 DASK_SETTINGS: dict[str, Any] = {
-    "logging": {"distributed": "critical"},
     # We count losses ourselves.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.scheduler.work-stealing": False,
@@ -195,10 +195,13 @@ class Cluster:
 
 
 def prepare_dask() -> None:
-    """Set Dask up for this process; to be called before `distributed` is imported."""
+    """Set Dask up for this process; before anything of `distributed` is used."""
     import dask
 
     dask.config.set(DASK_SETTINGS)
+    import distributed  # noqa: F401  it sets up logs of its own
+
+    quiet_dask()
 
 
 def runner_name(runner: Runner) -> str:

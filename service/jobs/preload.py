@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import signal
 from typing import Any
 
-__all__ = ["dask_setup"]
+__all__ = ["dask_setup", "quiet_dask"]
 
 
 async def dask_setup(worker: Any) -> None:
     """Set up a worker process; Dask calls it by this name."""
+    quiet_dask()
     # Ctrl-C goes to the whole terminal group; the service ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if not hasattr(signal, "SIGKILL"):
@@ -24,3 +26,9 @@ async def dask_setup(worker: Any) -> None:
 
     # Supervisors send it to all processes at once.
     loop.add_signal_handler(signal.SIGTERM, close)
+
+
+def quiet_dask() -> None:
+    """Silence Dask's own logs; what of it matters for a job is said with the job's name."""
+    for name in ("distributed", "distributed.client", "tornado", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -124,11 +124,12 @@ class Reconciler:
             except (DatabaseAway, ClusterAway) as error:
                 self._say(str(error))
                 self.slots = 0
-                self._steady_since = time.monotonic()
                 if isinstance(error, ClusterAway):
                     self._in_flight.clear()
                     self._cluster.disconnect()
                 self._stopping.wait(wait_s)
+                # From the next try on; it may be the first that works for a long time.
+                self._steady_since = time.monotonic()
                 wait_s = min(2 * wait_s, _LONGEST_RETRY_S)
             except Exception:
                 self._log.exception("reconciler broke")

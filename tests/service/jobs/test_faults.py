@@ -83,7 +83,7 @@ def test_a_service_that_is_stopped_gives_its_jobs_back(site: Site, to: str):
                 with contextlib.suppress(psutil.NoSuchProcess):
                     process.send_signal(signal.SIGTERM)
         assert first.stop() == 0
-        assert not any(_lives(process) for process in family)
+        until(lambda: not any(_lives(process) for process in family))
         job = site.get(job_id)
         assert (job.state, job.losses) == (JobState.QUEUED, 0)
     with site.work():
