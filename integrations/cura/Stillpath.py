@@ -19,18 +19,11 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError
 from urllib.parse import quote, urlencode, urlsplit
-from urllib.request import (
-    HTTPHandler,
-    HTTPRedirectHandler,
-    HTTPSHandler,
-    ProxyHandler,
-    Request,
-    build_opener,
-)
 
 from UM.Application import Application
 from UM.Logger import Logger
@@ -119,6 +112,13 @@ _SETTINGS: dict[str, dict[str, Any]] = {
         "minimum_value": "0.5",
         "maximum_value": "50",
     },
+    "times": {
+        "label": "Times",
+        "description": "Times in the G-code: of the compensated print, or as Cura wrote them.",
+        "type": "enum",
+        "options": {"new": "new", "kept": "as sliced"},
+        "default_value": "new",
+    },
     "reports": {
         "label": "Folder of reports",
         "description": "A page with figures for every print is written there. Empty: none.",
@@ -191,12 +191,9 @@ class Stillpath(Script):
     def _on_server(self, source: Path, target: Path, name: str) -> bytes:
         if not self._value("machine"):
             raise Failure("no machine is chosen; the server needs its name")
-        try:
-            client = Service(self._value("server"), self._value("key"), timeout_s=_PATIENCE_S)
-            options = {"machine": self._value("machine"), **self._options()}
-            return client.compensate(source, target, name, options)
-        except ServiceError as error:
-            raise Failure(error) from None
+        client = Service(self._value("server"), self._value("key"), timeout_s=_PATIENCE_S)
+        options = {"machine": self._value("machine"), "name": name, **self._options()}
+        return client.compensate(source, target, options)
 
     def _write_report(self, page: bytes, name: str) -> str:
         if not self._value("reports"):
@@ -235,7 +232,8 @@ class Stillpath(Script):
         return told[1].strip() if told else ""
 
     def _options(self) -> dict[str, Any]:
-        options = {name: self._value(name) for name in ("method", "robust", "tolerance_um")}
+        names = ("method", "robust", "tolerance_um", "times")
+        options = {name: self._value(name) for name in names}
         return options if options["method"] == "fbf" else {**options, "robust": "off"}
 
     def _value(self, key: str) -> Any:
@@ -246,10 +244,6 @@ class Stillpath(Script):
         if _SETTINGS[key]["type"] == "float":
             return float(str(value).replace(",", "."))
         return str(value).strip()
-
-
-class Failure(Exception):
-    """It was not done: the reason, for the user."""
 
 
 def _joined(data: list[str]) -> tuple[str, list[int]]:
@@ -340,12 +334,12 @@ def _show(text: str, kind: str) -> None:
 # Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
 
 
-class ServiceError(Exception):
-    """The service did not do it; `refused`: nor would it at another try."""
+class Failure(Exception):
+    """It was not done: one line for the user; code 1: another try may help, 2: it will not."""
 
-    def __init__(self, message: str, refused: bool = False) -> None:
-        super().__init__(message)
-        self.refused = refused
+    def __init__(self, message: object, code: int = 2) -> None:
+        super().__init__(" ".join(str(message).split()))
+        self.code = code
 
 
 class Service:
@@ -376,27 +370,19 @@ class Service:
     ) -> None:
         parts = urlsplit(address)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ServiceError(
-                f"{address!r} is not the address of a server; one looks like http://127.0.0.1:8000",
-                refused=True,
-            )
+            raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
         self._address = address.rstrip("/")
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
         self._tell = tell
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
-        handlers: list[Any] = [_NoRedirection(), _Http(), _Https()]
+        handlers: list[Any] = [_Web()]
         if parts.hostname in ("localhost", "127.0.0.1", "::1"):
-            handlers.append(ProxyHandler({}))
-        self._opener = build_opener(*handlers)
+            handlers.append(urllib.request.ProxyHandler({}))
+        self._opener = urllib.request.build_opener(*handlers)
 
     def compensate(
-        self,
-        source: Path,
-        target: Path,
-        name: str,
-        options: Mapping[str, Any],
-        wait_s: float | None = None,
+        self, source: Path, target: Path, options: Mapping[str, Any], wait_s: float | None = None
     ) -> bytes:
         """Send a file, wait, fetch the result and return the page of the report.
 
@@ -404,42 +390,41 @@ class Service:
         ----------
         source, target : Path
             The target is written in place: guard it.
-        name : str
-            What the file is called in the report.
         options : dict
-            `machine` and other parameters of a job.
+            `machine`, `name` (of the file, in the report) and other parameters of a job.
         wait_s : float, optional
             Give up after this time.
 
         Raises
         ------
-        ServiceError
+        Failure
         """
         self._tell("asking the server", None)
         machine = quote(options["machine"], safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
-        job = self._send(source, name, options)
+        job = self._send(source, options)
         path = f"/v1/jobs/{job}"
         try:
             self._wait(path, wait_s)
-            self._fetch(f"{path}/result", target)
+            self._ask(
+                "GET", f"{path}/result", self._timeout_s, take=lambda a: self._save(a, target)
+            )
             return self._ask("GET", f"{path}/report", self._timeout_s)
         finally:
             self._forget(path)
 
-    def _send(self, source: Path, name: str, options: Mapping[str, Any]) -> str:
+    def _send(self, source: Path, options: Mapping[str, Any]) -> str:
         size = source.stat().st_size
-        sent = {key: value for key, value in options.items() if value is not None}
-        query = urlencode({**sent, "name": name[-255:]}, errors="replace")
-        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        # A job of our own: it is deleted behind us, also if others send the same file.
+        given = {**options, "name": options["name"][-255:], "fresh": "true"}
+        query = urlencode(given, errors="replace")
         with source.open("rb") as file:
             body = _Told(file, size, lambda share: self._tell("sending", share))
-            answer = self._ask("POST", f"/v1/jobs?{query}", 0.0, body=body, headers=headers)
-        job = self._document(answer)
+            job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
         if job.get("source_bytes") != size:
             self._forget(f"/v1/jobs/{job.get('id')}")
-            raise ServiceError(f"sent {size} bytes, but {job.get('source_bytes')} arrived")
+            raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
         return str(job["id"])
 
     def _wait(self, path: str, wait_s: float | None) -> None:
@@ -452,46 +437,31 @@ class Service:
             if state == "failed":
                 problem = job.get("error") or {}
                 reason = problem.get("detail", "the server does not say why")
-                raise ServiceError(reason, refused=problem.get("status", 500) < 500)
+                raise Failure(reason, 2 if problem.get("status", 500) < 500 else 1)
+            if state == "cancelled":
+                raise Failure("the job was cancelled on the server")
             if wait_s is not None and time.monotonic() - began > wait_s:
-                raise ServiceError(f"not done within {wait_s:.0f} s; given up")
+                raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
             waiting = job.get("queue_position")
             stage = f"waiting behind {waiting} jobs" if waiting else job.get("stage") or "waiting"
             self._tell(stage, job.get("progress"))
             time.sleep(pause_s)
             pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
 
-    def _fetch(self, path: str, target: Path) -> None:
-        for attempts_left in (2, 1, 0):
-            try:
-                self._fetch_once(path, target)
-                return
-            except _Broken as error:
-                if not attempts_left:
-                    reason = f"the result cannot be fetched from {self._address}: {error}"
-                    raise ServiceError(reason) from None
-
-    def _fetch_once(self, path: str, target: Path) -> None:
-        with self._open("GET", path) as answer, target.open("wb") as file:
-            expected = int(answer.headers.get("Content-Length") or -1)
-            read = 0
-            while True:
-                try:
-                    chunk = answer.read(1 << 18)
-                except (OSError, http.client.HTTPException) as error:
-                    raise _Broken(str(error) or type(error).__name__) from None
-                if not chunk:
-                    break
-                file.write(chunk)
-                read += len(chunk)
+    def _save(self, answer: Any, target: Path) -> bytes:
+        expected = int(answer.headers.get("Content-Length") or -1)
+        read = 0
+        with target.open("wb") as file:
+            while chunk := _read(answer, 1 << 18):
+                read += file.write(chunk)
                 self._tell("fetching", read / expected if expected > 0 else None)
         if not read or read != expected >= 0:
             raise _Broken(f"{read} of {expected} bytes came")
+        return b""
 
     def _forget(self, path: str) -> None:
-        """Delete the job: what is not fetched by then is not wanted any more."""
-        # Gone, or the server is: either way there is nothing left to do.
-        with contextlib.suppress(ServiceError, _Broken):
+        """Delete the job, unless it is gone, or the server: nobody wants it any more."""
+        with contextlib.suppress(Failure, _Broken):
             self._open("DELETE", path, timeout_s=min(5.0, self._timeout_s)).close()
 
     def _ask(
@@ -499,36 +469,32 @@ class Service:
         method: str,
         path: str,
         patience_s: float,
-        body: Any = None,
-        headers: Mapping[str, str] | None = None,
+        body: _Told | None = None,
+        take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
-        """Return the answer; what may pass by itself is tried again for some time."""
+        """Return what is taken of the answer; what may pass by itself is tried for some time."""
         deadline, pause_s = time.monotonic() + patience_s, 0.2
         while True:
             try:
-                with self._open(method, path, body, headers) as answer:
-                    return bytes(answer.read())
-            except (_Broken, OSError, http.client.HTTPException) as error:
+                with self._open(method, path, body) as answer:
+                    return take(answer)
+            except _Broken as error:
                 if time.monotonic() + pause_s > deadline:
-                    raise ServiceError(f"no answer from {self._address}: {error}") from None
+                    raise Failure(f"no answer from {self._address}: {error}", 1) from None
             self._tell("the server does not answer; trying again", None)
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
 
     def _open(
-        self,
-        method: str,
-        path: str,
-        body: Any = None,
-        headers: Mapping[str, str] | None = None,
-        timeout_s: float | None = None,
+        self, method: str, path: str, body: _Told | None = None, timeout_s: float | None = None
     ) -> Any:
-        """Return the open answer; raise `ServiceError` if it is no, `_Broken` if there is none."""
-        request = Request(
-            self._address + path,
-            data=body,
-            headers={**self._headers, **(headers or {})},
-            method=method,
+        """Return the open answer; raise `Failure` if it is no, `_Broken` if there is none."""
+        headers = dict(self._headers)
+        if body is not None:
+            headers["Content-Type"] = "application/octet-stream"
+            headers["Content-Length"] = str(body.size)
+        request = urllib.request.Request(
+            self._address + path, data=body, headers=headers, method=method
         )
         try:
             return self._opener.open(request, timeout=timeout_s or self._timeout_s)
@@ -541,33 +507,43 @@ class Service:
             raise _Broken(str(getattr(error, "reason", "") or error)) from None
 
     def _document(self, answer: bytes) -> dict[str, Any]:
-        try:
-            document = json.loads(answer)
-        except ValueError:
-            document = None
-        if not isinstance(document, dict):
-            raise ServiceError(f"{self._address} answers, but not as a Stillpath server")
+        document = _object(answer)
+        if not document:
+            raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
-    def _refusal(self, error: HTTPError) -> ServiceError:
+    def _refusal(self, error: HTTPError) -> Failure:
         """Return the error for an answer of status 300 or above."""
-        try:
-            document = json.loads(error.read(1 << 16))
-        except (ValueError, OSError, http.client.HTTPException):
-            document = None
-        reason = document.get("detail") if isinstance(document, dict) else None
-        reason = reason or f"{self._address} answers {error.code} {error.reason}"
+        reason = f"{self._address} answers {error.code} {error.reason}"
+        with contextlib.suppress(_Broken):
+            reason = _object(_read(error, 1 << 16)).get("detail") or reason
         if error.code == 401:
             reason = f"the server does not accept the key (401): {reason}"
         elif 300 <= error.code < 400:
             reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
         elif error.code == 404 and "/v1/jobs/" in error.url:
             reason = f"the job was cancelled on the server: {reason}"
-        return ServiceError(reason, refused=error.code < 500)
+        return Failure(reason, 2 if error.code < 500 else 1)
 
 
 class _Broken(Exception):
     """There is no answer, or not all of it: another try may bring it."""
+
+
+def _read(answer: Any, size: int | None = None) -> bytes:
+    try:
+        return bytes(answer.read(size))
+    except (OSError, http.client.HTTPException) as error:
+        raise _Broken(str(error) or type(error).__name__) from None
+
+
+def _object(answer: bytes) -> dict[str, Any]:
+    """Return a JSON object, empty for anything else."""
+    try:
+        found = json.loads(answer)
+    except ValueError:
+        found = None
+    return found if isinstance(found, dict) else {}
 
 
 class _EarlyAnswer(http.client.HTTPConnection):
@@ -584,29 +560,27 @@ class _EarlyAnswerTls(_EarlyAnswer, http.client.HTTPSConnection):
     pass
 
 
-class _Http(HTTPHandler):
-    def http_open(self, request: Request) -> Any:
+class _Web(
+    urllib.request.HTTPHandler, urllib.request.HTTPSHandler, urllib.request.HTTPRedirectHandler
+):
+    def http_open(self, request: Any) -> Any:
         return self.do_open(_EarlyAnswer, request)
 
-
-class _Https(HTTPSHandler):
-    def https_open(self, request: Request) -> Any:
+    def https_open(self, request: Any) -> Any:
         return self.do_open(_EarlyAnswerTls, request)
 
-
-class _NoRedirection(HTTPRedirectHandler):
     def redirect_request(self, *_: Any) -> None:
-        return None
+        """Go nowhere else."""
 
 
 class _Told:
     """A file that tells which share of it has been read."""
 
     def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
-        self._file, self._size, self._tell = file, max(size, 1), tell
+        self._file, self.size, self._tell = file, size, tell
 
     def read(self, size: int = -1) -> bytes:
-        self._tell(min(self._file.tell() / self._size, 1.0))
+        self._tell(min(self._file.tell() / max(self.size, 1), 1.0))
         return self._file.read(size)
 
 

@@ -29,40 +29,24 @@ import sys
 import tempfile
 import time
 import traceback
+import urllib.request
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.error import HTTPError
 from urllib.parse import quote, urlencode, urlsplit
-from urllib.request import (
-    HTTPHandler,
-    HTTPRedirectHandler,
-    HTTPSHandler,
-    ProxyHandler,
-    Request,
-    build_opener,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-    from types import FrameType
     from typing import BinaryIO, NoReturn, TextIO
 
 PROGRAM = "stillpath-post"
-_JOB_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "plate")
+_JOB_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "times", "plate")
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
 _SUFFIXES = (".gcode.3mf", ".gcode", ".bgcode", ".gco", ".g")
 _SHOWN_EVERY_S = 0.1  # on a terminal
 _SAID_EVERY_S = 5.0  # elsewhere
-
-
-class Failure(Exception):
-    """It was not done: one line for the user, and the exit code."""
-
-    def __init__(self, message: object, code: int = 2) -> None:
-        super().__init__(" ".join(str(message).split()))
-        self.code = code
 
 
 class Stopped(BaseException):
@@ -126,17 +110,17 @@ def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
         f"{job.name} for {machine} (printer {(job.printers or ['not named'])[0]}, "
         f"flavour {job.flavour or 'not named'}, to {job.host})"
     )
-    options = {**settings.job_options, "machine": machine}
+    options = {**settings.job_options, "machine": machine, "name": job.name}
     if settings.server:
-        page = _on_server(path, job.name, options, settings, voice)
+        page = _on_server(path, options, settings, voice)
     else:
-        page = _here(path, job.name, options, voice, signals)
+        page = _here(path, options, voice, signals)
     voice.note(f"{job.name} compensated in {time.monotonic() - began:.1f} s")
     if settings.report and page:
         _write_report(page, job, settings, voice)
 
 
-def _here(path: Path, name: str, options: dict[str, Any], voice: Voice, signals: Signals) -> bytes:
+def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -> bytes:
     """Compensate on this computer; heavy imports begin here."""
     try:
         import service.post
@@ -146,6 +130,8 @@ def _here(path: Path, name: str, options: dict[str, Any], voice: Voice, signals:
             f"server: --server URL ({sys.executable})"
         ) from None
     signals.deferred = True  # what a handler raises inside a compiler or a C library gets lost
+
+    name = options.pop("name")
 
     def tell(stage: str, share: float | None) -> None:
         signals.check()
@@ -160,22 +146,15 @@ def _here(path: Path, name: str, options: dict[str, Any], voice: Voice, signals:
     return page.encode()
 
 
-def _on_server(
-    path: Path, name: str, options: dict[str, Any], settings: Settings, voice: Voice
-) -> bytes:
+def _on_server(path: Path, options: dict[str, Any], settings: Settings, voice: Voice) -> bytes:
     """Let a server compensate, and replace the file."""
     before = path.stat()
-    try:
-        client = Service(
-            settings.server, settings.key, timeout_s=settings.timeout, tell=voice.progress
-        )
-        with replacing(path) as temporary:
-            page = client.compensate(path, temporary, name, options, wait_s=settings.wait)
-            now = path.stat()
-            if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-                raise Failure(f"{path} was changed by somebody else while it was processed", 1)
-    except ServiceError as error:
-        raise Failure(error, 2 if error.refused else 1) from None
+    client = Service(settings.server, settings.key, settings.timeout, voice.progress)
+    with replacing(path) as temporary:
+        page = client.compensate(path, temporary, options, settings.wait)
+        now = path.stat()
+        if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
+            raise Failure(f"{path} was changed by somebody else while it was processed", 1)
     return page
 
 
@@ -256,7 +235,8 @@ class Settings:
         self.timeout = _seconds("timeout", given.timeout, read.get("timeout")) or 60.0
         self.wait = _seconds("wait", given.wait, read.get("wait"))
         self.log = _path(given.log or read.get("log"))
-        self.reports = _path(given.reports or read.get("reports")) or _data_dir() / "reports"
+        data = _user_dir("LOCALAPPDATA", "XDG_DATA_HOME", ".local/share")
+        self.reports = _path(given.reports or read.get("reports")) or data / "stillpath" / "reports"
         self.report = not given.no_report
         given.on_error = given.on_error or read.get("on_error", "fail")
         if given.on_error not in ("fail", "keep"):
@@ -316,13 +296,12 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise Failure(f"{path} is not in UTF-8") from None
     try:
         import tomllib
+
+        read = tomllib.loads(text)
     except ImportError:
         read = _plain_toml(text, path)
-    else:
-        try:
-            read = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise Failure(f"{path}: {error}") from None
+    except ValueError as error:
+        raise Failure(f"{path}: {error}") from None
     read = {name.replace("-", "_"): value for name, value in read.items()}
     for name, value in read.items():
         if name == "machines":
@@ -344,8 +323,8 @@ _TOML_LINE = re.compile(
 
 
 def _plain_toml(text: str, path: Path) -> dict[str, Any]:
-    table: dict[str, Any] = {}
-    read = table
+    read: dict[str, Any] = {}
+    table = read
     for number, line in enumerate(text.splitlines(), 1):
         found = _TOML_LINE.fullmatch(line)
         if found is None:
@@ -353,16 +332,13 @@ def _plain_toml(text: str, path: Path) -> dict[str, Any]:
         if found["table"]:
             table = read.setdefault(found["table"], {})
         elif found["name"]:
-            name, value = found["name"], found["value"]
-            quoted = name[0] in "\"'"
-            table[_toml_value(name) if quoted else name] = _toml_value(value)
+            name = found["name"]
+            table[_toml_value(name) if name[0] in "\"'" else name] = _toml_value(found["value"])
     return read
 
 
 def _toml_value(text: str) -> Any:
-    if text[0] == "'":
-        return text[1:-1]
-    return json.loads(text.lstrip("+"))
+    return text[1:-1] if text[0] == "'" else json.loads(text.lstrip("+"))
 
 
 def default_settings_path(environment: Mapping[str, str] = os.environ) -> Path:
@@ -370,10 +346,6 @@ def default_settings_path(environment: Mapping[str, str] = os.environ) -> Path:
     if environment.get("STILLPATH_POST_CONFIG"):
         return Path(environment["STILLPATH_POST_CONFIG"])
     return _user_dir("APPDATA", "XDG_CONFIG_HOME", ".config") / "stillpath" / "post.toml"
-
-
-def _data_dir() -> Path:
-    return _user_dir("LOCALAPPDATA", "XDG_DATA_HOME", ".local/share") / "stillpath"
 
 
 def _user_dir(windows: str, xdg: str, fallback: str) -> Path:
@@ -392,17 +364,14 @@ def _set_up(settings: Settings, voice: Voice) -> None:
         settings.path.touch(mode=0o600)  # it may come to hold a key
         settings.path.write_text(TEMPLATE, encoding="utf-8")
     program = Path(sys.argv[0]).absolute()
+    windows = sys.platform == "win32"
     if program.suffix == ".py":
         command = [sys.executable, str(program)]
-    elif sys.platform == "win32" and program.suffix != ".exe":
-        command = [f"{program}.exe"]  # the launcher that pip makes leaves it out
-    else:
-        command = [str(program)]
-    windows = sys.platform == "win32"
+    else:  # the launcher that pip makes leaves the .exe out
+        command = [str(program.with_suffix(".exe") if windows else program)]
     line = subprocess.list2cmdline(command) if windows else " ".join(map(shlex.quote, command))
     voice.out(f"settings: {settings.path}")
-    voice.out("line for the slicer's field of post-processing scripts:")
-    voice.out(f"  {line}")
+    voice.out(f"line for the slicer's field of post-processing scripts:\n  {line}")
 
 
 class Voice:
@@ -435,15 +404,11 @@ class Voice:
 
     def note(self, text: str) -> None:
         """Say what the user may want to know."""
-        self._clear()
-        self.out(f"{PROGRAM}: {text}")
-        self._append(text)
+        self._say(sys.stdout, text)
 
     def fail(self, text: str) -> None:
         """Say what went wrong."""
-        self._clear()
-        self._write(sys.stderr, f"{PROGRAM}: {text}\n")
-        self._append(text)
+        self._say(sys.stderr, text)
 
     def out(self, text: str) -> None:
         """Write one line to stdout."""
@@ -451,15 +416,16 @@ class Voice:
 
     def trace(self, text: str) -> None:
         """Keep what only a programmer understands."""
-        if self.log is not None:
-            self._append(text)
-        else:
+        if self.log is None:
             self._write(sys.stderr, text)
+        self._append(text)
 
-    def _clear(self) -> None:
+    def _say(self, stream: TextIO | None, text: str) -> None:
         if self._line:
             self._write(sys.stderr, "\r" + 80 * " " + "\r")
             self._line = False
+        self._write(stream, f"{PROGRAM}: {text}\n")
+        self._append(text)
 
     def _append(self, text: str) -> None:
         if self.log is None:
@@ -503,7 +469,7 @@ class Signals:
         if self._received:
             raise Stopped(self._received)
 
-    def _on(self, number: int, _: FrameType | None) -> None:
+    def _on(self, number: int, _: object) -> None:
         if self.deferred and not self._received:
             self._received = number
         else:
@@ -513,12 +479,12 @@ class Signals:
 # Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
 
 
-class ServiceError(Exception):
-    """The service did not do it; `refused`: nor would it at another try."""
+class Failure(Exception):
+    """It was not done: one line for the user; code 1: another try may help, 2: it will not."""
 
-    def __init__(self, message: str, refused: bool = False) -> None:
-        super().__init__(message)
-        self.refused = refused
+    def __init__(self, message: object, code: int = 2) -> None:
+        super().__init__(" ".join(str(message).split()))
+        self.code = code
 
 
 class Service:
@@ -549,27 +515,19 @@ class Service:
     ) -> None:
         parts = urlsplit(address)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ServiceError(
-                f"{address!r} is not the address of a server; one looks like http://127.0.0.1:8000",
-                refused=True,
-            )
+            raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
         self._address = address.rstrip("/")
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
         self._tell = tell
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
-        handlers: list[Any] = [_NoRedirection(), _Http(), _Https()]
+        handlers: list[Any] = [_Web()]
         if parts.hostname in ("localhost", "127.0.0.1", "::1"):
-            handlers.append(ProxyHandler({}))
-        self._opener = build_opener(*handlers)
+            handlers.append(urllib.request.ProxyHandler({}))
+        self._opener = urllib.request.build_opener(*handlers)
 
     def compensate(
-        self,
-        source: Path,
-        target: Path,
-        name: str,
-        options: Mapping[str, Any],
-        wait_s: float | None = None,
+        self, source: Path, target: Path, options: Mapping[str, Any], wait_s: float | None = None
     ) -> bytes:
         """Send a file, wait, fetch the result and return the page of the report.
 
@@ -577,42 +535,41 @@ class Service:
         ----------
         source, target : Path
             The target is written in place: guard it.
-        name : str
-            What the file is called in the report.
         options : dict
-            `machine` and other parameters of a job.
+            `machine`, `name` (of the file, in the report) and other parameters of a job.
         wait_s : float, optional
             Give up after this time.
 
         Raises
         ------
-        ServiceError
+        Failure
         """
         self._tell("asking the server", None)
         machine = quote(options["machine"], safe="")
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
-        job = self._send(source, name, options)
+        job = self._send(source, options)
         path = f"/v1/jobs/{job}"
         try:
             self._wait(path, wait_s)
-            self._fetch(f"{path}/result", target)
+            self._ask(
+                "GET", f"{path}/result", self._timeout_s, take=lambda a: self._save(a, target)
+            )
             return self._ask("GET", f"{path}/report", self._timeout_s)
         finally:
             self._forget(path)
 
-    def _send(self, source: Path, name: str, options: Mapping[str, Any]) -> str:
+    def _send(self, source: Path, options: Mapping[str, Any]) -> str:
         size = source.stat().st_size
-        sent = {key: value for key, value in options.items() if value is not None}
-        query = urlencode({**sent, "name": name[-255:]}, errors="replace")
-        headers = {"Content-Type": "application/octet-stream", "Content-Length": str(size)}
+        # A job of our own: it is deleted behind us, also if others send the same file.
+        given = {**options, "name": options["name"][-255:], "fresh": "true"}
+        query = urlencode(given, errors="replace")
         with source.open("rb") as file:
             body = _Told(file, size, lambda share: self._tell("sending", share))
-            answer = self._ask("POST", f"/v1/jobs?{query}", 0.0, body=body, headers=headers)
-        job = self._document(answer)
+            job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
         if job.get("source_bytes") != size:
             self._forget(f"/v1/jobs/{job.get('id')}")
-            raise ServiceError(f"sent {size} bytes, but {job.get('source_bytes')} arrived")
+            raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
         return str(job["id"])
 
     def _wait(self, path: str, wait_s: float | None) -> None:
@@ -625,46 +582,31 @@ class Service:
             if state == "failed":
                 problem = job.get("error") or {}
                 reason = problem.get("detail", "the server does not say why")
-                raise ServiceError(reason, refused=problem.get("status", 500) < 500)
+                raise Failure(reason, 2 if problem.get("status", 500) < 500 else 1)
+            if state == "cancelled":
+                raise Failure("the job was cancelled on the server")
             if wait_s is not None and time.monotonic() - began > wait_s:
-                raise ServiceError(f"not done within {wait_s:.0f} s; given up")
+                raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
             waiting = job.get("queue_position")
             stage = f"waiting behind {waiting} jobs" if waiting else job.get("stage") or "waiting"
             self._tell(stage, job.get("progress"))
             time.sleep(pause_s)
             pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
 
-    def _fetch(self, path: str, target: Path) -> None:
-        for attempts_left in (2, 1, 0):
-            try:
-                self._fetch_once(path, target)
-                return
-            except _Broken as error:
-                if not attempts_left:
-                    reason = f"the result cannot be fetched from {self._address}: {error}"
-                    raise ServiceError(reason) from None
-
-    def _fetch_once(self, path: str, target: Path) -> None:
-        with self._open("GET", path) as answer, target.open("wb") as file:
-            expected = int(answer.headers.get("Content-Length") or -1)
-            read = 0
-            while True:
-                try:
-                    chunk = answer.read(1 << 18)
-                except (OSError, http.client.HTTPException) as error:
-                    raise _Broken(str(error) or type(error).__name__) from None
-                if not chunk:
-                    break
-                file.write(chunk)
-                read += len(chunk)
+    def _save(self, answer: Any, target: Path) -> bytes:
+        expected = int(answer.headers.get("Content-Length") or -1)
+        read = 0
+        with target.open("wb") as file:
+            while chunk := _read(answer, 1 << 18):
+                read += file.write(chunk)
                 self._tell("fetching", read / expected if expected > 0 else None)
         if not read or read != expected >= 0:
             raise _Broken(f"{read} of {expected} bytes came")
+        return b""
 
     def _forget(self, path: str) -> None:
-        """Delete the job: what is not fetched by then is not wanted any more."""
-        # Gone, or the server is: either way there is nothing left to do.
-        with contextlib.suppress(ServiceError, _Broken):
+        """Delete the job, unless it is gone, or the server: nobody wants it any more."""
+        with contextlib.suppress(Failure, _Broken):
             self._open("DELETE", path, timeout_s=min(5.0, self._timeout_s)).close()
 
     def _ask(
@@ -672,36 +614,32 @@ class Service:
         method: str,
         path: str,
         patience_s: float,
-        body: Any = None,
-        headers: Mapping[str, str] | None = None,
+        body: _Told | None = None,
+        take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
-        """Return the answer; what may pass by itself is tried again for some time."""
+        """Return what is taken of the answer; what may pass by itself is tried for some time."""
         deadline, pause_s = time.monotonic() + patience_s, 0.2
         while True:
             try:
-                with self._open(method, path, body, headers) as answer:
-                    return bytes(answer.read())
-            except (_Broken, OSError, http.client.HTTPException) as error:
+                with self._open(method, path, body) as answer:
+                    return take(answer)
+            except _Broken as error:
                 if time.monotonic() + pause_s > deadline:
-                    raise ServiceError(f"no answer from {self._address}: {error}") from None
+                    raise Failure(f"no answer from {self._address}: {error}", 1) from None
             self._tell("the server does not answer; trying again", None)
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
 
     def _open(
-        self,
-        method: str,
-        path: str,
-        body: Any = None,
-        headers: Mapping[str, str] | None = None,
-        timeout_s: float | None = None,
+        self, method: str, path: str, body: _Told | None = None, timeout_s: float | None = None
     ) -> Any:
-        """Return the open answer; raise `ServiceError` if it is no, `_Broken` if there is none."""
-        request = Request(
-            self._address + path,
-            data=body,
-            headers={**self._headers, **(headers or {})},
-            method=method,
+        """Return the open answer; raise `Failure` if it is no, `_Broken` if there is none."""
+        headers = dict(self._headers)
+        if body is not None:
+            headers["Content-Type"] = "application/octet-stream"
+            headers["Content-Length"] = str(body.size)
+        request = urllib.request.Request(
+            self._address + path, data=body, headers=headers, method=method
         )
         try:
             return self._opener.open(request, timeout=timeout_s or self._timeout_s)
@@ -714,33 +652,43 @@ class Service:
             raise _Broken(str(getattr(error, "reason", "") or error)) from None
 
     def _document(self, answer: bytes) -> dict[str, Any]:
-        try:
-            document = json.loads(answer)
-        except ValueError:
-            document = None
-        if not isinstance(document, dict):
-            raise ServiceError(f"{self._address} answers, but not as a Stillpath server")
+        document = _object(answer)
+        if not document:
+            raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
         return document
 
-    def _refusal(self, error: HTTPError) -> ServiceError:
+    def _refusal(self, error: HTTPError) -> Failure:
         """Return the error for an answer of status 300 or above."""
-        try:
-            document = json.loads(error.read(1 << 16))
-        except (ValueError, OSError, http.client.HTTPException):
-            document = None
-        reason = document.get("detail") if isinstance(document, dict) else None
-        reason = reason or f"{self._address} answers {error.code} {error.reason}"
+        reason = f"{self._address} answers {error.code} {error.reason}"
+        with contextlib.suppress(_Broken):
+            reason = _object(_read(error, 1 << 16)).get("detail") or reason
         if error.code == 401:
             reason = f"the server does not accept the key (401): {reason}"
         elif 300 <= error.code < 400:
             reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
         elif error.code == 404 and "/v1/jobs/" in error.url:
             reason = f"the job was cancelled on the server: {reason}"
-        return ServiceError(reason, refused=error.code < 500)
+        return Failure(reason, 2 if error.code < 500 else 1)
 
 
 class _Broken(Exception):
     """There is no answer, or not all of it: another try may bring it."""
+
+
+def _read(answer: Any, size: int | None = None) -> bytes:
+    try:
+        return bytes(answer.read(size))
+    except (OSError, http.client.HTTPException) as error:
+        raise _Broken(str(error) or type(error).__name__) from None
+
+
+def _object(answer: bytes) -> dict[str, Any]:
+    """Return a JSON object, empty for anything else."""
+    try:
+        found = json.loads(answer)
+    except ValueError:
+        found = None
+    return found if isinstance(found, dict) else {}
 
 
 class _EarlyAnswer(http.client.HTTPConnection):
@@ -757,29 +705,27 @@ class _EarlyAnswerTls(_EarlyAnswer, http.client.HTTPSConnection):
     pass
 
 
-class _Http(HTTPHandler):
-    def http_open(self, request: Request) -> Any:
+class _Web(
+    urllib.request.HTTPHandler, urllib.request.HTTPSHandler, urllib.request.HTTPRedirectHandler
+):
+    def http_open(self, request: Any) -> Any:
         return self.do_open(_EarlyAnswer, request)
 
-
-class _Https(HTTPSHandler):
-    def https_open(self, request: Request) -> Any:
+    def https_open(self, request: Any) -> Any:
         return self.do_open(_EarlyAnswerTls, request)
 
-
-class _NoRedirection(HTTPRedirectHandler):
     def redirect_request(self, *_: Any) -> None:
-        return None
+        """Go nowhere else."""
 
 
 class _Told:
     """A file that tells which share of it has been read."""
 
     def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
-        self._file, self._size, self._tell = file, max(size, 1), tell
+        self._file, self.size, self._tell = file, size, tell
 
     def read(self, size: int = -1) -> bytes:
-        self._tell(min(self._file.tell() / self._size, 1.0))
+        self._tell(min(self._file.tell() / max(self.size, 1), 1.0))
         return self._file.read(size)
 
 
@@ -800,11 +746,12 @@ def _parser() -> _Parser:
     add("--server", metavar="URL", help="work on this server instead of on this computer")
     add("--local", action="store_true", help="on this computer, even if the settings name a server")
     add("--key", metavar="KEY", help="key of the server; better in the settings or STILLPATH_KEY")
-    add("--method", metavar="M", help="as of `stillpath compensate`, and so the next five")
+    add("--method", metavar="M", help="as of `stillpath compensate`, and so the next six")
     add("--basis", metavar="B")
     add("--robust", metavar="R")
     add("--along", metavar="W", type=float)
     add("--tolerance-um", metavar="T", type=float)
+    add("--times", choices=("new", "kept"), help="kept: the slicer's times stay in the file")
     add("--plate", metavar="N", type=int)
     add("--on-error", choices=("fail", "keep"), help="keep: print what was sliced, exit code 0")
     add("--reports", metavar="DIR", help="for reports of files that do not stay on this computer")
@@ -825,12 +772,10 @@ class _Parser(argparse.ArgumentParser):
 
 def _seconds(name: str, *given: float | None) -> float | None:
     """Return the first duration that was given."""
-    for value in given:
-        if value is not None:
-            if not 0 < value < 1e7:
-                raise Failure(f"{name} is {value} s; it must be positive")
-            return float(value)
-    return None
+    value = next((value for value in given if value is not None), None)
+    if value is not None and not 0 < value < 1e7:
+        raise Failure(f"{name} is {value} s; it must be positive")
+    return value
 
 
 def _path(text: str | None) -> Path | None:
@@ -838,11 +783,9 @@ def _path(text: str | None) -> Path | None:
 
 
 def _first_line(path: Path) -> str:
-    try:
-        with path.open(encoding="utf-8", errors="surrogateescape") as file:
-            return file.readline().strip()
-    except OSError:
-        return ""
+    with contextlib.suppress(OSError), path.open(encoding="utf-8", errors="surrogateescape") as f:
+        return f.readline().strip()
+    return ""
 
 
 def _unquoted(text: str) -> str:

@@ -140,7 +140,7 @@ import sys
 sys.argv = ["pretend_server.py", {str(data)!r}]
 from service import server
 real = server.serve_forever
-server.serve_forever = lambda settings, host, _: real(settings, host, {port})
+server.serve_forever = lambda settings, host, _, **more: real(settings, host, {port}, **more)
 import runpy
 runpy.run_path({PRETEND[1]!r}, run_name="__main__")
 """
@@ -235,7 +235,7 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
 def test_broken_transfers(
     running: Running, part: Path, tmp_path: Path, oddity: str, code: int, word: str
 ):
-    done = post(*running.odd(oddity), part, home=tmp_path)
+    done = post(*running.odd(oddity), "--timeout", "2", part, home=tmp_path)
     assert_reason(done, code, word)
     assert_untouched(part)
     until(lambda: not running.job_ids())
