@@ -216,3 +216,17 @@ def test_a_long_print_is_fetched_as_far_as_it_is_looked_at(visitor: Visitor, gea
     )
     page.get_by_text("All layers as a table").click()
     assert page.locator(".layers tbody tr").count() <= 100  # the rest when it is asked for
+
+
+def test_trajectories_are_computed_when_asked_for(visitor: Visitor, gear: dict[str, Any]):
+    page = opened(visitor, gear)
+    page.get_by_role("button", name="CSV").click()
+    expect(page.get_by_label("From, s of the print")).to_be_focused()
+    page.get_by_label("From, s of the print").fill("20")
+    page.get_by_label("Length, s").fill("0.5")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Compute and download").click()
+    assert download.value.suggested_filename == "gear.stillpath.20s.csv"
+    rows = download.value.path().read_text("utf-8").splitlines()
+    assert rows[0].startswith("t_s,")
+    assert len(rows) > 400

@@ -3,6 +3,7 @@
 import { h } from "../lib/dom.js";
 import { bytes } from "../lib/format.js";
 import { fileLink } from "../lib/files.js";
+import { openTrajectories } from "./trajectories.js";
 
 /**
  * @param {any} job
@@ -16,5 +17,5 @@ export function downloads(job) {
     fileLink({ text: `G-code${size}`, href: links.result, name: job.result_name, main: true }),
     links.report ? fileLink({ text: "Report", href: links.report, name: `${stem}.report.html`, open: true }) : null,
     links.report_json ? fileLink({ text: "JSON", href: links.report_json, name: `${stem}.report.json` }) : null,
-    links.trajectories ? fileLink({ text: "CSV", href: `${links.trajectories}?format=csv`, name: `${stem}.csv` }) : null);
+    links.trajectories ? h("button", { type: "button", onclick: openTrajectories }, "CSV …") : null);
 }

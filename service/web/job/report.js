@@ -7,6 +7,7 @@ import { problemPanel } from "../lib/problem.js";
 import { folded, longTable, table } from "../parts/table.js";
 import { headline } from "./headline.js";
 import { spectra, trackChart } from "./curves.js";
+import { trajectories } from "./trajectories.js";
 
 /**
  * @param {any} job
@@ -27,6 +28,7 @@ export function reportSections(job, report, signal) {
     spectra(report, channels, labels, signal),
     features(report, channels, labels),
     putBack(report, channels),
+    trajectories(job, signal),
     written(report),
   ].filter((part) => part !== null);
 }

@@ -33,8 +33,13 @@ export function fileLink({ text, href, name, main = false, open = false }) {
   return link;
 }
 
-/** @param {Blob} content @param {string} name */
-function save(content, name) {
+/**
+ * Let the browser save what has been fetched.
+ *
+ * @param {Blob} content
+ * @param {string} name
+ */
+export function save(content, name) {
   const href = URL.createObjectURL(content);
   const link = h("a", { href, download: name });
   document.body.append(link);

@@ -25,12 +25,12 @@ export async function revisionPanel(where, name, signal) {
     const newest = [...revisions].reverse();
     fill(area,
       drift.length ? h("ul.notice", null, drift.map((/** @type {any} */ d) => h("li", null, d.text))) : null,
-      table("Revisions, newest first", [{ title: "Revision", text: true }, { title: "When", text: true }, { title: "Who", text: true }, { title: "Why", text: true }, { title: "Approved", text: true }, { title: h("span.sr", null, "Actions"), text: true }],
+      table("Revisions, newest first", [{ title: "Revision", text: true }, { title: "Who and why", text: true }, { title: "Approved", text: true }],
         newest.map((r, k) => [
-          h("b", null, String(r.number)), when(r.when), r.author, r.restored ? `Back to ${r.restored}. ${r.message}` : r.message || "–",
-          r.approval ? h("span.badge", { dataset: { state: "done" }, title: `${r.approval.author}, ${when(r.approval.when)}` }, r.approval.author) : "–",
+          h("span.stacked", null, h("b", null, String(r.number)), h("small", null, when(r.when))),
+          h("span.stacked", null, r.author, h("small", null, r.restored ? `Back to ${r.restored}. ${r.message}` : r.message || "–")),
           h("div.row-actions", null,
-            r.approval ? null : h("button", { type: "button", "aria-label": `Approve revision ${r.number}`, onclick: () => approve(r.number) }, "Approve"),
+            r.approval ? h("span.badge", { dataset: { state: "done" }, title: when(r.approval.when) }, `by ${r.approval.author}`) : h("button", { type: "button", "aria-label": `Approve revision ${r.number}`, onclick: () => approve(r.number) }, "Approve"),
             k === 0 ? null : h("button", { type: "button", "aria-label": `Go back to revision ${r.number}`, onclick: () => rollBack(r.number, newest[0]) }, "Go back")),
         ])),
       revisions.length > 1 ? comparison(newest) : null);

@@ -70,7 +70,7 @@ function facts(machine) {
   return h("dl.facts", null, [...travel, ...planner, ...command].map(([name, value]) => [h("dt", null, name), h("dd", null, value)]).flat());
 }
 
-/** @param {string} key "max_accel_mm_s2" */
+/** @param {string} key "max_accel_mm_s2" @returns {string} */
 function words(key) {
   const units = { _mm_s2: " [mm/s²]", _mm_s: " [mm/s]", _mm: " [mm]", _s: " [s]" };
   for (const [suffix, unit] of Object.entries(units)) {

@@ -96,7 +96,7 @@ export async function show({ main, signal, setTitle }) {
 /** What few need, folded away. */
 function moreOptions() {
   const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
-  const robust = select("robust", [["", [["off", "The nominal plant: fastest"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
+  const robust = select("robust", [["", [["off", "The nominal plant (fastest)"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
   const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
   const plate = h("input", { type: "number", id: "plate", min: "1", step: "1", placeholder: "the only one" });
   const times = select("times", [["", [["new", "Follow the new motion"], ["kept", "Stay as they are"]]]]);
