@@ -171,6 +171,6 @@ function asTable(chart, told, xText, yText) {
   for (let k = 0; k < chart.at.length; k += step) {
     rows.push([xText(chart.at[k]), ...told.map((s) => (s.values[k] === null ? "–" : yText(/** @type {number} */ (s.values[k]))))]);
   }
-  const note = step > 1 ? h("p.hint", null, `Every ${step}th of ${chart.at.length} values.`) : null;
+  const note = step > 1 ? h("p.hint", null, `One of every ${step} values; ${chart.at.length} in all.`) : null;
   return h("div", null, table(chart.title, [{ title: chart.x.label }, ...told.map((s) => ({ title: `${s.label}${chart.y.label ? `, ${chart.y.label}` : ""}` }))], rows), note);
 }

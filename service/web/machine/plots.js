@@ -18,7 +18,7 @@ export function responsePlots(responses, signal) {
     lineChart({
       title: `Frequency response of the ${axis.axis.toUpperCase()} axis, modulus`, signal, at: axis.nominal.f_hz,
       marks: axis.modes.map((/** @type {any} */ m) => m.f_hz), x: HZ, y: { label: "|G|, mm/mm" },
-      series: [...members(axis.members, "magnitude", axis.nominal.f_hz.length), { label: axis.members.length ? "Nominal; thin: its set" : "Nominal", values: axis.nominal.magnitude, colour: "--after", width: 2.2 }],
+      series: [...members(axis.members, "magnitude", axis.nominal.f_hz.length), { label: axis.members.length ? "Nominal (thin: its set)" : "Nominal", values: axis.nominal.magnitude, colour: "--after", width: 2.2 }],
     }),
     modeTable(axis),
     h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "Where the model was measured is not known."))));
