@@ -69,7 +69,7 @@ async def watch_job(
     return EventSourceResponse(
         _events(hub, job_id, last_event_id),
         ping=_HEARTBEAT_S,
-        ping_message_factory=lambda: ServerSentEvent(comment="still here"),
+        ping_message_factory=lambda: ServerSentEvent(comment="still here", sep="\n"),
         send_timeout=_SEND_TIMEOUT_S,
         sep="\n",
     )

@@ -77,8 +77,7 @@ class Hub:
         """End the poller."""
         if self._poller is not None:
             self._poller.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._poller
+            await asyncio.wait([self._poller])
             self._poller = None
 
     @property
@@ -123,9 +122,11 @@ class Hub:
     async def _poll(self) -> None:
         log = structlog.get_logger("hub")
         while True:
+            # Without watchers nothing is asked. `wait_for` would lose a cancellation that comes
+            # together with a nudge (until Python 3.12).
             with contextlib.suppress(TimeoutError):
-                # Without watchers nothing is asked.
-                await asyncio.wait_for(self._wanted.wait(), _EVERY_S if self._channels else None)
+                async with asyncio.timeout(_EVERY_S if self._channels else None):
+                    await self._wanted.wait()
             self._wanted.clear()
             channels = dict(self._channels)
             if not channels:
