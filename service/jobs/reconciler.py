@@ -32,6 +32,10 @@ _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _ORPHAN_S = 3600.0
 """Files without a row are of an upload, as long as they are younger."""
+_GIVE_BACK_S = 1.5
+"""How long a worker that closes may take to give its job back; it looks twice a second."""
+_UPLOAD_S = 86400.0
+"""Uploads that have not grown for so long were broken off."""
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
 """How long our own workers, which start anew by themselves, and those elsewhere may be away before
@@ -69,6 +73,7 @@ class Reconciler:
         self._sweeper = threading.Thread(target=self._run_sweeps, name="sweeper", daemon=True)
         self._log = structlog.get_logger("reconciler")
         self._in_flight: dict[str, tuple[Job, Future]] = {}
+        self._broken_since: dict[str, float] = {}
         self._has_lease = False
         self._took_over = False
         self._started_at = time.time()
@@ -175,8 +180,20 @@ class Reconciler:
                 self._give_back(job.id, job.attempt, reason)
 
     def _collect(self) -> None:
-        """Drop the futures that are done; a job that still runs by then has lost its worker."""
-        done = {job_id: pair for job_id, pair in self._in_flight.items() if pair[1].done()}
+        """Drop the futures that are done; a job that still runs then has lost its worker.
+
+        Dask hears that a worker closes before the worker could give its job back: a moment's grace.
+        """
+        now = time.monotonic()
+        done = {
+            job_id: pair
+            for job_id, pair in self._in_flight.items()
+            if pair[1].done()
+            and (
+                pair[1].status == "finished"
+                or now - self._broken_since.setdefault(job_id, now) > _GIVE_BACK_S
+            )
+        }
         if not done:
             return
         rows = self._store.many(done)
@@ -190,6 +207,7 @@ class Reconciler:
                 unclaimed = True
                 self._log.warning("not even begun", job=job_id, reason=_reason(future))
             del self._in_flight[job_id]
+            self._broken_since.pop(job_id, None)
         if unclaimed:
             self._stopping.wait(_RETRY_S)  # whatever it is, do not try it a thousand times
 
@@ -243,7 +261,9 @@ class Reconciler:
         if self._cluster.is_own and self._settings.storage_url is None:
             # Nobody else uploads here: what is older than this process is of no upload.
             before = max(before, self._started_at)
-        sweep_incoming([self._settings.data_dir / "incoming"], before=before)
+        # A slow sender may be quiet for long.
+        broken_off = time.time() - _UPLOAD_S
+        sweep_incoming([self._settings.data_dir / "incoming"], before=broken_off)
         forget_expired(self._store, self._storage, keep_days=self._settings.keep_days)
         sweep_files(self._store, self._storage, before=before)
 

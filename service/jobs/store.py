@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -40,6 +41,8 @@ _JOBS = tables.jobs.c
 _FIELDS = tuple(field.name for field in fields(Job))
 _NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
 _OVER = tuple(state.value for state in JobState if state.is_final)
+_CLOCKS_APART = 12
+"""A lease that lasts for longer than so many times what it may was taken before clocks were set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +97,7 @@ class JobStore:
         *,
         idempotency: tuple[str, str] | None = None,
         limits: Quota | None = None,
+        shared: bool = False,
     ) -> Job:
         """Remember a new job, whose input must be stored already.
 
@@ -103,11 +107,13 @@ class JobStore:
         idempotency : (key, fingerprint), optional
             The caller's key, and a digest of the request that came with it.
         limits : Quota, optional
+        shared : bool
+            Whether a job that `find_same` finds will do.
 
         Returns
         -------
         Job
-            `job`, or the one that the same request led to before.
+            `job`, or the one that the same request led to before, or the shared one.
 
         Raises
         ------
@@ -120,6 +126,13 @@ class JobStore:
                 earlier = _earlier(connection, job, *idempotency)
                 if earlier is not None:
                     return earlier
+            if shared or limits is not None:
+                _stand_in_line(connection, job.owner)
+            same = _same(connection, job.owner, job.dedupe_key) if shared else None
+            if same is not None:
+                if idempotency is not None:
+                    _lead_to(connection, job.owner, idempotency[0], {"job_id": same.id})
+                return same
             if limits is not None:
                 _check_quota(connection, job, limits)
             connection.execute(tables.jobs.insert().values(_to_row(job)))
@@ -133,15 +146,8 @@ class JobStore:
 
     def find_same(self, owner: str, dedupe_key: str) -> Job | None:
         """Return the owner's newest job of a dedupe key: one that is done, else under way."""
-        order = case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state)
-        query = (
-            select(tables.jobs)
-            .where(_JOBS.owner == owner, _JOBS.dedupe_key == dedupe_key)
-            .where(_JOBS.state.in_(("done", *_NOT_OVER)))
-            .order_by(order, _JOBS.created_at.desc(), _JOBS.id.desc())
-            .limit(1)
-        )
-        return next(iter(self._jobs(query)), None)
+        with reading(self.engine) as connection:
+            return _same(connection, owner, dedupe_key)
 
     # Looking
 
@@ -354,7 +360,12 @@ class JobStore:
             taken = statement.on_conflict_do_update(
                 index_elements=["name"],
                 set_=row,
-                where=or_(leases.holder == holder, leases.expires_at <= now),
+                where=or_(
+                    leases.holder == holder,
+                    leases.expires_at <= now,
+                    # Of a holder whose clock was far ahead: nobody could wait for that.
+                    leases.expires_at > now + _CLOCKS_APART * seconds,
+                ),
             ).returning(leases.holder)
             return connection.execute(taken).first() is not None
 
@@ -434,13 +445,35 @@ def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Jo
         )
     earlier = _get(connection, known.job_id)
     if earlier is None:  # deleted meanwhile: the request counts anew
-        own = tables.submissions.c
-        connection.execute(
-            update(tables.submissions)
-            .where(and_(own.owner == job.owner, own.idempotency_key == key))
-            .values(row)
-        )
+        _lead_to(connection, job.owner, key, row)
     return earlier
+
+
+def _lead_to(connection: Connection, owner: str, key: str, values: dict[str, Any]) -> None:
+    """Let the request of an idempotency key lead to another job."""
+    row = tables.submissions.c
+    known = and_(row.owner == owner, row.idempotency_key == key)
+    connection.execute(update(tables.submissions).where(known).values(values))
+
+
+def _same(connection: Connection, owner: str, dedupe_key: str) -> Job | None:
+    order = case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state)
+    query = (
+        select(tables.jobs)
+        .where(_JOBS.owner == owner, _JOBS.dedupe_key == dedupe_key)
+        .where(_JOBS.state.in_(("done", *_NOT_OVER)))
+        .order_by(order, _JOBS.created_at.desc(), _JOBS.id.desc())
+        .limit(1)
+    )
+    row = connection.execute(query).one_or_none()
+    return None if row is None else _from_row(row)
+
+
+def _stand_in_line(connection: Connection, owner: str) -> None:
+    """Let submissions of one owner come one after the other, so that none overlooks another."""
+    if connection.dialect.name == "postgresql":  # SQLite has locked all
+        lock = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 7))")
+        connection.execute(lock, {"owner": owner})
 
 
 def _usage(connection: Connection, owner: str) -> tuple[int, int]:
@@ -451,10 +484,6 @@ def _usage(connection: Connection, owner: str) -> tuple[int, int]:
 
 
 def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
-    if connection.dialect.name == "postgresql":
-        # Submissions of one owner one after the other, so that none overlooks another.
-        lock = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 7))")
-        connection.execute(lock, {"owner": job.owner})
     jobs, size = _usage(connection, job.owner)
     if jobs >= limits.max_jobs:
         raise QuotaExceeded(
@@ -505,6 +534,8 @@ def _from_cursor(cursor: str) -> Sequence[Any]:
         created_at, job_id = json.loads(base64.urlsafe_b64decode(padded))
         if type(created_at) not in (float, int) or type(job_id) is not str:
             raise ValueError
+        if not (math.isfinite(created_at) and job_id.isascii() and job_id.isalnum()):
+            raise ValueError  # not all databases take all texts and numbers
         return float(created_at), job_id
     except (ValueError, TypeError, OverflowError):
         raise BadCursor(
