@@ -11,7 +11,7 @@ __all__ = ["PROGRAM", "ROOT", "environment", "finish", "post", "start"]
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = ROOT / "integrations" / "slicers" / "stillpath_post.py"
-_LONGEST_S = 120
+_LONGEST_S = 600
 
 
 def environment(folder: Path, **more: str) -> dict[str, str]:

@@ -115,7 +115,7 @@ def test_a_server_that_dies_at_work(part: Path, tmp_path: Path):
     data.mkdir()
     with server(PRETEND, data) as (client, process):
         there = Running(client, data)
-        posting = start(*there.arguments, "--timeout", "1", part, home=tmp_path)
+        posting = start(*there.arguments, "--timeout", "5", part, home=tmp_path)
         there.running_job()
         process.kill()
         assert_reason(finish(posting), 1, "no answer")
@@ -235,7 +235,7 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
 def test_broken_transfers(
     running: Running, part: Path, tmp_path: Path, oddity: str, code: int, word: str
 ):
-    done = post(*running.odd(oddity), "--timeout", "2", part, home=tmp_path)
+    done = post(*running.odd(oddity), "--timeout", "5", part, home=tmp_path)
     assert_reason(done, code, word)
     assert_untouched(part)
     until(lambda: not running.job_ids())

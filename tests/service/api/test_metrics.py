@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.database.engine import DatabaseAway
 from service.storage.base import StorageError
 from tests.service.api.test_submitting import opened, post
 from tests.service.test_api import assert_problem, over, until
+
+_ENDS = ("started", "finished")
 
 
 def figures(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -43,7 +48,34 @@ def test_figures(tmp_path: Path):
         labels = {("method", "GET"), ("route", "none"), ("status", "404")}
         assert found["stillpath_http_requests_total", frozenset(labels)] == 1
         assert "what-a-caller-wrote" not in answer.text
-        assert "stillpath_job_seconds" in answer.text
+
+
+def test_how_long_jobs_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("service.api.metrics._SETTLED_S", 0.0)
+    with opened(tmp_path) as client:
+        made = [post(client, content) for content in (b"nap 1", b"G1 X1", b"bad")]
+        jobs = [until(client, answer.headers["location"], over) for answer in made]
+        took_s = [seconds_of(job) for job in jobs]
+        assert took_s[0] >= 1
+        for _ in range(2):  # none is counted twice
+            found = figures(client.get("/metrics").text)
+            for state, expected in (("done", took_s[:2]), ("failed", took_s[2:])):
+                labels = {("state", state)}
+                name = "stillpath_job_seconds"
+                assert found[f"{name}_count", frozenset(labels)] == len(expected)
+                total_s = found[f"{name}_sum", frozenset(labels)]
+                assert total_s == pytest.approx(sum(expected), abs=1e-4)
+                for limit in (1.0, 10.0, 600.0):
+                    bucket = frozenset(labels | {("le", str(limit))})
+                    within = sum(seconds <= limit for seconds in expected)
+                    assert found[f"{name}_bucket", bucket] == within
+                bucket = frozenset(labels | {("le", "+Inf")})
+                assert found[f"{name}_bucket", bucket] == len(expected)
+
+
+def seconds_of(job: dict[str, Any]) -> float:
+    started, finished = (datetime.fromisoformat(job[f"{name}_at"]) for name in _ENDS)
+    return (finished - started).total_seconds()
 
 
 def test_not_ready_says_why(tmp_path: Path, monkeypatch):
