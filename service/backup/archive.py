@@ -124,6 +124,7 @@ def restore(source: Path, data_dir: Path) -> Manifest:
         except BaseException:
             shutil.rmtree(fresh)
             raise
+        _hold_back(fresh / DATABASE)
         names = sorted(path.name for path in fresh.iterdir())
         for name in sorted(names, key=lambda name: name == DATABASE):
             (fresh / name).replace(data_dir / name)
@@ -265,6 +266,26 @@ def _unpack(source: Path, folder: Path) -> Manifest:
         while (path := path.parent) != folder and not any(path.iterdir()):
             path.rmdir()
     return manifest
+
+
+def _hold_back(database: Path) -> None:
+    """Let no printer start by itself now, perhaps for the second time."""
+    if not database.exists():
+        return
+    why = "held back: it was due when the backup was made that was restored since"
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+        if {"jobs", "deliveries"} <= tables:
+            connection.execute(
+                "UPDATE deliveries SET state = 'failed', error = ? "
+                "WHERE state IN ('waiting', 'sending') AND kind = 'printer' "
+                "AND job_id IN (SELECT id FROM jobs WHERE print_after)",
+                (why,),
+            )
+            connection.execute(
+                "UPDATE jobs SET print_after = 0 WHERE state IN ('queued', 'running')"
+            )
+        connection.commit()
 
 
 def _write(path: Path, content: IO[bytes]) -> tuple[str, int]:

@@ -119,6 +119,7 @@ def _changed(engine: Engine, before: Delivery, after: Delivery) -> bool:
         update(deliveries)
         .where(
             deliveries.c.id == before.id,
+            deliveries.c.job_id == before.job_id,  # SQLite gives the id of a deleted row again
             deliveries.c.state == before.state,
             deliveries.c.attempts == before.attempts,
         )

@@ -122,6 +122,9 @@ class Sender:
                 if not away:
                     self._log.warning("no deliveries for now", reason=str(error))
                 away, claimed = True, False
+            except Exception:  # a thread that ended would send nothing more, and say nothing
+                self._log.exception("deliveries broke")
+                claimed = False
             if not claimed:
                 self._wake.wait(self._poll_s)
                 self._wake.clear()

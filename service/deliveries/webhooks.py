@@ -95,7 +95,7 @@ def send_webhook(job: Job, target: Target, secret: str, *, delivery: int, now: f
     headers = {
         "Content-Type": "application/json",
         SIGNATURE: sign(secret, int(now), body),
-        "Stillpath-Delivery": str(delivery),
+        "Stillpath-Delivery": f"{job.id}-{delivery}",
         "Stillpath-Event": f"job.{job.state.value}",
     }
     return post(target, headers=headers, content=body, timeout_s=_TIMEOUT_S)

@@ -179,6 +179,8 @@ class KeyStore:
 
     def revoke(self, key_id: str) -> Key | None:
         """End a key at once and for good; return it, or None if there is none of that id."""
+        if not key_id.isalnum():
+            return None
         with writing(self._engine) as connection:
             connection.execute(
                 update(keys)

@@ -16,6 +16,7 @@ from service.backup import archive
 from service.backup.archive import BackupError, back_up, restore
 from service.cli import run
 from service.database.engine import open_database
+from service.deliveries.rows import deliveries_of
 from service.exclusive import exclusive
 from service.jobs.state import JobState
 from service.jobs.store import JobStore
@@ -92,6 +93,22 @@ def test_running_jobs_can_be_taken_up(store, data, tmp_path):
     restore(tmp_path / "b.tar", tmp_path / "new")
     assert jobs(tmp_path / "new") == {job.id: JobState.RUNNING}
     assert list(tree(tmp_path / "new")) == [f"jobs/{job.id}/source/part.gcode"]
+
+
+def test_a_restore_starts_no_print(store, data, tmp_path):
+    waiting, done = (make_job(printer="left", print_after=True) for _ in range(2))
+    for job in (waiting, done):
+        write(data / f"jobs/{job.id}/source/part.gcode", "G28\n")
+        store.add(job)
+    write(data / f"jobs/{done.id}/1/result/part.stillpath.gcode", "G28\n")
+    store.apply(done.id, finished(store.claim(done.id, 1500.0, "w")))
+    back_up(data, tmp_path / "b.tar")
+    restore(tmp_path / "b.tar", tmp_path / "new")
+    engine = open_database(Settings(data_dir=tmp_path / "new"))
+    assert JobStore(engine).get(waiting.id).print_after is False
+    (delivery,) = deliveries_of(engine, [done.id])[done.id]
+    assert (delivery.state, "held back" in delivery.error) == ("failed", True)
+    engine.dispose()
 
 
 def test_while_jobs_come_and_go(store, data, tmp_path):

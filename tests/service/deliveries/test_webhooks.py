@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.deliveries.rows import claim, settle
 from service.deliveries.webhooks import SignatureRefused, sign, verify
 from tests.service.deliveries.listeners import Listener, Seen, until
 from tests.service.deliveries.places import SECRET, Place, open_place
@@ -78,7 +79,9 @@ def test_the_same_body_is_sent_again_with_the_same_delivery(tmp_path: Path):
             delivery = place.settled(job)
     assert (delivery.state, delivery.attempts) == ("done", 4)
     assert len({seen.body for seen in listener.seen}) == 1
-    assert {seen.headers["stillpath-delivery"] for seen in listener.seen} == {str(delivery.id)}
+    assert {seen.headers["stillpath-delivery"] for seen in listener.seen} == {
+        f"{job.id}-{delivery.id}"
+    }
     for seen in listener.seen:
         check(seen)
 
@@ -193,6 +196,17 @@ def test_a_deleted_jobs_delivery_goes_with_it(place: Place):
     place.store.forget(job.id)
     with pytest.raises(KeyError):
         place.delivery(job)
+
+
+def test_the_row_of_a_deleted_job_is_not_taken_for_the_next_one(place: Place):
+    first = place.fail(webhook="http://127.0.0.1:1/")
+    claimed, _ = claim(place.engine, now=time.time(), until=time.time() + 60)
+    place.store.forget(first.id)
+    second = place.fail(webhook="http://127.0.0.1:1/")
+    assert place.delivery(second).id == claimed.id  # SQLite gives it again
+    claim(place.engine, now=time.time(), until=time.time() + 60)
+    assert not settle(place.engine, claimed, "done", next_at=0.0)
+    assert place.delivery(second).state == "sending"
 
 
 @given(st.binary(max_size=200), st.integers(0, 10**10))
