@@ -213,6 +213,7 @@ def test_cancel(client: TestClient):
     assert_problem(client.post(f"/v1/jobs/{'0' * 32}/cancel"), 404)
 
 
+@pytest.mark.slow
 def test_a_restart_continues_what_was_queued_and_running(tmp_path: Path):
     with open_client(tmp_path) as client:
         slow = client.post(JOBS, content=b"slow").headers["location"]

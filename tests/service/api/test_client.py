@@ -264,6 +264,7 @@ def run(*arguments: object, **environment: str) -> subprocess.CompletedProcess[s
     )
 
 
+@pytest.mark.slow
 def test_compensate_with_a_server(address: str, tmp_path: Path):
     source = part(tmp_path, "G1 X31\n")
     target = tmp_path / "out.gcode"
@@ -282,6 +283,7 @@ def test_compensate_with_a_server(address: str, tmp_path: Path):
     assert (done.returncode, "http://127" in done.stderr) == (2, True)
 
 
+@pytest.mark.slow
 def test_the_commands_of_jobs(address: str, client: Client, tmp_path: Path):
     made = client.submit(part(tmp_path, "G1 X41\n"), machine="ender3", batch="cli")
     assert run("jobs", "wait", made.id, STILLPATH_SERVER=address).returncode == 0

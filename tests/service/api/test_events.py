@@ -19,16 +19,10 @@ from service.database.engine import open_database
 from service.jobs.state import Cancelled, Claimed, Progressed
 from service.jobs.store import JobStore
 from service.settings import Settings
-from tests.service.api.test_submitting import opened, post
+from tests.service.api.serving import post
 from tests.service.database.examples import make_job
 from tests.service.test_api import assert_problem, over, until
 from tests.service.test_server import until as waiting
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    with opened(tmp_path_factory.mktemp("data")) as found:
-        yield found
 
 
 def events(text: str) -> list[dict[str, str]]:

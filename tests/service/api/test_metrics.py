@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.database.engine import DatabaseAway
 from service.storage.base import StorageError
-from tests.service.api.test_submitting import opened, post
+from tests.service.api.serving import opened, post
 from tests.service.test_api import assert_problem, over, until
 
 _ENDS = ("started", "finished")

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
 
-from tests.service.api.test_submitting import opened
+from tests.service.api.serving import opened
 from tests.service.test_api import assert_problem, over, until
 
-PRINTERS = """
-[printer.left]
-kind = "octoprint"
-url = "http://127.0.0.1:9"
-machine = "ender3"
-method = "shaper:ei"
-"""
 FORM = {"select": (None, "false"), "path": (None, "")}
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
-    folder = tmp_path_factory.mktemp("data")
-    (folder / "printers.toml").write_text(PRINTERS)
-    with opened(folder, printers=folder / "printers.toml") as found:
-        yield found
 
 
 def test_the_test_of_the_connection(client: TestClient):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,21 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
-from tests.service.api.test_submitting import opened, post
+from tests.service.api.serving import post
 from tests.service.test_api import assert_problem, over, until
 
 CONTENT = b"; compensated\n" + b"".join(b"G1 X%d\n" % n for n in range(500))
-
-
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("data")
-
-
-@pytest.fixture(scope="module")
-def client(data_dir: Path) -> Iterator[TestClient]:
-    with opened(data_dir) as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +91,7 @@ def test_layers(client: TestClient, job: str):
 
 
 def test_what_is_gone_is_told(client: TestClient, data_dir: Path):
-    where = post(client, b"G1 X77").headers["location"]
+    where = post(client, b"G1 X177").headers["location"]
     done = until(client, where, over)
     (result,) = (data_dir / "jobs" / done["id"]).glob("*/result/*")
     result.unlink()

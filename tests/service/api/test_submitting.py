@@ -3,39 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import create_app
-from service.settings import Settings
-from tests.service.runners import light
-from tests.service.test_api import JOBS, assert_problem, over, until
-
-
-@pytest.fixture(scope="module")
-def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("data")
-
-
-@pytest.fixture(scope="module")
-def client(data_dir: Path) -> Iterator[TestClient]:
-    with opened(data_dir) as found:
-        yield found
-
-
-def opened(folder: Path, **settings: Any) -> TestClient:
-    app = create_app(
-        Settings(data_dir=folder, requests_per_minute=100_000, **settings), runner=light
-    )
-    return TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
-
-
-def post(client: TestClient, content: bytes, query: str = "", **headers: str) -> Any:
-    return client.post(f"{JOBS}{query}", content=content, headers=headers)
+from tests.service.api.serving import opened, post
+from tests.service.test_api import assert_problem, over, until
 
 
 def folders(data_dir: Path) -> set[str]:
@@ -106,6 +81,7 @@ def test_pages_batches_and_states(client: TestClient):
     assert_problem(client.get("/v1/jobs?limit=0"), 422, "limit")
 
 
+@pytest.mark.slow
 def test_quotas(tmp_path: Path):
     with opened(tmp_path, max_jobs_per_owner=1) as client:
         where = post(client, b"slow").headers["location"]
