@@ -7,7 +7,7 @@ import json
 import time
 import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from models.errors import ModelError
 from service.api.problems import Problem
 from service.api.schemas import JobQuery
 from service.api.uploads import Upload, receive_upload
+from service.database.engine import DatabaseAway
 from service.deliveries.printers import Printer, printer_for
 from service.deliveries.targets import TargetRefused, check_webhook
 from service.jobs.state import Job
@@ -27,7 +28,7 @@ from service.machines.revision import NotApproved, UnknownMachine
 from service.security.audit import record
 from service.security.callers import Caller
 from service.settings import Settings
-from service.storage.base import Storage
+from service.storage.base import Storage, StorageError
 from service.version import __version__
 
 __all__ = ["Intake", "Taken"]
@@ -77,6 +78,8 @@ class Intake:
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
         self._folder.mkdir(parents=True, exist_ok=True)
+        if self._settings.scheduler is not None:
+            return  # it may be shared; the sweep knows what is old
         for leftover in self._folder.iterdir():
             leftover.unlink(missing_ok=True)
 
@@ -151,7 +154,8 @@ class Intake:
             if earlier is not None:
                 return Taken(earlier, False, upload)
         dedupe_key = _dedupe_key(wanted, upload, pinned)
-        if not wanted.fresh and wanted.webhook is None and wanted.printer is None:
+        shared = not wanted.fresh and wanted.webhook is None and wanted.printer is None
+        if shared:
             same = self._store.find_same(caller.owner, dedupe_key)
             if same is not None:
                 return Taken(same, False, upload)
@@ -181,17 +185,26 @@ class Intake:
             pinned.write(document)
             self._storage.put(f"{prefix}machine.json", document)
             self._storage.put(f"{prefix}source/{job.source_name}", incoming)
-            added = self._store.add(job, idempotency=idempotency, limits=self._quota)
+            added = self._store.add(job, idempotency=idempotency, limits=self._quota, shared=shared)
         except QuotaExceeded as error:
             raise _too_many(str(error)) from None
         except IdempotencyConflict:
             raise _conflict(idempotency_key) from None
         finally:
             document.unlink(missing_ok=True)
-            # Not known by this name: refused, or a request with the same key was quicker.
             if added is None or added.id != job_id:
-                self._storage.delete(prefix)
+                self._undo(job_id)
         return Taken(added, added.id == job_id, upload)
+
+    def _undo(self, job_id: str) -> None:
+        """Delete what was stored for a job that was refused, or that another one stands for.
+
+        What cannot be deleted now goes with the sweep. A database that broke off may have taken the
+        job all the same: then its files stay.
+        """
+        with suppress(DatabaseAway, StorageError):
+            if self._store.get(job_id) is None:
+                self._storage.delete(f"jobs/{job_id}/")
 
     def _check_targets(self, wanted: JobQuery) -> None:
         """Refuse where nothing may be sent to."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
+from contextlib import suppress
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -21,7 +22,7 @@ from service.jobs.state import Cancelled, Job, JobState
 from service.jobs.store import BadCursor, JobStore
 from service.security.audit import record
 from service.security.callers import Caller, Scope
-from service.storage.base import Storage
+from service.storage.base import Storage, StorageError
 
 __all__ = ["router", "upload_body"]
 
@@ -184,8 +185,9 @@ async def delete_job(request: Request, job_id: JobId, caller: Submitter) -> Resp
     if not await run_in_threadpool(store.forget, job_id):
         raise no_such_job(job_id)
     await _changed(request, caller, "delete", job_id)
-    # What a worker still puts there is swept up later.
-    await run_in_threadpool(storage.delete, f"jobs/{job_id}/")
+    # What a worker still puts there, or what cannot be deleted now, is swept up later.
+    with suppress(StorageError):
+        await run_in_threadpool(storage.delete, f"jobs/{job_id}/")
     return Response(status_code=204)
 
 

@@ -7,10 +7,12 @@ the result is sent on, or, if there is none, for the machine NAME.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, ValidationError
+from starlette.concurrency import run_in_threadpool
 
 from service.api.access import Reader, Uploader
 from service.api.intake import Intake
@@ -102,9 +104,9 @@ async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersi
     """Answer a slicer's test of the connection."""
     if name not in request.app.state.printers:
         # Only whether there is one: jobs ask for more.
-        names = request.app.state.machines.names()
+        names = await run_in_threadpool(request.app.state.machines.names)
         if name not in names:
-            raise _no_such_printer(request, name)
+            raise _no_such_printer(request, name, names)
     return ApiVersion()
 
 
@@ -140,7 +142,8 @@ async def upload_for(
 
 async def _taken(request: Request, response: Response, name: str, caller: Uploader) -> Stored:
     intake: Intake = request.app.state.intake
-    taken = await intake.take(request, _wanted(request, name), caller)
+    wanted = await run_in_threadpool(_wanted, request, name)
+    taken = await intake.take(request, wanted, caller)
     here = f"/v1/jobs/{taken.job.id}"
     response.headers["Location"] = f"{str(request.base_url).rstrip('/')}{here}"
     file = LocalFile(
@@ -162,9 +165,10 @@ def _wanted(request: Request, name: str) -> JobQuery:
     try:
         return JobQuery.model_validate(given)
     except ValidationError:
-        raise _no_such_printer(request, name) from None
+        names = request.app.state.machines.names()
+        raise _no_such_printer(request, name, names) from None
 
 
-def _no_such_printer(request: Request, name: str) -> Problem:
-    known = ", ".join([*request.app.state.printers, *request.app.state.machines.names()])
+def _no_such_printer(request: Request, name: str, machines: Iterable[str]) -> Problem:
+    known = ", ".join([*request.app.state.printers, *machines])
     return Problem(404, "No such printer", f"No printer is called {name!r:.80}. Known: {known}.")

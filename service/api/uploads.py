@@ -26,6 +26,9 @@ _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
 _MOST_FIELDS = 32
 _LONGEST_FIELD_BYTES = 4096
+_LONGEST_NAME_BYTES = 180
+"""Of a file's name; with what a result's name has more it stays below the usual 255."""
+_SUFFIX = re.compile(r"(\.gcode)?\.[A-Za-z0-9]{1,10}$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +108,12 @@ async def receive_document(request: Request, *, max_bytes: int) -> bytes:
 def safe_name(name: str) -> str:
     """Return a file name without folders, control characters or surprises."""
     base = re.split(r"[/\\]", name)[-1]
-    base = re.sub(r"[^\w .()+-]", "_", base).strip(" .")[:100]
-    return base or _DEFAULT_NAME
+    base = re.sub(r"[^\w .()+-]", "_", base).strip(" .")
+    # File systems count bytes; printers tell the kind of a file by its suffix.
+    suffix = _SUFFIX.search(base)
+    end = suffix[0] if suffix else ""
+    stem = base.removesuffix(end).encode()[: _LONGEST_NAME_BYTES - len(end)]
+    return f"{stem.decode(errors='ignore')}{end}".strip(" .") or _DEFAULT_NAME
 
 
 @dataclass(slots=True)
