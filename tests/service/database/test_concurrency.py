@@ -94,6 +94,12 @@ def test_the_same_request_many_times_at_once_is_one_job(store: JobStore):
     assert store.counts()[JobState.QUEUED] == 1
 
 
+def test_the_same_file_many_times_at_once_is_one_job(store: JobStore):
+    answers = at_once(*[lambda: store.add(make_job(), shared=True)] * 8)
+    assert len({answer.id for answer in answers}) == 1
+    assert store.usage("anna")[0] == 1
+
+
 def test_many_at_once_stay_within_the_quota(store: JobStore):
     limits = Quota(max_jobs=3, max_bytes=10**9)
     results = at_once(*[lambda: store.add(make_job(), limits=limits) for _ in range(8)])

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import math
+
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -221,6 +225,19 @@ def test_the_same_job(store: JobStore):
     assert store.find_same("bob", key) is None
 
 
+def test_the_same_job_is_shared(store: JobStore):
+    first, second = make_job(), make_job()
+    assert store.add(first, shared=True) == first
+    assert store.add(second, shared=True, idempotency=("key", "print")) == first
+    # The key leads there as well from now on.
+    assert store.submitted("anna", "key") == ("print", first)
+    assert store.add(make_job(), shared=True, idempotency=("key", "print")) == first
+    assert store.usage("anna")[0] == 1
+    other = make_job(owner="bob")
+    assert store.add(other, shared=True) == other
+    assert store.add(second) == second
+
+
 # Lists
 
 
@@ -253,7 +270,12 @@ def test_a_page_of_some(store: JobStore):
 
 
 @pytest.mark.parametrize(
-    "cursor", ["", "x", "ä", "WzEsMl0", "e30", "W251bGwsImEiXQ", "WzFlOTk5OSwgMV0", "=" * 9]
+    "cursor",
+    ["", "x", "ä", "WzEsMl0", "e30", "W251bGwsImEiXQ", "WzFlOTk5OSwgMV0", "=" * 9]
+    + [
+        base64.urlsafe_b64encode(json.dumps(content).encode()).decode()
+        for content in ([1.0, "\ud800"], [1.0, "\0"], [math.nan, "a"], [math.inf, "a"])
+    ],
 )
 def test_a_cursor_that_no_page_gave(store: JobStore, cursor: str):
     with pytest.raises(BadCursor, match="without a cursor"):
@@ -417,6 +439,13 @@ def test_a_lease(store: JobStore):
     assert not store.lease("reconciler", "one", 5.0, 1010.0)
     store.release("reconciler", "two")
     assert store.lease("reconciler", "one", 5.0, 1010.0)
+
+
+def test_a_lease_of_a_clock_that_was_set_back_since(store: JobStore):
+    assert store.lease("reconciler", "one", 5.0, 10_000.0)
+    assert not store.lease("reconciler", "two", 5.0, 9990.0)
+    assert store.lease("reconciler", "two", 5.0, 6400.0)
+    assert not store.lease("reconciler", "three", 5.0, 6401.0)
 
 
 def test_what_fails_leaves_nothing(store: JobStore):
