@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,22 +31,30 @@ from tests.service.test_api import assert_problem
 
 MINE = "/v1/machines/mine"
 MEASUREMENTS = f"{MINE}/measurements"
+KEPT = ("machines", "identifications")
 
 
-@pytest.fixture
-def data(tmp_path: Path) -> Path:
-    return tmp_path / "data"
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
 
 
-@pytest.fixture
-def client(data: Path) -> Iterator[TestClient]:
-    """With a machine `mine`."""
+@pytest.fixture(scope="module")
+def service(data: Path) -> Iterator[TestClient]:
     app = create_app(Settings(data_dir=data), runner=pretend)
     with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as opened:
-        machine = make_machine(kinematics="cartesian")
-        made = opened.put(MINE, content=machine.model_dump_json(), params={"author": "anna"})
-        assert made.status_code == 201, made.text
         yield opened
+
+
+@pytest.fixture
+def client(service: TestClient, data: Path) -> Iterator[TestClient]:
+    """The one service of this module, with a machine `mine`."""
+    machine = make_machine(kinematics="cartesian")
+    made = service.put(MINE, content=machine.model_dump_json(), params={"author": "anna"})
+    assert made.status_code == 201, made.text
+    yield service
+    for folder in KEPT:
+        shutil.rmtree(data / folder, ignore_errors=True)
 
 
 def post(client: TestClient, *files: InputFile, where: str = MEASUREMENTS, **more: Any) -> Any:
@@ -60,7 +69,7 @@ def kept(data: Path) -> dict[str, bytes]:
     """Machines and identifications; the job database writes as it likes."""
     return {
         str(p.relative_to(data)): p.read_bytes()
-        for folder in ("machines", "identifications")
+        for folder in KEPT
         for p in (data / folder).rglob("*")
         if p.is_file()
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
@@ -30,10 +31,22 @@ def open_client(folder: Path, **settings: Any) -> TestClient:
     return TestClient(app, base_url="http://localhost", raise_server_exceptions=False)
 
 
-@pytest.fixture
-def client(tmp_path: Path) -> Iterator[TestClient]:
-    with open_client(tmp_path) as opened:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def service(folder: Path) -> Iterator[TestClient]:
+    with open_client(folder) as opened:
         yield opened
+
+
+@pytest.fixture
+def client(service: TestClient, folder: Path) -> Iterator[TestClient]:
+    """The one service of this module, without machines of its own."""
+    yield service
+    shutil.rmtree(folder / "machines", ignore_errors=True)
 
 
 def put(client: TestClient, machine: Machine, where: str = MINE, **headers: str) -> Any:
@@ -127,12 +140,12 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
     ],
 )
 def test_bad_documents_leave_nothing(
-    client: TestClient, tmp_path: Path, where: str, body: bytes | str | None, status: int, words
+    client: TestClient, folder: Path, where: str, body: bytes | str | None, status: int, words
 ):
     content = make_machine().model_dump_json() if body is None else body
     document = assert_problem(client.put(where, content=content), status)
     assert any(word in document["detail"] for word in words)
-    assert not (tmp_path / "machines").exists()
+    assert not (folder / "machines").exists()
 
 
 @pytest.mark.parametrize(
@@ -156,11 +169,11 @@ def test_what_is_not_there(client: TestClient, method: str, path: str, status: i
     assert_problem(client.request(method, path), status)
 
 
-def test_the_list_shows_own_machines_and_damaged_ones(client: TestClient, tmp_path: Path):
+def test_the_list_shows_own_machines_and_damaged_ones(client: TestClient, folder: Path):
     put(client, changed(50.0))
     put(client, make_machine("spoiled"), "/v1/machines/spoiled")
     client.post(f"{MINE}/revisions/1/approve", params={"author": "bob"})
-    (tmp_path / "machines" / "spoiled" / "000001.json").write_text("{")
+    (folder / "machines" / "spoiled" / "000001.json").write_text("{")
     listed = {m["name"]: m for m in client.get("/v1/machines").json()}
     assert list(listed) == [*builtin_machines(), "mine", "spoiled"]
     assert (listed["mine"]["origin"], listed["mine"]["number"]) == ("own", 1)
@@ -170,6 +183,7 @@ def test_the_list_shows_own_machines_and_damaged_ones(client: TestClient, tmp_pa
     assert_problem(client.post("/v1/jobs?machine=spoiled", content=b"G1 X1"), 422, "damaged")
 
 
+@pytest.mark.slow
 def test_only_approved_revisions_where_that_is_switched_on(tmp_path: Path):
     with open_client(tmp_path, require_approval=True) as client:
         put(client, changed(50.0))
@@ -187,6 +201,7 @@ def pinned(folder: Path, job: dict[str, Any]) -> PinnedMachine:
     return PinnedMachine.read(folder / "jobs" / job["id"] / "machine.json", job["machine"])
 
 
+@pytest.mark.slow
 def test_a_job_keeps_the_machine_it_was_accepted_with(tmp_path: Path):
     with open_client(tmp_path) as client:
         put(client, changed(50.0))
