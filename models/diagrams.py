@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.diagram_kernels import advance
 from models.errors import ModelError
 
 __all__ = ["Block", "Diagram", "Running", "polynomial_response"]
@@ -267,6 +266,9 @@ class Running:
         watched: NDArray[np.int64],
         records: Array,
     ) -> None:
+        # With numba, slow to import; the API describes loops without running them.
+        from models.diagram_kernels import advance
+
         advance(
             self._layout, self._wires, self._gains, self._num, self._den, self._shape,
             self._state, self._cursor, self._signals, self.tick,

@@ -13,7 +13,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, logm
 
 from models.errors import ModelError
 from models.plant_specs import (
@@ -118,6 +117,8 @@ class ContinuousPlant(_StateSpace):
 
     def discretise(self, dt_s: float) -> DiscretePlant:
         """Return the first-order-hold equivalent, exact for commands linear between samples."""
+        from scipy.linalg import expm  # slow to import, and checking a document needs it not
+
         n = self.order
         if n == 0:
             return DiscretePlant(self.a, self.b, self.c, self.d, self.notes, dt_s)
@@ -305,6 +306,8 @@ def _as_sampled(spec: PlantSpec) -> DiscretePlant:
 
 def _undo_hold(plant: DiscretePlant, spec: PlantSpec) -> ContinuousPlant:
     """Invert the first-order hold."""
+    from scipy.linalg import expm, logm
+
     roots: Roots = spec.roots()
     negative = (roots.poles.imag == 0) & (roots.poles.real <= 0)
     if negative.any():

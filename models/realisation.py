@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigvals, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 from models.roots import Roots
 
@@ -46,6 +45,9 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
     Diagonal balancing: equal diagonals of both Gramians. Unlike a full balancing it needs no
     inverse, and so it survives zeros that almost cancel poles.
     """
+    # Slow to import, and checking a document needs it not.
+    from scipy.linalg import solve_discrete_lyapunov
+
     if len(b) == 0:
         return a, b, c, d
     solve = solve_discrete_lyapunov if discrete else _solve_continuous
@@ -58,6 +60,8 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
 
 def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.complex128]:
     """Return the finite generalised eigenvalues of the Rosenbrock pencil."""
+    from scipy.linalg import eigvals
+
     n = len(b)
     if n == 0:
         return np.zeros(0, complex)
@@ -72,6 +76,8 @@ def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.
 
 
 def _solve_continuous(a: Matrix, q: Matrix) -> Matrix:
+    from scipy.linalg import solve_continuous_lyapunov
+
     return np.asarray(solve_continuous_lyapunov(a, -q), dtype=np.float64)
 
 

@@ -41,6 +41,8 @@ app = typer.Typer(
 app.add_typer(machines.app, name="machines")
 
 _INTERRUPTED = 130
+_WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
+"""Commands that compute in processes of their own."""
 _METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
     "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
@@ -77,7 +79,7 @@ ReportOption = Annotated[
 
 def main() -> NoReturn:
     """Run the command line and exit; the entry point of the `stillpath` command."""
-    prepare_environment()
+    prepare_environment(computing=sys.argv[1:2] not in _WITH_WORKERS)
     sys.exit(run(sys.argv[1:]))
 
 

@@ -17,14 +17,21 @@ _KEPT_BYTES, _STEP_BYTES = 256 << 20, 16 << 20
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def prepare_environment() -> None:
+def prepare_environment(*, computing: bool = True) -> None:
     """Set defaults for the numerical libraries; what the user has set stays.
 
     BLAS gets one thread: the matrices are small, and more threads only burn CPU. Numba gets a
     writable folder for compiled kernels where the installed package cannot hold them. Child
-    processes inherit both. Memory that is freed stays with the process.
+    processes inherit both.
+
+    Parameters
+    ----------
+    computing : bool
+        Whether this process computes: then memory that is freed stays with it. One that lasts and
+        leaves computing to others gives it back.
     """
-    _keep_freed_memory()
+    if computing:
+        _keep_freed_memory()
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
     if "NUMBA_CACHE_DIR" not in os.environ and not _package_is_writable():

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import matrix_balance
 
 from models.errors import ModelError
 from models.realisation import transmission_zeros
@@ -56,6 +55,8 @@ def zeros_poles_gain(
     unit = 1.0 if dt_s is not None else float(np.exp(np.mean(np.log(np.abs(poles) + 1e-30))))
     a, b = a / unit, b / unit
     whole = np.block([[a, b[:, None]], [c[None, :], np.array([[d]])]])
+    from scipy.linalg import matrix_balance  # slow to import, seldom needed
+
     whole = np.asarray(matrix_balance(whole, permute=False)[0], np.float64)
     a, b, c = whole[:n, :n], whole[:n, n], whole[n, :n]
     zeros = transmission_zeros(a, b, c, d)
