@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
@@ -32,6 +33,10 @@ from service.storage.base import Storage, StorageError
 from service.version import __version__
 
 __all__ = ["Intake", "Taken"]
+
+_STORED_AT_ONCE = 12
+"""Uploads that are put into the storage beside each other: that may take minutes, and the threads
+are for all requests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +79,7 @@ class Intake:
         self._printers = printers
         self._quota = Quota(settings.max_jobs_per_owner, settings.max_bytes_per_owner)
         self._folder = settings.data_dir / "incoming"
+        self._turns = CapacityLimiter(_STORED_AT_ONCE)
 
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
@@ -118,8 +124,16 @@ class Intake:
             if with_print != wanted:
                 wanted = with_print
                 await run_in_threadpool(self._check_targets, wanted)
-            taken = await run_in_threadpool(
-                self._accept, job_id, incoming, upload, wanted, pinned, caller, idempotency_key
+            taken = await to_thread.run_sync(
+                self._accept,
+                job_id,
+                incoming,
+                upload,
+                wanted,
+                pinned,
+                caller,
+                idempotency_key,
+                limiter=self._turns,
             )
         request.app.state.metrics.upload_bytes.inc(upload.size_bytes)
         if taken.is_new:

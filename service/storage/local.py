@@ -12,6 +12,7 @@ from pathlib import Path
 
 from service.storage.base import Stat, StorageError
 from service.storage.keys import check_key, check_prefix
+from service.storage.leftovers import delete_leftovers
 
 __all__ = ["LocalStorage"]
 
@@ -35,6 +36,7 @@ class LocalStorage:
         self._root = root
         with _explained():
             _make_folder(root / _FRESH)
+            delete_leftovers(root / _FRESH, "*")
 
     def put(self, key: str, file: Path) -> None:
         """Move a local file to `key`; see `Storage.put`."""

@@ -14,6 +14,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from service.storage.base import Stat, StorageError
 from service.storage.keys import check_key, check_prefix
+from service.storage.leftovers import delete_leftovers
 
 if TYPE_CHECKING:
     from obstore.store import S3Store
@@ -24,6 +25,7 @@ _CHUNK_BYTES = 1 << 20
 _PART_BYTES = 8 << 20
 _PARTS_AT_ONCE = 4
 _CONNECT_S, _REQUEST_S, _RETRY_S = 5.0, 60.0, 8.0
+_FETCHED = "fetched-"
 _PARAMETERS = ("endpoint", "region")
 
 
@@ -51,6 +53,7 @@ class S3Storage:
         self._url = url.split("?")[0]
         self._scratch = scratch
         self._store = _open(url)
+        delete_leftovers(scratch, f"{_FETCHED}*")
 
     def put(self, key: str, file: Path) -> None:
         """Upload a local file and delete it here; see `Storage.put`.
@@ -76,7 +79,7 @@ class S3Storage:
         """Give a copy; see `Storage.local`."""
         size = self.stat(key).size_bytes
         self._scratch.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=self._scratch, prefix="fetched-") as folder:
+        with tempfile.TemporaryDirectory(dir=self._scratch, prefix=_FETCHED) as folder:
             # Programs read the kind of a file from its name.
             copy = Path(folder) / key.rsplit("/", 1)[-1]
             with copy.open("wb") as file:

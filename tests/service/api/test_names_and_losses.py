@@ -1,7 +1,9 @@
-"""Handing in when names are long, and when the database breaks off."""
+"""Handing in when names are long, the database breaks off, or the storage is slow."""
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -48,3 +50,27 @@ def test_long_names_are_kept_short(client: TestClient):
     found = until(client, f"/v1/jobs/{job['id']}", over)
     assert found["state"] == "done"
     assert client.get(f"/v1/jobs/{job['id']}/result").status_code == 200
+
+
+def test_a_slow_storage_leaves_threads_to_others(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+):
+    put, goes_on = client.app.state.storage.put, threading.Event()
+    waiting = threading.Semaphore(0)
+
+    def slow(key: str, file: Path) -> None:
+        waiting.release()
+        goes_on.wait()
+        put(key, file)
+
+    monkeypatch.setattr(client.app.state.storage, "put", slow)
+    with ThreadPoolExecutor(30) as threads:
+        answers = [threads.submit(post, client, b"G1 X%d" % n, "&fresh=true") for n in range(30)]
+        try:
+            for _ in range(12):
+                assert waiting.acquire(timeout=120)
+            assert not waiting.acquire(timeout=1)
+            assert client.get("/v1/jobs").status_code == 200
+        finally:
+            goes_on.set()
+        assert {answer.result().status_code for answer in answers} == {202}

@@ -257,3 +257,13 @@ def test_the_settings_choose(tmp_path: Path):
     for wrong in ("ftp://b", "s3://", "s3://b?what=1"):
         with pytest.raises(ValueError, match="s3://bucket"):
             open_storage(Settings(data_dir=tmp_path, storage_url=wrong))
+
+
+def test_what_a_kill_left_is_deleted_when_it_is_old(tmp_path: Path):
+    LocalStorage(tmp_path)
+    old, fresh = tmp_path / ".fresh" / "old", tmp_path / ".fresh" / "fresh"
+    for path in (old, fresh):
+        path.write_text("half")
+    os.utime(old, (1.0, 1.0))
+    LocalStorage(tmp_path)
+    assert (old.exists(), fresh.exists()) == (False, True)

@@ -1,0 +1,25 @@
+"""What a process that was killed left behind in a folder of files that are being made."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from pathlib import Path
+
+__all__ = ["delete_leftovers"]
+
+_OLD_S = 86400.0
+"""Nothing that somebody still works on is older."""
+
+
+def delete_leftovers(folder: Path, pattern: str) -> None:
+    """Delete the files and folders that fit `pattern` and were not touched for a day."""
+    before = time.time() - _OLD_S
+    for path in folder.glob(pattern):
+        with contextlib.suppress(OSError):  # somebody else is at it, too
+            if path.stat().st_mtime < before:
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
