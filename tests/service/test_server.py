@@ -35,6 +35,7 @@ def server(
     try:
         assert process.stdout is not None
         base = process.stdout.readline().removeprefix("stillpath: ").strip()
+        assert base, "the server did not start"
         with httpx2.Client(base_url=base, timeout=180) as client:
             until(lambda: _answers(client))
             yield client, process

@@ -1,0 +1,25 @@
+"""The real server, to be asked thousands of things: `python fuzzed_server.py DATA_DIR`.
+
+Jobs are pretended, and one real design, which takes seconds of computing, is the answer to every
+question for one.
+"""
+
+import sys
+from pathlib import Path
+from unittest import mock
+
+if __name__ == "__main__":
+    from service.environment import prepare_environment
+
+    prepare_environment()
+
+    from models.store import load_machine
+    from service.api import designs
+    from service.design.design import design_report
+    from service.server import serve_forever
+    from service.settings import Settings
+    from tests.service.runners import light
+
+    design = design_report(load_machine("ender3"), "x")
+    with mock.patch.object(designs, "_made", return_value=design):
+        serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=light)
