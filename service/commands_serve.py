@@ -37,6 +37,7 @@ def serve(
     docs/running.md.
     """
     settings = _settings(data_dir=data_dir, workers=workers)
+    _check_storage(settings)
 
     from service.deliveries.printers import PrinterFileError
     from service.security.keys import KeyRefused, UnsafeBinding
@@ -79,12 +80,23 @@ def worker(
         raise typer.TyperException(
             "which scheduler? Say --scheduler tcp://host:8786, or set STILLPATH_SCHEDULER"
         )
+    _check_storage(settings)
 
     from service.jobs.daemons import run_workers
     from service.logs import configure_logging
 
     configure_logging()
     run_workers(settings)
+
+
+def _check_storage(settings: Settings) -> None:
+    """Refuse an address that names no storage; whether it answers is for later."""
+    from service.storage.opened import open_storage
+
+    try:
+        open_storage(settings)
+    except ValueError as error:
+        raise typer.TyperException(str(error)) from None
 
 
 def _settings(**given: Any) -> Settings:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import uvicorn
 
 from service.api import create_app
+from service.database.engine import open_database
 from service.exclusive import exclusive
 from service.jobs.worker import Runner, run_task
 from service.logs import configure_logging
@@ -41,6 +42,8 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
     ------
     OSError
         If the address cannot be bound, or another service works with the data directory.
+    StoreError
+        If the database cannot be opened.
     UnsafeBinding
         If other computers can reach the address, and keys are switched off.
     """
@@ -61,6 +64,8 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         _alone(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
+        # The application does so again; what uvicorn makes of an error there nobody can read.
+        open_database(settings).dispose()
         shown = f"[{host}]" if family == socket.AF_INET6 else host
         sys.stdout.write(f"stillpath: http://{shown}:{listener.getsockname()[1]}/\n")
         sys.stdout.flush()

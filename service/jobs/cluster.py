@@ -124,7 +124,7 @@ class Cluster:
             threads = client.sync(client.scheduler.ncores, callback_timeout=_TIMEOUT_S)
             slots = int(sum(threads.values()))
             if self._local is not None and slots < self._settings.workers:
-                _replace_ended(self._local, self._settings.workers)
+                _start_missing(self._local, self._settings.workers)
         return slots
 
     def submit(self, job: Job, when_done: Callable[[], object]) -> Future:
@@ -161,7 +161,8 @@ class Cluster:
         """Let go of the scheduler, and end our own workers at once, whatever they do."""
         local, self._local = self._local, None
         if local is not None:
-            for nanny in list(local.workers.values()):
+            # Those that only start belong to it; `workers` would leave them out.
+            for nanny in list(local._created):
                 # Asked kindly, they would finish their jobs first.
                 _kill(getattr(nanny, "pid", None))
         self.disconnect()
@@ -173,7 +174,8 @@ class Cluster:
         from distributed import LocalCluster
 
         return LocalCluster(
-            n_workers=self._settings.workers,
+            # `slots` has them started, without waiting: an end of the service would wait too.
+            n_workers=0,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
@@ -209,8 +211,8 @@ def runner_name(runner: Runner) -> str:
     return f"{runner.__module__}:{runner.__qualname__}"
 
 
-def _replace_ended(local: LocalCluster, workers: int) -> None:
-    """Start workers for those that ended for good; what is starting anyway is let alone."""
+def _start_missing(local: LocalCluster, workers: int) -> None:
+    """Start workers up to a number, also for those that ended for good; does not wait for them."""
     from distributed.core import Status
 
     def drop() -> None:

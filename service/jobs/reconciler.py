@@ -150,6 +150,8 @@ class Reconciler:
         if not self._cluster.is_connected:
             self._in_flight.clear()
             self._cluster.connect()
+            if self._stopping.is_set():
+                return  # it took its time; start no workers that must end at once
         self.slots = self._cluster.slots()
         self._say(None if self.slots else "no worker is connected to the scheduler")
         self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())

@@ -32,29 +32,34 @@ def site(tmp_path: Path) -> Iterator[Site]:
     site.close()
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """Give a service that goes on, whatever happens to its workers."""
+    site = Site(tmp_path_factory.mktemp("shared") / "data")
+    with site.work(cancel_grace_s=1.0):
+        yield site
+    site.check_files()
+    site.close()
+
+
 def worker_pid(site: Site, job_id: str) -> int:
     return int(site.running(job_id).worker.rsplit(":", 1)[1])
 
 
-def test_a_worker_that_is_killed_costs_its_job_one_attempt(site: Site):
-    with site.work() as process:
-        job_id, other = site.submit("slow-once 1"), site.submit("G1")
-        os.kill(worker_pid(site, job_id), signal.SIGKILL)
-        job = site.ended(job_id)
-        assert (job.state, job.attempt, job.losses) == (JobState.DONE, 2, 1)
-        assert site.ended(other).attempt == 1
-        assert process.family()
-    site.check_files()
+def test_a_worker_that_is_killed_costs_its_job_one_attempt(shared: Site):
+    job_id, other = shared.submit("slow-once 1"), shared.submit("G1")
+    os.kill(worker_pid(shared, job_id), signal.SIGKILL)
+    job = shared.ended(job_id)
+    assert (job.state, job.attempt, job.losses) == (JobState.DONE, 2, 1)
+    assert shared.ended(other).attempt == 1
 
 
-def test_a_job_that_kills_every_worker_fails_and_the_others_go_on(site: Site):
-    with site.work():
-        killer, other = site.submit("die"), site.submit("G1")
-        job = site.ended(killer)
-        assert (job.state, job.attempt) == (JobState.FAILED, 2)
-        assert "its process ended" in job.problem["detail"]
-        assert site.ended(other).state is JobState.DONE
-    site.check_files()
+def test_a_job_that_kills_every_worker_fails_and_the_others_go_on(shared: Site):
+    killer, other = shared.submit("die"), shared.submit("G1")
+    job = shared.ended(killer)
+    assert (job.state, job.attempt) == (JobState.FAILED, 2)
+    assert "its process ended" in job.problem["detail"]
+    assert shared.ended(other).state is JobState.DONE
 
 
 def test_a_service_that_is_killed_takes_its_workers_along_and_its_jobs_up_again(site: Site):
@@ -91,28 +96,27 @@ def test_a_service_that_is_stopped_gives_its_jobs_back(site: Site, to: str):
     site.check_files()
 
 
-def test_a_cancel_frees_the_worker_and_a_deaf_one_is_ended(site: Site):
-    with site.work(cancel_grace_s=1.0):
-        slow = site.submit("slow")
-        pid = worker_pid(site, slow)
-        site.cancel(slow)
-        following = site.submit("G1")
-        job = site.ended(following)
-        assert (job.state, worker_pid_of(job.worker)) == (JobState.DONE, pid)
-        deaf = site.submit("deaf")
-        site.running(deaf)
-        site.cancel(deaf)
-        following = site.submit("G1")
-        job = site.ended(following)
-        assert (job.state, job.attempt) == (JobState.DONE, 1)
-        assert worker_pid_of(job.worker) != pid
-        assert site.get(deaf).state is JobState.CANCELLED
-    site.check_files()
+def test_a_cancel_frees_the_worker(shared: Site):
+    slow = shared.submit("slow")
+    pid = worker_pid(shared, slow)
+    shared.cancel(slow)
+    job = shared.ended(shared.submit("G1"))
+    assert (job.state, worker_pid_of(job.worker)) == (JobState.DONE, pid)
+
+
+def test_a_worker_that_is_deaf_to_a_cancel_is_ended(shared: Site):
+    deaf = shared.submit("deaf")
+    pid = worker_pid(shared, deaf)
+    shared.cancel(deaf)
+    job = shared.ended(shared.submit("G1"))
+    assert (job.state, job.attempt) == (JobState.DONE, 1)
+    assert worker_pid_of(job.worker) != pid
+    assert shared.get(deaf).state is JobState.CANCELLED
 
 
 def test_limits_end_a_job_and_nothing_else(site: Site):
-    with site.work(max_job_s=2.0, cancel_grace_s=1.0, max_job_bytes=400 << 20):
-        ids = [site.submit(text) for text in ("deaf", "grow 600", "G1")]
+    with site.work(max_job_s=20.0, cancel_grace_s=1.0, max_job_bytes=250 << 20):
+        ids = [site.submit(text) for text in ("deaf", "grow 300", "G1")]
         long, large, good = (site.ended(job_id) for job_id in ids)
         assert "STILLPATH_MAX_JOB_S" in long.problem["detail"]
         assert "STILLPATH_MAX_JOB_BYTES" in large.problem["detail"]
@@ -121,7 +125,7 @@ def test_limits_end_a_job_and_nothing_else(site: Site):
 
 
 def test_silence_is_a_loss(site: Site):
-    with site.work(heartbeat_timeout_s=2.0, max_attempts=3):
+    with site.work(heartbeat_timeout_s=10.0, max_attempts=3):
         job_id = site.submit("slow-once 1")
         pid = worker_pid(site, job_id)
         os.kill(pid, signal.SIGSTOP)  # neither dead nor alive
@@ -173,7 +177,7 @@ def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
     submitter = threading.Thread(target=submit)
     submitter.start()
     try:
-        for n in range(3):
+        for n in range(2):
             with site.work(workers=2) as process:
                 done = site.store.counts()[JobState.DONE]
                 until(lambda done=done: site.store.counts()[JobState.DONE] > done + 2)

@@ -1,0 +1,64 @@
+"""How a service that cannot start says so, and how one that starts ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytestmark = pytest.mark.slow
+
+SERVE = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def start(data_dir: Path, **settings: str) -> subprocess.Popen[str]:
+    given = {f"STILLPATH_{name.upper()}": value for name, value in settings.items()}
+    return subprocess.Popen(
+        [*SERVE, "--data-dir", str(data_dir)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | given,
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "code", "said"),
+    [
+        ({"storage_url": "ftp://somewhere"}, 2, "neither s3://bucket/prefix nor"),
+        ({"database_url": "postgresql://nobody@127.0.0.1:9/none"}, 1, "does not answer"),
+        ({}, 1, "restore a backup"),
+    ],
+    ids=["storage", "database-away", "database-broken"],
+)
+def test_a_service_that_cannot_start_says_why_in_one_line(
+    tmp_path: Path, settings: dict[str, str], code: int, said: str
+):
+    (tmp_path / "stillpath.sqlite3").write_text("not a database" * 1000)
+    process = start(tmp_path, **settings)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == code, errors
+    assert errors.startswith("stillpath: error: ")
+    assert said in errors
+    assert errors.count("\n") == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends signals")
+def test_a_service_ends_before_its_workers_are_up(tmp_path: Path):
+    process = start(tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("stillpath: http://")
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode in (0, -signal.SIGTERM)
+    assert "Traceback" not in errors
+    assert "jobs are done" not in errors
+    assert not any(
+        str(tmp_path) in " ".join(p.info["cmdline"] or []) for p in psutil.process_iter(["cmdline"])
+    )
