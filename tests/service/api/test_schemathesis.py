@@ -80,4 +80,5 @@ def test_the_api_is_as_described(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             check=False,
         )
         assert done.returncode == 0, done.stdout + done.stderr
+        assert "Authentication failed" not in done.stdout, done.stdout  # else it tested doors only
         assert client.get("/readyz").status_code == 200
