@@ -57,7 +57,7 @@ def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
     assert download.value.suggested_filename == "wheel.stillpath.gcode"
     assert download.value.path().read_bytes().count(b"\n") > 1000
     with page.context.expect_page() as report:
-        page.get_by_role("link", name=re.compile("^Report")).click()
+        page.get_by_role("link", name="Report", exact=True).click()
     expect(report.value.locator("h1")).to_have_text("wheel.gcode")
 
 
@@ -90,13 +90,30 @@ def test_a_file_that_is_no_gcode_is_refused_with_the_reason(visitor: Visitor, tm
     visitor.shoot(page, "failed")
 
 
-def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
-    file = tmp_path / "empty.gcode"
-    file.write_bytes(b"")
-    visitor.expected = {422}
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [("part.gcode", b"", "empty"), ("part.stl", b"solid part", "Slice it first")],
+)
+def test_files_that_cannot_be_meant_are_not_sent(
+    visitor: Visitor, tmp_path: Path, name: str, content: bytes, said: str
+):
+    file = tmp_path / name
+    file.write_bytes(content)
     page = visitor.open()
     hand_in(page, file)
-    expect(page.get_by_role("alert")).to_contain_text("empty")
+    expect(page.get_by_role("alert")).to_contain_text(said)
+    expect(page.get_by_role("button", name="Compensate")).to_be_enabled()
+
+
+def test_a_request_that_is_refused_says_why(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "part.gcode"
+    file.write_bytes(GEAR.read_bytes())
+    visitor.expected = {422}
+    page = visitor.open()
+    page.locator("form").evaluate("form => { form.noValidate = true; }")
+    page.get_by_label("Tolerance, µm").fill("900")
+    hand_in(page, file)
+    expect(page.get_by_role("alert")).to_contain_text("tolerance_um")
 
 
 def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):

@@ -60,7 +60,7 @@ export function lineChart(chart) {
     drawn?.destroy();
     const width = plot.clientWidth;
     if (width === 0) return;
-    drawn = new uPlot(settings(chart, width, xText, read), [chart.at, ...chart.series.map((s) => s.values)], plot);
+    drawn = new uPlot(settings(chart, width, xText, read), [chart.at, ...chart.series.map((s) => (chart.y.log ? positive(s.values) : s.values))], plot);
   };
   const sizes = new ResizeObserver(() => {
     if (drawn === null) draw();
@@ -105,7 +105,8 @@ function settings(chart, width, xText, read) {
     axes: [
       { ...axis, label: chart.x.label, size: 30, space: 60, values: (/** @type {any} */ _, /** @type {any[]} */ ticks) => ticks.map((v) => (v === null ? "" : (chart.x.tick ?? xText)(v))),
         ...(chart.x.time ? { incrs: TIME_STEPS } : {}) },
-      { ...axis, label: chart.y.label, size: 52, values: (/** @type {any} */ _, /** @type {any[]} */ ticks) => ticks.map((v) => (v === null ? "" : number(v, 2))) },
+      { ...axis, label: chart.y.label, size: 52, values: (/** @type {any} */ _, /** @type {any[]} */ ticks) => ticks.map((v) => (v === null ? "" : number(v, 2))),
+        ...(chart.y.log ? { splits: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ low, /** @type {number} */ high) => powersOfTen(low, high), filter: (/** @type {any} */ _, /** @type {number[]} */ ticks) => ticks } : {}) },
     ],
     series: [{}, ...chart.series.map((s) => ({
       label: s.label, stroke: colour(s.colour), width: s.width ?? 1.6, dash: s.dash,
@@ -117,6 +118,18 @@ function settings(chart, width, xText, read) {
       drawClear: [(/** @type {any} */ u) => drawMarks(u, chart.marks ?? [], ink)],
     },
   };
+}
+
+/** @param {number} low @param {number} high */
+function powersOfTen(low, high) {
+  const first = Math.ceil(Math.log10(low) - 1e-9);
+  const count = Math.max(0, Math.floor(Math.log10(high) + 1e-9) - first + 1);
+  return Array.from({ length: count }, (_, k) => 10 ** (first + k));
+}
+
+/** What a logarithmic axis can show. @param {(number | null)[]} values */
+function positive(values) {
+  return values.map((v) => (v !== null && v > 0 ? v : null));
 }
 
 /** Smallest range that starts at zero, unless a curve goes below. @param {Chart} chart */

@@ -1,12 +1,13 @@
 /** Curves of a report: the error along the print, and its spectra. */
 
 import { h } from "../lib/dom.js";
-import { clock, number, um } from "../lib/format.js";
+import { clock, hz, number, um } from "../lib/format.js";
 import { lineChart } from "../charts/line-chart.js";
 
 const COLOURS = { before: "--before", after: "--after", shaper: "--shaper" };
 const DASHES = { before: undefined, after: undefined, shaper: [7, 4] };
 const WIDTHS = { before: 1.3, after: 2.2, shaper: 1.3 };
+const SPAN = 2000;
 
 /**
  * @param {any} report
@@ -41,12 +42,18 @@ export function spectra(report, channels, labels, signal) {
     h("p.hint", null, "How much of the error lies at which frequency. Dashed lines stand at the resonances of the machine's model."),
     h("div.pair", null, axes.map((/** @type {any} */ axis) => h("div", null,
       h("h3", null, `Along ${axis.axis.toUpperCase()}`),
-      h("p.hint", null, axis.resonances_hz.length ? `Resonances at ${axis.resonances_hz.map((/** @type {number} */ f) => number(f)).join(", ")} Hz` : "No resonances"),
+      h("p.hint", null, axis.resonances_hz.length ? `Resonances at ${axis.resonances_hz.map(hz).join(", ")} Hz` : "No resonances"),
       lineChart({
         title: `Spectrum of the error along ${axis.axis.toUpperCase()}`, signal, at: axis.f_hz, marks: axis.resonances_hz,
-        x: { label: "Hz", text: (v) => `${number(v)} Hz`, tick: (v) => number(v) }, y: { label: "µm/√Hz", text: (v) => `${number(v)} µm/√Hz` },
-        series: curves(channels, labels, axis.um_per_sqrt_hz),
+        x: { label: "Hz", text: (v) => `${number(v)} Hz`, tick: (v) => number(v) }, y: { label: "µm/√Hz", text: (v) => `${number(v)} µm/√Hz`, log: true },
+        range: decades(axis.um_per_sqrt_hz), series: curves(channels, labels, axis.um_per_sqrt_hz),
       })))));
+}
+
+/** What of a spectrum is worth seeing; resonances lie far below its peak. @param {Record<string, (number | null)[]>} values @returns {[number, number]} */
+function decades(values) {
+  const peak = Math.max(...Object.values(values).flat().map((v) => v ?? 0)) || 1;
+  return [peak / SPAN, 1.4 * peak];
 }
 
 /** @param {any[]} channels @param {Record<string, string>} labels @param {Record<string, (number | null)[]>} values */

@@ -16,6 +16,6 @@ export function downloads(job) {
   return h("div.downloads", { role: "group", "aria-label": "Downloads" },
     fileLink({ text: `G-code${size}`, href: links.result, name: job.result_name, main: true }),
     links.report ? fileLink({ text: "Report", href: links.report, name: `${stem}.report.html`, open: true }) : null,
-    links.report_json ? fileLink({ text: "JSON", href: links.report_json, name: `${stem}.report.json` }) : null,
-    links.trajectories ? h("button", { type: "button", onclick: openTrajectories }, "CSV …") : null);
+    links.report_json ? fileLink({ text: "Report (JSON)", href: links.report_json, name: `${stem}.report.json` }) : null,
+    links.trajectories ? h("button", { type: "button", onclick: openTrajectories }, "Trajectories (CSV) …") : null);
 }

@@ -7,7 +7,7 @@ import { counted, remaining } from "../lib/format.js";
 const ANNOUNCE_EVERY = 0.25;
 
 /**
- * @returns {{element: HTMLElement, update: (job: any) => void}}
+ * @returns {{element: HTMLElement, update: (job: any) => void, silence: () => void}}
  */
 export function progressPanel() {
   const bar = h("progress", { max: "1", "aria-label": "Progress" });
@@ -35,7 +35,8 @@ export function progressPanel() {
       announce(`${capital(job.stage)}, ${Math.floor(100 * job.progress)} percent. ${remaining(job.eta_s)}`);
     }
   };
-  return { element, update };
+  const silence = () => fill(left, "The service does not answer; it is asked again until it does.");
+  return { element, update, silence };
 }
 
 /** @param {string} text */

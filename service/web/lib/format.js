@@ -35,6 +35,14 @@ export function number(value, digits = 3) {
 }
 
 /**
+ * @param {number} value
+ * @returns {string} A frequency in hertz, with one decimal, so that those in a column line up.
+ */
+export function hz(value) {
+  return value.toFixed(1);
+}
+
+/**
  * @param {number | null | undefined} seconds
  * @returns {string} "12.3 s", "4 min 05 s", "2 h 03 min"
  */

@@ -33,7 +33,7 @@ export function startRouter(main, routes) {
     const path = location.hash.replace(/^#/, "") || "/";
     const route = routes.find((r) => r.pattern.test(path));
     mark(route?.name ?? "");
-    fill(main);
+    fill(main, h("p.hint.late", null, "Loading …"));
     window.scrollTo(0, 0);
     const setTitle = (/** @type {string} */ text) => {
       if (!here.signal.aborted) document.title = `${text} · Stillpath`;
@@ -50,6 +50,7 @@ export function startRouter(main, routes) {
       }
     } catch (error) {
       if (isAbort(error) || here.signal.aborted) return;
+      main.querySelector(":scope > .late")?.remove();
       main.append(problemPanel(error, h("button", { type: "button", onclick: show }, "Try again")));
     }
     if (!first && !here.signal.aborted) focusHeading(main);

@@ -21,9 +21,10 @@ export function isOver(job) {
  * @param {string} id
  * @param {(job: any) => void} onJob
  * @param {AbortSignal} signal
+ * @param {() => void} [onSilence] The service does not answer; it is asked again.
  * @returns {Promise<void>} Rejected with the problem if there is no such job (any more).
  */
-export async function watchJob(id, onJob, signal) {
+export async function watchJob(id, onJob, signal, onSilence = () => {}) {
   let over = false;
   let streams = true;
   let wait = ASK_EVERY_MS;
@@ -39,6 +40,7 @@ export async function watchJob(id, onJob, signal) {
     } catch (error) {
       if (isAbort(error) || signal.aborted) throw error;
       if (error instanceof ProblemError && [401, 403, 404].includes(error.status) && !streams) throw error;
+      if (!streams) onSilence();
       streams = false;
       wait = Math.min(wait * 1.5, SLOWEST_MS);
     }

@@ -1,7 +1,7 @@
 /** Plants over frequency: modulus and phase of the model, of its set, and what was measured. */
 
 import { h } from "../lib/dom.js";
-import { number } from "../lib/format.js";
+import { hz, number } from "../lib/format.js";
 import { lineChart } from "../charts/line-chart.js";
 import { table } from "../parts/table.js";
 
@@ -67,7 +67,7 @@ function modeTable(axis) {
   if (axis.modes.length === 0) return h("p.hint", null, "No resonances.");
   const spread = (/** @type {number | null} */ sd, /** @type {number} */ digits) => (sd === null || sd === undefined ? "" : ` ± ${number(2 * sd, digits)}`);
   return table(`Modes of the ${axis.axis.toUpperCase()} axis`, [{ title: "Mode", text: true }, { title: "Frequency, Hz" }, { title: "Damping ratio" }],
-    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), `${number(m.f_hz)}${spread(m.f_sd_hz, 2)}`, `${number(m.zeta)}${spread(m.zeta_sd, 2)}`]));
+    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), `${hz(m.f_hz)}${spread(m.f_sd_hz, 2)}`, `${m.zeta.toFixed(3)}${spread(m.zeta_sd, 2)}`]));
 }
 
 /** @param {any[]} curves @param {"magnitude"} what @param {number} length */

@@ -62,7 +62,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
   }
 
   function deleteButton(/** @type {any} */ job) {
-    return h("button", { type: "button", onclick: () => act(async () => {
+    return h("button.quiet.apart", { type: "button", onclick: () => act(async () => {
       if (!await confirmed({ title: "Delete this job?", text: `${job.source_name}, its result and its report are deleted for good.`, yes: "Delete" })) return;
       await request(`/v1/jobs/${job.id}`, { method: "DELETE", signal });
       announce(`${job.source_name} is deleted.`);
@@ -82,7 +82,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
   draw(first);
   if (isOver(first)) return;
   // Not waited for: the view is shown, and changes as the job does.
-  watchJob(first.id, draw, signal).catch((error) => {
+  watchJob(first.id, draw, signal, progress.silence).catch((error) => {
     if (!isAbort(error)) fill(fault, problemPanel(error));
   });
 }

@@ -23,7 +23,7 @@ export async function show({ main, signal, setTitle, params: [name] }) {
     h("p.crumb", null, h("a", { href: "#/machines" }, "Machines"), " / "),
     h("div.head", null, h("h1", null, machine.title), h("span.badge", { dataset: { state: isOwn ? "own" : "builtin" } }, isOwn ? "Your own" : "Built in")),
     h("p.lead", null, h("code", null, machine.name), ` · ${machine.kinematics} · ${machine.firmware.kind}`, machine.source ? ` · ${machine.source}` : ""),
-    h("section", null, h("h2", null, "How it answers"), plots),
+    h("section", null, h("h2", null, "Frequency response"), plots),
     isOwn ? h("section", null, h("h2", null, "Revisions"), history) : null,
     h("section", null, h("h2", null, isOwn ? "New measurement" : "Measure yours"),
       measurementPanel({ machines, base: machine.name, own: isOwn, signal })),

@@ -10,6 +10,7 @@ import { machinePicker } from "../parts/machine-picker.js";
 
 const LAST_MACHINE = "stillpath.machine";
 const FILES = ".gcode,.g,.gco,.nc,.bgcode,.3mf,text/*";
+const MODELS = /\.(stl|obj|step|stp|amf|ply)$/i;
 const METHODS = [
   ["", [["fbf", "Compensate"]]],
   ["Approximate inverses", [["zpetc", "ZPETC"], ["ebzpetc", "Extended-bandwidth ZPETC"], ["ts", "Truncated series"], ["zmetc", "ZMETC"], ["npz-ignore", "NPZ-ignore"]]],
@@ -25,7 +26,8 @@ export async function show({ main, signal, setTitle }) {
     h("h1", null, "New job"),
     h("p.lead", null, "Hand in a sliced file. You get one back that keeps the nozzle on its path, with a report of what was measured on it."),
   ];
-  fill(main, heading);
+  // As narrow as it will be with the form, so that nothing jumps when that comes.
+  fill(main, h("div.narrow", null, heading));
   const machines = await getJson("/v1/machines", { signal });
   /** @type {File | null} */
   let file = null;
@@ -70,6 +72,8 @@ export async function show({ main, signal, setTitle }) {
 
   async function submit() {
     if (!file || !machine) return;
+    const wrong = complaint(file);
+    if (wrong) return fill(status, problemPanel(wrong));
     remember(machine);
     const sending = new AbortController();
     signal.addEventListener("abort", () => sending.abort());
@@ -91,6 +95,13 @@ export async function show({ main, signal, setTitle }) {
       ready();
     }
   }
+}
+
+/** What can be told of a file without sending it. @param {File} file @returns {{title: string, detail: string} | null} */
+function complaint(file) {
+  if (file.size === 0) return { title: "The file is empty", detail: `${file.name} has no content. Slice or copy it again.` };
+  if (MODELS.test(file.name)) return { title: "The file is not sliced", detail: `${file.name} is a model. Slice it first, and hand in the G-code.` };
+  return null;
 }
 
 /** What few need, folded away. */
