@@ -28,6 +28,7 @@ from service.remote import register as register_jobs
 from service.scanning import commands as scanning
 from service.security import commands as security
 from service.trajectories import register as register_trajectories
+from service.warm import register as register_warm
 
 __all__ = ["app", "main", "run"]
 
@@ -310,6 +311,7 @@ farm.register(app)
 commands_serve.register(app)
 backup.register(app)
 register_jobs(app)
+register_warm(app)
 
 
 def _options(**values: Any) -> Any:

@@ -1,0 +1,59 @@
+"""`stillpath warm`: what is compiled at first use is compiled now, as a part of installing."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command()(warm)
+
+
+def warm(
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="A sliced file, as they will come: .gcode, ..")
+    ],
+    machine: Annotated[
+        str,
+        typer.Option(
+            "--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."
+        ),
+    ],
+) -> None:
+    """Compile the kernels that a job needs, by doing one; nothing of the job is kept.
+
+    Compiled code lasts until the next version: in the installed package where it may be written,
+    else in the user's cache folder (or NUMBA_CACHE_DIR).
+    """
+    if not source.is_file():
+        raise typer.TyperException(f"there is no file {source}")
+
+    from service.console import progress_shown
+    from service.machines.commands import open_machines
+    from service.pipeline.options import Options
+    from service.pipeline.road import compensate_file
+    from service.reports import write_report
+
+    found = open_machines().for_job(machine, files=True)
+    with (
+        tempfile.TemporaryDirectory(prefix="stillpath-warm-") as folder,
+        progress_shown("stillpath") as progress,
+    ):
+        report = Path(folder) / "report"
+        result = compensate_file(
+            source,
+            Path(folder) / source.name,
+            found.machine,
+            Options(),
+            cache_dir=Path(folder),
+            progress=progress,
+            layers=report,
+        )
+        write_report(result, report)
