@@ -92,7 +92,7 @@ def main() -> None:
 def simulated_logs() -> Iterator[str]:
     """Pairs of raw logs through files, as a user has them."""
     print("simulated raw logs (turned sensor, unknown start), X and Y from two files")
-    print("| rate, Hz | sweep | f, worst % | zeta, worst % | NRMSE, worst % | CPU s of the pair (limit 5) |")
+    print("| rate, Hz | sweep | f, worst % | zeta, worst % | NRMSE, worst % | CPU s (limit 5) |")
     print("|---|---|---|---|---|---|")
     rng = np.random.default_rng(1)
     for sensor, kind in ((ADXL345, "3200"), (LIS2DW, "1600")):
