@@ -230,7 +230,9 @@ def test_machines(capsys):
 @pytest.mark.parametrize(
     "arguments", ["serve --host 0.0.0.0", "serve --host printer.lan", "serve --workers 0", "fly"]
 )
-def test_refusals(arguments, capsys):
+def test_refusals(arguments, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("STILLPATH_KEYS", "false")
     assert run(arguments.split()) == 2
     one_line(capsys)
 
