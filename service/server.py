@@ -66,10 +66,19 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
     ):
         # The application does so again; what uvicorn makes of an error there nobody can read.
         open_database(settings).dispose()
-        shown = f"[{host}]" if family == socket.AF_INET6 else host
-        sys.stdout.write(f"stillpath: http://{shown}:{listener.getsockname()[1]}/\n")
+        for address in _addresses(host, listener.getsockname()[1]):
+            sys.stdout.write(f"stillpath: {address}\n")
         sys.stdout.flush()
         uvicorn.Server(config).run(sockets=[listener])
+
+
+def _addresses(host: str, port: int) -> list[str]:
+    """Return where a browser finds the service, on this computer first."""
+    if host in ("0.0.0.0", "::", ""):
+        name = socket.gethostname()
+        return [f"http://127.0.0.1:{port}/", f"http://{name}:{port}/ (from other computers)"]
+    shown = f"[{host}]" if ":" in host else host
+    return [f"http://{shown}:{port}/"]
 
 
 @contextlib.contextmanager

@@ -169,7 +169,7 @@ class Intake:
                 return Taken(earlier, False, upload)
         dedupe_key = _dedupe_key(wanted, upload, pinned)
         shared = not wanted.fresh and wanted.webhook is None and wanted.printer is None
-        if shared:
+        if shared and idempotency is None:  # with a key, `add` looks, and notes the key
             same = self._store.find_same(caller.owner, dedupe_key)
             if same is not None:
                 return Taken(same, False, upload)

@@ -101,7 +101,8 @@ def matches(header: str | None, tag: str) -> bool:
 
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
     """Return the part that is asked for, as first byte and the one behind the last."""
-    asked = request.headers.get("range")
+    # Only GET knows ranges (RFC 9110, 14.2).
+    asked = request.headers.get("range") if request.method == "GET" else None
     condition = request.headers.get("if-range")
     if asked is None or (condition is not None and condition != tag):
         return None

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["Trajectories", "router"]
 
 _LONGEST_S = 600.0
+_WAITING = 4
+"""How many may wait for their turn."""
 _MEDIA = {"csv": "text/csv", "npz": "application/octet-stream"}
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
@@ -53,7 +55,16 @@ class Trajectories:
         GcodeError
         FileNotFoundError
             If the job's files are gone.
+        Problem
+            429 if too many wait already.
         """
+        if self._turn.statistics().tasks_waiting >= _WAITING:
+            raise Problem(
+                429,
+                "Too many wait",
+                f"{_WAITING} others wait for trajectories; ask again later.",
+                headers={"Retry-After": "60"},
+            )
         async with self._turn:
             with ExitStack() as files:
                 source, machine = [
@@ -87,7 +98,7 @@ class Trajectories:
                 "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
             },
         },
-        **responses(404, 409, 422),
+        **responses(404, 409, 422, 429),
     },
     summary="Fetch the trajectories",
 )

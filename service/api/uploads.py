@@ -88,8 +88,8 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
         raise Problem(
             422,
             "The file is empty",
-            "The request brought no bytes. Send the G-code as the body "
-            "(curl --data-binary @part.gcode) or as a form's file.",
+            "The file has no content: slice or copy it again. The G-code is the body of the "
+            "request (curl --data-binary @part.gcode), or a form's file.",
         )
     return Upload(safe_name(name), sink.size_bytes, sink.digest.hexdigest(), fields)
 

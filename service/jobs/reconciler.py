@@ -37,6 +37,8 @@ _GIVE_BACK_S = 1.5
 _UPLOAD_S = 86400.0
 """Uploads that have not grown for so long were broken off."""
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
+_CLOCK_SET_S = 1.0
+"""Between two looks, a clock that was set differs by more."""
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
 """How long our own workers, which start anew by themselves, and those elsewhere may be away before
 the service is not ready."""
@@ -81,6 +83,7 @@ class Reconciler:
         self._trouble_since = 0.0
         # Since when the database and the workers answer, without a break.
         self._steady_since = time.monotonic()
+        self._clock_offset_s = time.time() - time.monotonic()
 
     def start(self) -> None:
         """Start the threads."""
@@ -175,6 +178,10 @@ class Reconciler:
 
     def _find_silent(self) -> None:
         timeout_s = self._settings.heartbeat_timeout_s
+        offset_s = time.time() - time.monotonic()
+        if abs(offset_s - self._clock_offset_s) > _CLOCK_SET_S:
+            self._steady_since = time.monotonic()  # what was heard before has an old time
+        self._clock_offset_s = offset_s
         # While nobody could reach the database, nobody could be heard.
         if time.monotonic() - self._steady_since > timeout_s:
             for job in self._store.silent(time.time() - timeout_s):

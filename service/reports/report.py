@@ -80,12 +80,18 @@ def render_report(result: Result) -> str:
     )
 
 
-def _headline(channels: Sequence[Channel]) -> dict[str, float | None]:
-    """Contour error rms while extruding, by channel, and how many times smaller it became."""
-    rms = {channel.name: channel.extruding.contour_rms_um for channel in channels}
+def _headline(channels: Sequence[Channel]) -> dict[str, Any]:
+    """Contour error rms while extruding, by channel, and how many times smaller it became.
+
+    Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion.
+    """
+    extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
+    scope = "extruding" if extrudes else "all_motion"
+    rms = {channel.name: getattr(channel, scope).contour_rms_um for channel in channels}
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
     return {
+        "of": "while extruding" if extrudes else "of all motion (nothing is extruded)",
         "before": before,
         "after": after,
         "shaper": rms.get("shaper"),
