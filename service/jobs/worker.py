@@ -148,6 +148,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         for said in (watch.verdict, event):
             if said is not None:
                 _report(store, job, said)
+        _tidy(job, workplace)
         log.info("job over", outcome="dropped" if event is None else type(event).__name__)
     if watch.outgrown:
         workplace.end(0)
@@ -251,6 +252,19 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
 def _report(store: JobStore, job: Job, event: Event) -> None:
     # Should the database break after it has taken the event, the second try is stale: no harm.
     _patiently(lambda: store.apply(job.id, event), DatabaseAway, time.sleep)
+
+
+def _tidy(job: Job, workplace: Workplace) -> None:
+    """Delete what the attempt has put away, unless the job's row names it.
+
+    The job may have been deleted or cancelled meanwhile, or given to somebody else.
+    """
+    with contextlib.suppress(DatabaseAway, StorageError):  # then the sweep finds it
+        row = workplace.store.get(job.id)
+        if row is None:
+            workplace.storage.delete(f"jobs/{job.id}/")
+        elif row.output != f"jobs/{job.id}/{job.attempt}":
+            workplace.storage.delete(f"jobs/{job.id}/{job.attempt}/")
 
 
 def _patiently(

@@ -123,6 +123,20 @@ def test_an_attempt_that_finishes_too_late_changes_nothing(site: Site):
     site.check_files()
 
 
+def test_a_job_deleted_while_its_result_is_made_leaves_nothing(site: Site):
+    job_id = site.submit("G1 X1")
+
+    def late(task: Any, progress: Any) -> dict[str, Any]:
+        summary = light(task, progress)
+        site.store.forget(job_id)
+        site.storage.delete(f"jobs/{job_id}/")
+        return summary
+
+    with pytest.raises(AssertionError):
+        Bench(site).run(job_id, late)
+    assert list(site.storage.list("jobs/")) == []  # before any sweep
+
+
 def test_a_worker_that_is_stopped_gives_its_job_back(site: Site):
     bench = Bench(site)
     job_id = site.submit("slow")
