@@ -22,7 +22,7 @@ __all__ = ["State", "differences", "states", "tagged"]
 _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
-_G92_E = re.compile(rb"G92 E(\S+)")
+_G92_E = re.compile(rb"\s*G92\s*E([-+]?[\d.]+)")
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
     rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time"
