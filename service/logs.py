@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import TextIO, cast
 
 import structlog
 from structlog.typing import Processor
@@ -27,5 +28,15 @@ def configure_logging() -> None:
             mask_secrets,
             renderer,
         ],
-        logger_factory=structlog.WriteLoggerFactory(file=sys.stderr),
+        logger_factory=structlog.WriteLoggerFactory(file=cast("TextIO", _Stderr())),
     )
+
+
+class _Stderr:
+    """Whatever stderr is at the moment of writing: who redirects it does not keep it for ever."""
+
+    def write(self, text: str) -> int:
+        return sys.stderr.write(text)
+
+    def flush(self) -> None:
+        sys.stderr.flush()
