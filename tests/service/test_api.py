@@ -138,10 +138,10 @@ def test_bad_options_are_refused_at_once(client: TestClient, query: str, words: 
 
 def test_empty_large_and_broken_uploads_leave_nothing(client: TestClient, data_dir: Path):
     before = sorted((data_dir / "jobs").iterdir())
-    assert_problem(client.post(JOBS, content=b""), 422, "no bytes")
+    assert_problem(client.post(JOBS, content=b""), 422, "no content")
     assert_problem(client.post(JOBS, content=b"x" * 100_001), 413, "100000 bytes")
     assert_problem(client.post(JOBS, content=iter([b"x" * 60_000] * 2)), 413, "100000 bytes")
-    assert_problem(client.post(JOBS, files={"file": ("a.gcode", b"")}), 422, "no bytes")
+    assert_problem(client.post(JOBS, files={"file": ("a.gcode", b"")}), 422, "no content")
     assert_problem(client.post(JOBS, files={"file": (None, b"text")}), 422, "file name")
     form = {"content-type": "multipart/form-data; boundary=abc"}
     assert_problem(client.post(JOBS, content=b"junk", headers=form), 422, "cannot be read")

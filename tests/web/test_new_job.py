@@ -42,7 +42,9 @@ def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
     hand_in(page, file)
     page.wait_for_url("**/#/jobs/*")
     expect(page.locator("h1")).to_have_text("wheel.gcode")
-    expect(page.get_by_role("progressbar", name="Progress")).to_be_visible()
+    # A quick computer is done before one looks.
+    progress = page.get_by_role("progressbar", name="Progress")
+    expect(progress.or_(page.locator(".headline")).first).to_be_visible()
     visitor.shoot(page, "progress")
     expect(page.locator(".headline")).to_contain_text("times smaller")
     before, after = (page.locator(f".headline .{name}") for name in ("before", "after"))
