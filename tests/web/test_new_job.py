@@ -59,7 +59,7 @@ def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
     assert download.value.suggested_filename == "wheel.stillpath.gcode"
     assert download.value.path().read_bytes().count(b"\n") > 1000
     with page.context.expect_page() as report:
-        page.get_by_role("link", name="Report", exact=True).click()
+        page.get_by_role("link", name="Report (new tab)").click()
     expect(report.value.locator("h1")).to_have_text("wheel.gcode")
 
 
