@@ -562,8 +562,8 @@ class Service:
     def _send(self, source: Path, options: Mapping[str, Any]) -> str:
         size = source.stat().st_size
         # A job of our own: it is deleted behind us, also if others send the same file.
-        given = {**options, "name": options["name"][-255:], "fresh": "true"}
-        query = urlencode(given, errors="replace")
+        name = options["name"][-255:]
+        query = urlencode({**options, "name": name, "fresh": "true"}, errors="replace")
         with source.open("rb") as file:
             body = _Told(file, size, lambda share: self._tell("sending", share))
             job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
@@ -579,12 +579,10 @@ class Service:
             state = job.get("state")
             if state == "done":
                 return
-            if state == "failed":
+            if state in ("failed", "cancelled"):
                 problem = job.get("error") or {}
-                reason = problem.get("detail", "the server does not say why")
-                raise Failure(reason, 2 if problem.get("status", 500) < 500 else 1)
-            if state == "cancelled":
-                raise Failure("the job was cancelled on the server")
+                reason = problem.get("detail", f"the job was {state} on the server")
+                raise Failure(reason, 2 if problem.get("status", 422) < 500 else 1)
             if wait_s is not None and time.monotonic() - began > wait_s:
                 raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
             waiting = job.get("queue_position")
@@ -594,8 +592,7 @@ class Service:
             pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
 
     def _save(self, answer: Any, target: Path) -> bytes:
-        expected = int(answer.headers.get("Content-Length") or -1)
-        read = 0
+        expected, read = int(answer.headers.get("Content-Length") or -1), 0
         with target.open("wb") as file:
             while chunk := _read(answer, 1 << 18):
                 read += file.write(chunk)
@@ -684,11 +681,10 @@ def _read(answer: Any, size: int | None = None) -> bytes:
 
 def _object(answer: bytes) -> dict[str, Any]:
     """Return a JSON object, empty for anything else."""
-    try:
-        found = json.loads(answer)
-    except ValueError:
-        found = None
-    return found if isinstance(found, dict) else {}
+    with contextlib.suppress(ValueError):
+        if isinstance(found := json.loads(answer), dict):
+            return found
+    return {}
 
 
 class _EarlyAnswer(http.client.HTTPConnection):
