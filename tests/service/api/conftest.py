@@ -11,13 +11,13 @@ from starlette.testclient import TestClient
 from tests.service.api.serving import PRINTERS, opened
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where it keeps its files."""
     return tmp_path_factory.mktemp("data")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def client(data_dir: Path) -> Iterator[TestClient]:
     """Its client; there is one printer, `left`, that does not answer."""
     printers = data_dir / "printers.toml"

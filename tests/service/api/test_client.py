@@ -73,7 +73,7 @@ def test_from_file_to_file(client: Client, tmp_path: Path):
         ("bad\n", "ender3", "line 7|X1e400", True),
         ("crash\n", "ender3", "RuntimeError", False),
         ("G1 X1\n", "nope", "nope", True),
-        ("", "ender3", "no bytes", True),
+        ("", "ender3", "no content", True),
     ],
 )
 def test_why_it_was_not_done(
