@@ -1,1 +1,1 @@
-"""A package, so that the application that its tests share (fixtures of scope `package`) ends with them."""
+"""A package, so that what its tests share (fixtures of scope `package`) ends with them."""
