@@ -160,6 +160,13 @@ def compensate(
         float | None,
         typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
     ] = None,
+    budget_um: Annotated[
+        float | None,
+        typer.Option(
+            help="Contour error that every feature may have (rms, worst plant of the set): print "
+            "as fast as that allows. [default: keep all speeds]"
+        ),
+    ] = None,
     plate: PlateOption = None,
     dialect: DialectOption = None,
     keep_times: Annotated[
@@ -179,6 +186,7 @@ def compensate(
         "robust": robust,
         "along": along,
         "tolerance_um": tolerance_um,
+        "budget_um": budget_um,
         "plate": plate,
         "dialect": dialect,
         "times": "kept" if keep_times else None,

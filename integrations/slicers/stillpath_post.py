@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from typing import BinaryIO, NoReturn, TextIO
 
 PROGRAM = "stillpath-post"
-_JOB_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "times", "plate")
+_JOB_OPTIONS = tuple("method basis robust along tolerance_um budget_um times plate".split())
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
@@ -742,11 +742,12 @@ def _parser() -> _Parser:
     add("--server", metavar="URL", help="work on this server instead of on this computer")
     add("--local", action="store_true", help="on this computer, even if the settings name a server")
     add("--key", metavar="KEY", help="key of the server; better in the settings or STILLPATH_KEY")
-    add("--method", metavar="M", help="as of `stillpath compensate`, and so the next six")
+    add("--method", metavar="M", help="as of `stillpath compensate`, and so the next seven")
     add("--basis", metavar="B")
     add("--robust", metavar="R")
     add("--along", metavar="W", type=float)
     add("--tolerance-um", metavar="T", type=float)
+    add("--budget-um", metavar="B", type=float)
     add("--times", choices=("new", "kept"), help="kept: the slicer's times stay in the file")
     add("--plate", metavar="N", type=int)
     add("--on-error", choices=("fail", "keep"), help="keep: print what was sliced, exit code 0")

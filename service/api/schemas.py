@@ -12,6 +12,7 @@ from service.jobs.state import Job, JobState
 from service.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
+    BudgetUm,
     DialectName,
     Options,
     RobustMode,
@@ -112,6 +113,11 @@ class JobQuery(BaseModel):
         le=50,
         allow_inf_nan=False,
         description="How far the written path may be from the computed one.",
+    )
+    budget_um: BudgetUm | None = Field(
+        default=None,
+        description="Contour error that every feature may have, rms of the worst plant of the "
+        "machine's set: the print becomes as fast as that allows. By default it keeps its speeds.",
     )
     plate: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
         default=None, description="Which plate of a 3MF package with several."

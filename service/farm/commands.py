@@ -50,6 +50,7 @@ Key = Annotated[str | None, typer.Option(metavar="KEY", help="Key of the server.
 Method = Annotated[str, typer.Option(help="See `stillpath compensate --help`; so for all below.")]
 Along = Annotated[float | None, typer.Option(help="Weight of errors along the path.")]
 Tolerance = Annotated[float | None, typer.Option(help="Of the written path. [default: 2]")]
+Budget = Annotated[float | None, typer.Option(help="As fast as this contour error allows.")]
 Dialect = Annotated[str | None, typer.Option(metavar="NAME", help="How files are read.")]
 KeepTimes = Annotated[bool, typer.Option("--keep-times", help="Leave the slicer's times.")]
 
@@ -75,6 +76,7 @@ def batch(
     robust: str = "off",
     along: Along = None,
     tolerance_um: Tolerance = None,
+    budget_um: Budget = None,
     dialect: Dialect = None,
     keep_times: KeepTimes = False,
 ) -> None:
@@ -88,7 +90,7 @@ def batch(
     from service.farm.summary import print_summary, write_summary
     from service.interruption import Interrupted
 
-    options = _options(method, basis, robust, along, tolerance_um, dialect, keep_times)
+    options = _options(method, basis, robust, along, tolerance_um, budget_um, dialect, keep_times)
     items = items_of(sources, parse_map(machine, machine_map or []), output=output)
     outcomes: list[Outcome] = []
 
@@ -133,6 +135,7 @@ def watch(
     robust: str = "off",
     along: Along = None,
     tolerance_um: Tolerance = None,
+    budget_um: Budget = None,
     dialect: Dialect = None,
     keep_times: KeepTimes = False,
 ) -> None:
@@ -144,7 +147,7 @@ def watch(
     from service.farm.watching import Watcher, run_watch
     from service.interruption import Interrupted
 
-    options = _options(method, basis, robust, along, tolerance_um, dialect, keep_times)
+    options = _options(method, basis, robust, along, tolerance_um, budget_um, dialect, keep_times)
     group = parse_map(machine, machine_map or [])
     if output.resolve() == folder.resolve():
         raise ModelError(f"--output {output} is the watched folder; name one in it or elsewhere")
@@ -197,6 +200,7 @@ def _options(
     robust: str,
     along: float | None,
     tolerance_um: float | None,
+    budget_um: float | None,
     dialect: str | None,
     keep_times: bool,
 ) -> Any:
@@ -210,6 +214,7 @@ def _options(
         "robust": robust,
         "along": along,
         "tolerance_um": tolerance_um,
+        "budget_um": budget_um,
         "dialect": dialect,
         "times": "kept" if keep_times else None,
     }

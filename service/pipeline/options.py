@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
-__all__ = ["DEFAULT_TOLERANCE_UM", "BasisName", "DialectName", "Options", "RobustMode"]
+__all__ = [
+    "DEFAULT_TOLERANCE_UM",
+    "BasisName",
+    "BudgetUm",
+    "DialectName",
+    "Options",
+    "RobustMode",
+]
 
 DEFAULT_TOLERANCE_UM = 2.0
 
 BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
 RobustMode = Literal["off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
+BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
 
 
 class Options(BaseModel):
@@ -24,7 +38,9 @@ class Options(BaseModel):
     the path against that across it (None: as suits `robust`). `plate` chooses one of several in a
     3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
     the file follow the new motion. `dialect` is how the file is read (None: as the machine's
-    firmware reads it).
+    firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
+    worst plant of the machine's set) that every feature may have: the print becomes as fast as
+    that allows (None: it keeps its speeds).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -43,3 +59,12 @@ class Options(BaseModel):
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM
     times: Literal["new", "kept"] = "new"
     dialect: DialectName | None = None
+    budget_um: BudgetUm | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Digests of options are kept for long: what came later counts only where it is used.
+        values: dict[str, Any] = handler(self)
+        if values.get("budget_um") is None:
+            values.pop("budget_um", None)
+        return values

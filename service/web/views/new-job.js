@@ -109,6 +109,7 @@ function moreOptions() {
   const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
   const robust = select("robust", [["", [["off", "The nominal plant (fastest)"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
   const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
+  const budget = h("input", { type: "number", id: "budget", min: "0.5", max: "1000", step: "0.5", placeholder: "keep all speeds" });
   const plate = h("input", { type: "number", id: "plate", min: "1", step: "1", placeholder: "the only one" });
   const times = select("times", [["", [["new", "Follow the new motion"], ["kept", "Stay as they are"]]]]);
   const dialect = select("dialect", [["", DIALECTS]]);
@@ -118,12 +119,13 @@ function moreOptions() {
       field("robust", "Design for", robust),
       field("basis", "Basis functions", basis),
       field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
+      field("budget", "Speed budget, µm", budget, "Contour error (rms) that every feature may have; the print becomes as fast as that allows."),
       field("dialect", "File is written for", dialect),
       field("times", "The slicer's times", times),
       field("plate", "Plate of a 3MF package", plate)),
     h("label.check", { for: "fresh" }, fresh, "Compute anew even if the same file was done before"));
   const read = () => ({
-    basis: basis.value, robust: robust.value, along: along.value, plate: plate.value,
+    basis: basis.value, robust: robust.value, along: along.value, budget_um: budget.value, plate: plate.value,
     times: times.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "",
   });
   return { element, read };
