@@ -331,7 +331,7 @@ def _show(text: str, kind: str) -> None:
     Message(text, title="Stillpath", lifetime=lifetime_s, **more).show()
 
 
-# Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
+# Client of the service: the same in slicers/, cura/ and octoprint/.
 
 
 class Failure(Exception):

@@ -476,7 +476,7 @@ class Signals:
             raise Stopped(number)
 
 
-# Client of the service: the same in slicers/stillpath_post.py and cura/Stillpath.py.
+# Client of the service: the same in slicers/, cura/ and octoprint/.
 
 
 class Failure(Exception):
