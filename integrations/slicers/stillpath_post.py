@@ -40,7 +40,10 @@ if TYPE_CHECKING:
     from typing import BinaryIO, NoReturn, TextIO
 
 PROGRAM = "stillpath-post"
-_JOB_OPTIONS = tuple("method basis robust along tolerance_um budget_um times plate".split())
+_JOB_OPTIONS = (
+    *("method", "basis", "robust", "along"),
+    *("tolerance_um", "budget_um", "times", "plate"),
+)
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
