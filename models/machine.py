@@ -98,6 +98,8 @@ class Machine(Document):
             if not content[added]:
                 # Machines from before there were such fields keep their revision.
                 del content[added]
+        if not content["firmware"].get("ft_motion", True):
+            del content["firmware"]["ft_motion"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
 

@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from gcode.types import Limits, Moves, Phases, ProgramBlock
 
 if TYPE_CHECKING:
+    from gcode.dialect import Dialect
     from gcode.firmware.encoding import Encoded
     from gcode.pieces import Piece
     from gcode.segments import Segments
     from gcode.timeline import Group, Timeline
+    from models.machine import CommandLimits
+    from models.shaping import Shaping
 
-__all__ = ["Encoder", "FirmwareKit", "Planner", "Voice"]
+__all__ = ["Adviser", "Encoder", "FirmwareKit", "Planner", "Voice", "scaled"]
 
 
 class Planner(Protocol):
@@ -117,6 +120,51 @@ class Voice(Protocol):
         """
 
 
+class Adviser(Protocol):
+    """Words that set the firmware's own shaper and the acceleration of moves that print.
+
+    Lines come without their ends, so that a comment can follow.
+    """
+
+    @property
+    def shapers(self) -> tuple[str, ...]:
+        """Types that a file may set, by our names (`models.shaper_pulses`); empty: none."""
+
+    @property
+    def same_for_both(self) -> bool:
+        """X and Y share one type and one frequency (RepRapFirmware)."""
+
+    @property
+    def travel_apart(self) -> bool:
+        """Travel has an acceleration of its own, which `accel_lines` leaves alone."""
+
+    @property
+    def highest_mm_s2(self) -> float:
+        """Acceleration of X and Y that the machine is set up for."""
+
+    @property
+    def stated(self) -> Shaping | None:
+        """The shaper that the machine states; None: it does not say."""
+
+    def accel_mm_s2(self, limits: Limits) -> float:
+        """Return the acceleration of moves that print."""
+
+    def with_accel(self, limits: Limits, accel_mm_s2: float) -> Limits:
+        """Return limits with another acceleration of moves that print."""
+
+    def accel_lines(self, accel_mm_s2: float) -> tuple[bytes, ...]:
+        """Return the lines that set it."""
+
+    def sets_accel(self, text: str) -> bool:
+        """Tell whether a line of a file sets it."""
+
+    def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
+        """Return the lines that set the shapers of X and Y."""
+
+    def read_shaper(self, text: str, now: Shaping) -> Shaping:
+        """Return what a line of a file leaves in force."""
+
+
 class FirmwareKit(Protocol):
     """What one firmware offers for one machine."""
 
@@ -145,6 +193,26 @@ class FirmwareKit(Protocol):
         where these limits change.
         """
 
+    def quickened(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> Limits:
+        """Return limits under which X and Y are quicker (or slower) than under `own`.
+
+        Parameters
+        ----------
+        own : Limits
+            What the file has set.
+        accel : float
+            Ratio of the accelerations. Corners are passed at its square root times the speed: they
+            stay as round as they are.
+        speed : float
+            Ratio of the speed limits.
+        most : CommandLimits
+            What no limit rises above; one that the file has set higher stays.
+
+        Notes
+        -----
+        Limits of Z and of the extruder stay.
+        """
+
     def planner(self) -> Planner:
         """Return a planner at rest."""
 
@@ -154,6 +222,9 @@ class FirmwareKit(Protocol):
     def voice(self) -> Voice:
         """Return the words of the firmware."""
 
+    def adviser(self, dialect: Dialect) -> Adviser:
+        """Return its words for shaper and acceleration, for files read by a dialect."""
+
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which moves climb so much that a stream could not keep their times.
 
@@ -162,3 +233,8 @@ class FirmwareKit(Protocol):
         travel_mm : ndarray, shape (n, 4)
             x y z e; moves that do not climb in the file may still climb along a bed mesh.
         """
+
+
+def scaled(value: float, ratio: float, most: float) -> float:
+    """Return `ratio` times a limit, which rises to `most` and not above; higher ones stay."""
+    return min(ratio * value, max(value, most))

@@ -120,6 +120,8 @@ class Marlin(FirmwareFacts):
     """MAX_CMD_SIZE: one less than this is read of a line, the rest is cut off."""
     shaper: MarlinShaper | None = None
     """None: not known. Without a shaper (M593) both frequencies are 0."""
+    ft_motion: bool = False
+    """FT_MOTION is built in and on (M493): it has shapers of its own, and M593 has no effect."""
     board: Literal["32bit", "avr"] = "32bit"
     """An 8-bit board computes step rates in 16 bits and cannot follow a dense stream."""
     step_timer_hz: Annotated[float, Field(ge=1e5, le=1e9)] = 2e6

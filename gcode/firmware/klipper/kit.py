@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.dialect import Dialect
+from gcode.firmware.base import scaled
+from gcode.firmware.klipper.advice import KlipperAdviser
 from gcode.firmware.klipper.encoder import KlipperEncoder, stream_limits
 from gcode.firmware.klipper.limits import KlipperLimits
 from gcode.firmware.klipper.planner import Planner
 from gcode.firmware.klipper.voice import KlipperVoice
 from gcode.types import Limits
 from models.firmware import Klipper
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 
 __all__ = ["MIN_STREAM_ACCEL_MM_S2", "KlipperKit"]
 
@@ -60,6 +67,20 @@ class KlipperKit:
         """Return the raised limits; nothing of the file's is kept."""
         return self._stream
 
+    def quickened(
+        self, own: Limits, accel: float, speed: float, most: CommandLimits
+    ) -> KlipperLimits:
+        """Return limits under which X and Y are quicker."""
+        mine = cast(KlipperLimits, own)
+        raised = scaled(mine.accel_mm_s2, accel, most.accel_mm_s2)
+        corner = math.sqrt(raised / mine.accel_mm_s2) * mine.square_corner_velocity_mm_s
+        return replace(
+            mine,
+            velocity_mm_s=scaled(mine.velocity_mm_s, speed, most.velocity_mm_s),
+            accel_mm_s2=raised,
+            square_corner_velocity_mm_s=corner,
+        )
+
     def planner(self) -> Planner:
         """Return a planner at rest."""
         return Planner(self._firmware)
@@ -71,6 +92,10 @@ class KlipperKit:
     def voice(self) -> KlipperVoice:
         """Return Klipper's words."""
         return KlipperVoice(self._firmware)
+
+    def adviser(self, dialect: Dialect) -> KlipperAdviser:
+        """Return its words for shaper and acceleration."""
+        return KlipperAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which moves climb so much that Z's limit leaves too little acceleration."""

@@ -178,6 +178,7 @@ def marlin(firmware: Marlin) -> Dialect:
         **(ARCS if firmware.arcs else {}),
         **(RETRACTION if firmware.retraction else {}),
         **{"prusa": PRUSA, "bambu": BAMBU}.get(firmware.variant, {}),
+        **({"M493": EventKind.SHAPER} if firmware.ft_motion else {}),
     }
     made = Dialect(
         name="marlin",

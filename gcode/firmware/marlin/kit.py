@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.dialect import Dialect
+from gcode.firmware.base import scaled
+from gcode.firmware.marlin.advice import MarlinAdviser
 from gcode.firmware.marlin.encoder import STREAM_Z_ACCEL_MM_S2, MarlinEncoder, stream_limits
 from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from gcode.firmware.marlin.planner import Planner
 from gcode.firmware.marlin.voice import MarlinVoice
 from gcode.types import Limits
 from models.firmware import Marlin
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 
 __all__ = ["LONGEST_LEAST_MM", "MIN_STREAM_ACCEL_MM_S2", "MarlinKit"]
 
@@ -26,6 +31,8 @@ LONGEST_LEAST_MM = 0.02
 
 JUNCTION_DEVIATION_MM = (0.01, 0.3)
 """What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
+
+_ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
 
 _ALTERNATIVE = "use the firmware's own input shaper (`stillpath simulate` names its best setting)"
 
@@ -102,6 +109,24 @@ class MarlinKit:
         """Return what a stream runs under where the file has set `own`."""
         return stream_limits(cast(MarlinLimits, own), self._velocity)
 
+    def quickened(
+        self, own: Limits, accel: float, speed: float, most: CommandLimits
+    ) -> MarlinLimits:
+        """Return limits under which X and Y are quicker; junctions keep their deviation."""
+        mine = cast(MarlinLimits, own)
+        raised = {
+            name: scaled(getattr(mine, name), accel, most.accel_mm_s2) for name in _ACCELERATIONS
+        }
+        jerk = math.sqrt(raised["print_accel_mm_s2"] / mine.print_accel_mm_s2)
+        return replace(
+            mine,
+            **raised,
+            feedrate_x_mm_s=scaled(mine.feedrate_x_mm_s, speed, most.velocity_mm_s),
+            feedrate_y_mm_s=scaled(mine.feedrate_y_mm_s, speed, most.velocity_mm_s),
+            jerk_x_mm_s=jerk * mine.jerk_x_mm_s,
+            jerk_y_mm_s=jerk * mine.jerk_y_mm_s,
+        )
+
     def planner(self) -> Planner:
         """Return a planner at rest."""
         return Planner(self._firmware, corexy=self._corexy)
@@ -113,6 +138,10 @@ class MarlinKit:
     def voice(self) -> MarlinVoice:
         """Return Marlin's words."""
         return MarlinVoice(self._firmware)
+
+    def adviser(self, dialect: Dialect) -> MarlinAdviser:
+        """Return its words for shaper and acceleration."""
+        return MarlinAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which moves climb so much that Z leaves too little acceleration."""

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.dialect import Dialect
+from gcode.firmware.base import scaled
+from gcode.firmware.reprapfirmware.advice import RepRapAdviser
 from gcode.firmware.reprapfirmware.encoder import RepRapEncoder, stream_limits
 from gcode.firmware.reprapfirmware.limits import RepRapLimits
 from gcode.firmware.reprapfirmware.planner import RepRapPlanner
 from gcode.firmware.reprapfirmware.voice import RepRapVoice
 from gcode.types import Limits
 from models.firmware import RepRapFirmware
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 
 __all__ = ["RepRapKit"]
 
 STEEPEST = 0.1
 """Z is driven with the stream's acceleration times the slope; steeper moves stay as they are."""
+
+
+_ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
+_SPEEDS = ("speed_x_mm_s", "speed_y_mm_s")
+_JERKS = ("jerk_x_mm_s", "jerk_y_mm_s", "max_jerk_x_mm_s", "max_jerk_y_mm_s")
 
 
 class RepRapKit:
@@ -52,6 +64,19 @@ class RepRapKit:
         """Return the raised limits; nothing of the file's is kept."""
         return self._stream
 
+    def quickened(
+        self, own: Limits, accel: float, speed: float, most: CommandLimits
+    ) -> RepRapLimits:
+        """Return limits under which X and Y are quicker."""
+        mine = cast(RepRapLimits, own)
+        raised = {
+            name: scaled(getattr(mine, name), accel, most.accel_mm_s2) for name in _ACCELERATIONS
+        }
+        raised |= {name: scaled(getattr(mine, name), speed, most.velocity_mm_s) for name in _SPEEDS}
+        jerk = math.sqrt(raised["accel_x_mm_s2"] / mine.accel_x_mm_s2)
+        raised |= {name: jerk * getattr(mine, name) for name in _JERKS}
+        return replace(mine, **raised)
+
     def planner(self) -> RepRapPlanner:
         """Return a planner at rest."""
         return RepRapPlanner(self._firmware, self._machine.kinematics)
@@ -64,6 +89,10 @@ class RepRapKit:
     def voice(self) -> RepRapVoice:
         """Return RepRapFirmware's words."""
         return RepRapVoice(self._firmware, self._machine.pressure_advance_s)
+
+    def adviser(self, dialect: Dialect) -> RepRapAdviser:
+        """Return its words for shaper and acceleration."""
+        return RepRapAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Tell which moves climb more than Z can follow a stream, the bed mesh included."""

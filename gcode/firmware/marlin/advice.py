@@ -1,0 +1,103 @@
+"""Marlin's words for a shaper and an acceleration, read and written."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+from gcode.dialect import Dialect
+from gcode.firmware.marlin.limits import MarlinLimits
+from gcode.lexer import split_line
+from gcode.types import Limits
+from models.firmware import Marlin
+from models.shaping import OFF, AxisShaper, Shaping
+
+__all__ = ["MarlinAdviser"]
+
+_WITH_SHAPER = ("2.1", "bugfix")
+_COMPENSATORS = {"zv": 1, "ei": 5, "2hump_ei": 6, "3hump_ei": 7, "mzv": 8}
+"""Our names to M493 C. ZVD, ZVDD and ZVDDD have no model here."""
+_MODELLED = {str(number): name for name, number in _COMPENSATORS.items()} | {"0": "none"}
+
+
+class MarlinAdviser:
+    """See `gcode.firmware.base.Adviser`.
+
+    M593 sets a ZV shaper; a build may lack it, so it is only written where the machine states a
+    shaper (`firmware.shaper` with a frequency above 0), M493 where it says `ft_motion`. Sources:
+    Marlin/src/gcode/feature/input_shaping/M593.cpp and gcode/config/M200-M205.cpp, 2.1.2 (2023-01);
+    gcode/feature/ft_motion/M493.cpp, bugfix-2.1.x (2025).
+    """
+
+    same_for_both = False
+    travel_apart = True
+
+    def __init__(self, firmware: Marlin, dialect: Dialect) -> None:
+        self._dialect = dialect
+        axes = firmware.planner.max_accel_mm_s2
+        self.highest_mm_s2 = min(axes.x, axes.y)
+        s = firmware.shaper
+        self.stated: Shaping | None = None
+        if s is not None:
+            self.stated = Shaping(
+                AxisShaper("zv" if s.freq_x_hz else "none", s.freq_x_hz, s.damping_x),
+                AxisShaper("zv" if s.freq_y_hz else "none", s.freq_y_hz, s.damping_y),
+            )
+        elif firmware.variant == "2.0":
+            self.stated = OFF
+        self._fixed_time = firmware.ft_motion
+        if self._fixed_time:
+            # What M593 states is not what fixed-time motion does.
+            self.stated = None
+            self.shapers: tuple[str, ...] = tuple(_COMPENSATORS)
+            return
+        has_shaper = self.stated is not None and self.stated.is_on
+        self.shapers = ("zv",) if has_shaper and firmware.variant in _WITH_SHAPER else ()
+
+    def accel_mm_s2(self, limits: Limits) -> float:
+        """Return M204 P."""
+        return cast(MarlinLimits, limits).print_accel_mm_s2
+
+    def with_accel(self, limits: Limits, accel_mm_s2: float) -> Limits:
+        """Return the limits with another M204 P."""
+        return replace(cast(MarlinLimits, limits), print_accel_mm_s2=accel_mm_s2)
+
+    def accel_lines(self, accel_mm_s2: float) -> tuple[bytes, ...]:
+        """Return the line that sets the acceleration of moves that print."""
+        return (f"M204 P{accel_mm_s2:.10g}".encode(),)
+
+    def sets_accel(self, text: str) -> bool:
+        """Tell whether a line sets M204 P."""
+        return any(
+            c.name == "M204" and bool(c.words.keys() & {"P", "S"})
+            for c in split_line(text, self._dialect)
+        )
+
+    def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
+        """Return the lines that set both shapers."""
+        if self._fixed_time:
+            return tuple(
+                f"M493 {axis} C{_COMPENSATORS[s.type]} A{s.f_hz:.6g} I{s.damping:.6g}".encode()
+                for axis, s in (("X", shaping.x), ("Y", shaping.y))
+            )
+        return tuple(
+            f"M593 {axis} F{s.f_hz:.6g} D{s.damping:.6g}".encode()
+            for axis, s in (("X", shaping.x), ("Y", shaping.y))
+        )
+
+    def read_shaper(self, text: str, now: Shaping) -> Shaping:
+        """Return what an M593 or M493 leaves in force."""
+        name = "M493" if self._fixed_time else "M593"
+        for command in split_line(text, self._dialect):
+            if command.name != name:
+                continue
+            both = not command.words.keys() & {"X", "Y"}
+            hertz, zeta = ("A", "I") if self._fixed_time else ("F", "D")
+            given = {k: float(v) for k, v in command.words.items() if k in (hertz, zeta) and v}
+            axes = []
+            for axis, s in (("X", now.x), ("Y", now.y)):
+                if both or axis in command.words:
+                    s = AxisShaper("zv", given.get("F", s.f_hz), given.get("D", s.damping))
+                axes.append(s)
+            now = Shaping(*axes)
+        return now
