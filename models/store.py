@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -28,7 +29,7 @@ _LARGEST_BYTES = 4_000_000
 
 def builtin_machines() -> list[str]:
     """Return the names of the built-in machines, sorted."""
-    return sorted(path.stem for path in _LIBRARY.glob("*.json"))
+    return list(_builtin_names())
 
 
 def load_machine(name_or_path: str | Path) -> Machine:
@@ -44,9 +45,9 @@ def load_machine(name_or_path: str | Path) -> Machine:
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or names_a_file(text):
         return _from_file(Path(name_or_path))
-    if text not in builtin_machines():
+    if text not in _builtin_names():
         raise no_such_machine(text)
-    return _from_file(_LIBRARY / f"{text}.json")
+    return _builtin(text)
 
 
 def names_a_file(text: str) -> bool:
@@ -102,6 +103,17 @@ def explain(error: ValidationError) -> str:
         shown = ""
     more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
     return f"{where}: {message}{shown}{more}"
+
+
+# What comes with the program does not change while it runs, and every upload asks for it.
+@cache
+def _builtin_names() -> tuple[str, ...]:
+    return tuple(sorted(path.stem for path in _LIBRARY.glob("*.json")))
+
+
+@cache
+def _builtin(name: str) -> Machine:
+    return _from_file(_LIBRARY / f"{name}.json")
 
 
 def _from_file(path: Path) -> Machine:

@@ -33,6 +33,7 @@ from service.api.intake import Intake
 from service.api.limits import Limits
 from service.database.documents import open_documents
 from service.database.engine import open_database
+from service.deliveries.checking import Checker
 from service.deliveries.printers import load_printers
 from service.deliveries.sender import Sender
 from service.identification.archive import Archive
@@ -150,9 +151,14 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
         Archive(open_documents(settings, engine, "identifications"))
     )
     state.layers = assets.Layers(storage)
-    state.intake = Intake(settings, state.store, storage, state.machines, state.printers)
+    state.intake = Intake(
+        settings, state.store, storage, state.machines, state.printers, state.audit
+    )
     await run_in_threadpool(state.intake.prepare)
-    state.deliveries = Sender(engine, state.store, storage, settings, state.printers)
+    state.checker = Checker(open_documents(settings, engine, "printers"))
+    state.deliveries = Sender(
+        engine, state.store, storage, settings, state.printers, state.checker
+    )
     await run_in_threadpool(state.deliveries.start)
     stack.push_async_callback(run_in_threadpool, state.deliveries.stop)
     state.work = Work(settings, state.store, storage, runner=runner)

@@ -23,10 +23,16 @@ from service.database.engine import DatabaseAway
 from service.deliveries.printers import Printer, printer_for
 from service.deliveries.targets import TargetRefused, check_webhook
 from service.jobs.state import Job
-from service.jobs.store import IdempotencyConflict, JobStore, Quota, QuotaExceeded
+from service.jobs.store import (
+    IdempotencyConflict,
+    JobStore,
+    Quota,
+    QuotaExceeded,
+    SpaceExceeded,
+)
 from service.machines.resolve import PinnedMachine, Resolver
 from service.machines.revision import NotApproved, UnknownMachine
-from service.security.audit import record
+from service.security.audit import AuditLog, tell
 from service.security.callers import Caller
 from service.settings import Settings
 from service.storage.base import Storage, StorageError
@@ -62,6 +68,7 @@ class Intake:
     machines : Resolver
     printers : mapping
         That results may be sent to, by name.
+    audit : AuditLog
     """
 
     def __init__(
@@ -71,8 +78,10 @@ class Intake:
         storage: Storage,
         machines: Resolver,
         printers: Mapping[str, Printer],
+        audit: AuditLog,
     ) -> None:
         self._settings = settings
+        self._audit = audit
         self._store = store
         self._storage = storage
         self._machines = machines
@@ -137,16 +146,6 @@ class Intake:
             )
         request.app.state.metrics.upload_bytes.inc(upload.size_bytes)
         if taken.is_new:
-            await run_in_threadpool(
-                record,
-                request,
-                caller,
-                "submit",
-                job_id,
-                machine=wanted.machine,
-                revision=pinned.machine.revision,
-                source_sha256=upload.sha256,
-            )
             request.app.state.work.notify()
         return taken
 
@@ -191,7 +190,14 @@ class Intake:
             printer=wanted.printer,
             print_after=wanted.print,
         )
-        self._check_room(caller, upload.size_bytes)
+        audit_row = self._audit.row(
+            caller,
+            "submit",
+            job_id,
+            machine=wanted.machine,
+            revision=pinned.machine.revision,
+            source_sha256=upload.sha256,
+        )
         prefix = f"jobs/{job_id}/"
         document = incoming.with_suffix(".machine")
         added: Job | None = None
@@ -199,7 +205,15 @@ class Intake:
             pinned.write(document)
             self._storage.put(f"{prefix}machine.json", document)
             self._storage.put(f"{prefix}source/{job.source_name}", incoming)
-            added = self._store.add(job, idempotency=idempotency, limits=self._quota, shared=shared)
+            added = self._store.add(
+                job,
+                idempotency=idempotency,
+                limits=self._quota,
+                shared=shared,
+                audit_row=audit_row,
+            )
+        except SpaceExceeded as error:
+            raise _no_space(str(error)) from None
         except QuotaExceeded as error:
             raise _too_many(str(error)) from None
         except IdempotencyConflict:
@@ -208,6 +222,8 @@ class Intake:
             document.unlink(missing_ok=True)
             if added is None or added.id != job_id:
                 self._undo(job_id)
+        if added.id == job_id:
+            tell(audit_row)
         return Taken(added, added.id == job_id, upload)
 
     def _undo(self, job_id: str) -> None:
@@ -244,20 +260,18 @@ class Intake:
             raise _conflict(key)
         return job
 
-    def _check_room(self, caller: Caller, upload_bytes: int = 0) -> None:
-        """Refuse as early as can be told; adding the job checks again, in its transaction."""
+    def _check_room(self, caller: Caller) -> None:
+        """Refuse before the body is read; adding the job checks again, in its transaction."""
         jobs, kept_bytes = self._store.usage(caller.owner)
         if jobs >= self._quota.max_jobs:
             raise _too_many(
                 f"{caller.owner!r} has {jobs} jobs that are not over, the limit is "
                 f"{self._quota.max_jobs}; wait for some, or cancel them."
             )
-        if kept_bytes + upload_bytes >= self._quota.max_bytes:
-            raise Problem(
-                507,
-                "No space left",
+        if kept_bytes >= self._quota.max_bytes:
+            raise _no_space(
                 f"{caller.owner!r} keeps {kept_bytes} bytes, and {self._quota.max_bytes} is the "
-                "limit; delete jobs that are over.",
+                "limit; delete jobs that are over."
             )
 
     def _pinned(self, name: str) -> PinnedMachine:
@@ -315,6 +329,10 @@ def _result_name(source_name: str) -> str:
     source = Path(source_name)
     suffix = ".gcode.3mf" if source_name.lower().endswith(".gcode.3mf") else source.suffix
     return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
+
+
+def _no_space(detail: str) -> Problem:
+    return Problem(507, "No space left", detail)
 
 
 def _too_many(detail: str) -> Problem:

@@ -29,7 +29,7 @@ def open_documents(settings: Settings, engine: Engine, name: str) -> Documents:
     settings : Settings
     engine : sqlalchemy.Engine
         Of the same settings.
-    name : {"machines", "identifications"}
+    name : {"machines", "identifications", "printers"}
 
     Returns
     -------

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from sqlalchemy import Connection, Engine, create_engine, event, func, inspect, select, text
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
     from service.settings import Settings
 
+_T = TypeVar("_T")
+
 __all__ = [
     "DatabaseAway",
     "StoreError",
@@ -34,12 +37,15 @@ __all__ = [
     "migrate",
     "open_database",
     "reading",
+    "write_together",
     "writing",
 ]
 
 _FILE = "stillpath.sqlite3"
 _BUSY_TIMEOUT_MS = 30_000
 _LINE = threading.Lock()
+_WISHES: deque[_Wish] = deque()
+"""Of those who wait for their turn in `write_together`."""
 # Taken by whoever changes the schema; a number that nobody else in the database uses.
 _MIGRATION_LOCK = 0x57111_0000
 _ON_POSTGRESQL: dict[str, Any] = {
@@ -145,6 +151,11 @@ def migrate(engine: Engine) -> None:
     with reading(engine) as connection:
         if _version(connection) == LATEST:
             return
+    with writing(engine) as connection:
+        _lock_schema(connection)
+        if not inspect(connection).get_table_names():
+            _make_schema(connection)
+            return
     # Only now: most starts have nothing to do, and this takes its time.
     from alembic import command
     from alembic.config import Config
@@ -155,8 +166,7 @@ def migrate(engine: Engine) -> None:
         "script_location", str(Path(__file__).parent / "migrations").replace("%", "%%")
     )
     with writing(engine) as connection:
-        if engine.dialect.name == "postgresql":
-            connection.execute(select(func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
+        _lock_schema(connection)
         version = _version(connection)
         known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
         if version is not None and version not in known:
@@ -169,6 +179,23 @@ def migrate(engine: Engine) -> None:
         command.upgrade(config, "head")
 
 
+def _lock_schema(connection: Connection) -> None:
+    if connection.dialect.name == "postgresql":  # SQLite has locked all
+        connection.execute(select(func.pg_advisory_xact_lock(_MIGRATION_LOCK)))
+
+
+def _make_schema(connection: Connection) -> None:
+    """Make the tables as they are now, and say so as Alembic does: there is nothing to migrate."""
+    from service.database.tables import metadata
+
+    metadata.create_all(connection)
+    connection.exec_driver_sql(
+        "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
+        "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))"
+    )
+    connection.execute(text("INSERT INTO alembic_version VALUES (:it)"), {"it": LATEST})
+
+
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
     """Give a connection for one transaction, which is undone if the block raises.
@@ -179,6 +206,35 @@ def writing(engine: Engine) -> Iterator[Connection]:
     """
     with _turn(engine), _plainly(engine), engine.begin() as connection:
         yield connection
+
+
+def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
+    """Return what `work` returns, done in a transaction that others may share.
+
+    SQLite lets one write after the other, and each waits for the disk. So whoever comes first does
+    what all the others in line want as well, each undone by itself if it raises, and the disk is
+    waited for once. On PostgreSQL everyone has a transaction of his own.
+
+    Raises
+    ------
+    DatabaseAway
+        Then nothing may have been written, or all.
+    """
+    if engine.dialect.name != "sqlite":
+        with writing(engine) as connection:
+            return work(connection)
+    mine = _Wish(engine, work)
+    _WISHES.append(mine)
+    try:
+        with _turn(engine):
+            if not mine.is_over:
+                _fulfil(engine)
+    finally:
+        with suppress(ValueError):  # taken already
+            _WISHES.remove(mine)
+    if mine.error is not None:
+        raise mine.error
+    return cast("_T", mine.result)
 
 
 @contextmanager
@@ -195,9 +251,52 @@ def reading(engine: Engine) -> Iterator[Connection]:
 
 def insert(connection: Connection, table: Table) -> Any:
     """Return an INSERT that knows ``on_conflict_do_nothing`` and ``on_conflict_do_update``."""
+    # One of them only: the drivers that SQLAlchemy knows for PostgreSQL take their time.
     if connection.dialect.name == "postgresql":
+        from sqlalchemy.dialects import postgresql
+
         return postgresql.insert(table)
+    from sqlalchemy.dialects import sqlite
+
     return sqlite.insert(table)
+
+
+@dataclass(eq=False, slots=True)
+class _Wish:
+    """What a thread wants written, and what came of it."""
+
+    engine: Engine
+    work: Callable[[Connection], Any]
+    is_over: bool = False
+    result: Any = None
+    error: BaseException | None = None
+
+    def fulfil(self, connection: Connection) -> None:
+        try:
+            with _plainly(self.engine), connection.begin_nested():
+                self.result = self.work(connection)
+        except Exception as error:  # its owner's, not that of whose turn it is
+            self.error = error
+
+
+def _fulfil(engine: Engine) -> None:
+    """Do what all in line want, in one transaction."""
+    wishes = [wish for wish in _WISHES.copy() if wish.engine is engine]
+    for wish in wishes:
+        with suppress(ValueError):  # its owner has given up
+            _WISHES.remove(wish)
+    try:
+        with _plainly(engine), engine.begin() as connection:
+            for wish in wishes:
+                wish.fulfil(connection)
+    except BaseException as error:
+        for wish in wishes:
+            wish.error = error
+        if not isinstance(error, Exception):
+            raise
+    finally:
+        for wish in wishes:
+            wish.is_over = True
 
 
 @contextmanager

@@ -1,18 +1,24 @@
-"""What Dask does first in every worker process: make it deaf to signals that are not for it."""
+"""What Dask does first in every worker process: make it modest, and deaf to foreign signals."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import signal
 from typing import Any
 
 __all__ = ["dask_setup", "quiet_dask"]
 
+_NICENESS = 10
+
 
 async def dask_setup(worker: Any) -> None:
     """Set up a worker process; Dask calls it by this name."""
     quiet_dask()
+    if hasattr(os, "nice"):
+        # Whoever hands a file in, and a firmware's host on the same computer, comes first.
+        os.nice(_NICENESS)
     # Ctrl-C goes to the whole terminal group; the service ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if not hasattr(signal, "SIGKILL"):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -32,10 +32,18 @@ from sqlalchemy import (
 )
 
 from service.database import tables
-from service.database.engine import insert, reading, writing
+from service.database.engine import insert, reading, write_together, writing
 from service.jobs.state import Claimed, Event, Job, JobState, Stale, advance
 
-__all__ = ["BadCursor", "IdempotencyConflict", "JobStore", "Page", "Quota", "QuotaExceeded"]
+__all__ = [
+    "BadCursor",
+    "IdempotencyConflict",
+    "JobStore",
+    "Page",
+    "Quota",
+    "QuotaExceeded",
+    "SpaceExceeded",
+]
 
 _JOBS = tables.jobs.c
 _FIELDS = tuple(field.name for field in fields(Job))
@@ -54,7 +62,11 @@ class Quota:
 
 
 class QuotaExceeded(Exception):
-    """The owner has too much already."""
+    """The owner has too many jobs already."""
+
+
+class SpaceExceeded(QuotaExceeded):
+    """The owner keeps too many bytes already."""
 
 
 class IdempotencyConflict(Exception):
@@ -98,6 +110,7 @@ class JobStore:
         idempotency: tuple[str, str] | None = None,
         limits: Quota | None = None,
         shared: bool = False,
+        audit_row: Mapping[str, Any] | None = None,
     ) -> Job:
         """Remember a new job, whose input must be stored already.
 
@@ -109,6 +122,8 @@ class JobStore:
         limits : Quota, optional
         shared : bool
             Whether a job that `find_same` finds will do.
+        audit_row : mapping, optional
+            From `AuditLog.row`; written if the job is new, in the same transaction: disks are slow.
 
         Returns
         -------
@@ -121,7 +136,8 @@ class JobStore:
             If the key is known with another fingerprint.
         QuotaExceeded
         """
-        with writing(self.engine) as connection:
+
+        def add(connection: Connection) -> Job:
             if idempotency is not None:
                 earlier = _earlier(connection, job, *idempotency)
                 if earlier is not None:
@@ -136,7 +152,11 @@ class JobStore:
             if limits is not None:
                 _check_quota(connection, job, limits)
             connection.execute(tables.jobs.insert().values(_to_row(job)))
-        return job
+            if audit_row is not None:
+                connection.execute(tables.audit.insert().values(audit_row))
+            return job
+
+        return write_together(self.engine, add)
 
     def submitted(self, owner: str, idempotency_key: str) -> tuple[str, Job | None] | None:
         """Return the fingerprint that came with a key, and its job unless that was deleted."""
@@ -491,7 +511,7 @@ def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
             "wait for some or cancel them"
         )
     if size + job.source_bytes > limits.max_bytes:
-        raise QuotaExceeded(
+        raise SpaceExceeded(
             f"{job.owner!r} keeps {size} bytes and this upload has {job.source_bytes}, the limit "
             f"is {limits.max_bytes}; delete old jobs"
         )

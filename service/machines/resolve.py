@@ -16,7 +16,6 @@ from models.store import builtin_machines, explain, load_machine, names_a_file, 
 from service.machines.checks import age_warnings
 from service.machines.revision import NotApproved, UnknownMachine, document_text
 from service.machines.store import MachineStore
-from service.pipeline.files import replacing
 
 __all__ = ["PinnedMachine", "Resolver", "user_data_dir"]
 
@@ -39,9 +38,8 @@ class PinnedMachine(BaseModel):
     warnings: tuple[str, ...] = ()
 
     def write(self, file: Path) -> None:
-        """Write it to a file, whole or not at all."""
-        with replacing(file) as temporary:
-            temporary.write_text(document_text(self), encoding="utf-8")
+        """Write it to a file of the caller's own, which `Storage.put` then keeps for good."""
+        file.write_text(document_text(self), encoding="utf-8")
 
     @classmethod
     def read(cls, file: Path, name: str) -> PinnedMachine:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from service.security.callers import Caller
 if TYPE_CHECKING:
     from fastapi import Request
 
-__all__ = ["AuditEntry", "AuditLog", "record"]
+__all__ = ["AuditEntry", "AuditLog", "record", "tell"]
 
 _DENIED_SECONDS = 60.0
 _DENIED_KEPT = 4096
@@ -83,7 +83,13 @@ class AuditLog:
         ------
         DatabaseAway
         """
-        row = {
+        self._write(self.row(caller, action, subject, **details))
+
+    def row(
+        self, caller: Caller, action: str, subject: str | None, **details: Any
+    ) -> dict[str, Any]:
+        """Return a row, for who writes it in the transaction of what was done."""
+        return {
             "at": self._clock(),
             "owner": caller.owner,
             "key_id": caller.key_id,
@@ -92,27 +98,19 @@ class AuditLog:
             "subject": None if subject is None else subject[:255],
             "details": details or None,
         }
-        with writing(self._engine) as connection:
-            connection.execute(insert(audit).values(row))
 
     def note(self, caller: Caller, action: str, subject: str | None, **details: Any) -> None:
         """Write a row, and the same into the log.
 
         What was done is done, so that a database that does not answer is logged, not raised.
         """
-        log = structlog.get_logger("audit").bind(
-            owner=caller.owner,
-            key_id=caller.key_id,
-            remote=caller.remote,
-            subject=subject,
-            details=details,
-        )
+        row = self.row(caller, action, subject, **details)
         try:
-            self.add(caller, action, subject, **details)
+            self._write(row)
         except DatabaseAway as error:
-            log.error("audit row lost", action=action, reason=str(error))
+            _log(row).error("audit row lost", action=action, reason=str(error))
         else:
-            log.info("audit", action=action)
+            tell(row)
 
     def denied(self, caller: Caller, route: str, why: str) -> None:
         """Write that somebody was turned away; of one address and reason once a minute.
@@ -129,6 +127,10 @@ class AuditLog:
             if len(self._denied) > _DENIED_KEPT:
                 self._denied.popitem(last=False)
         self.note(caller, "denied", route, why=why)
+
+    def _write(self, row: dict[str, Any]) -> None:
+        with writing(self._engine) as connection:
+            connection.execute(insert(audit).values(row))
 
     def page(
         self, *, limit: int = 100, before: int | None = None, action: str | None = None
@@ -156,9 +158,19 @@ class AuditLog:
         return [AuditEntry(**{**row, "details": row["details"] or {}}) for row in rows]
 
 
+def tell(row: Mapping[str, Any]) -> None:
+    """Write a row that stands in the database into the log."""
+    _log(row).info("audit", action=row["action"])
+
+
 def record(
     request: Request, caller: Caller, action: str, subject: str | None = None, **details: Any
 ) -> None:
     """Write what a request did into the audit log. Blocks: async routes call it in a thread."""
     log: AuditLog = request.app.state.audit
     log.note(caller, action, subject, **details)
+
+
+def _log(row: Mapping[str, Any]) -> Any:
+    known = {name: row[name] for name in ("owner", "key_id", "remote", "subject")}
+    return structlog.get_logger("audit").bind(**known, details=row["details"] or {})

@@ -12,12 +12,20 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Engine
+from sqlalchemy import URL, Connection, Engine, select
 
-from service.database.engine import open_database
+from service.database import tables
+from service.database.engine import (
+    DatabaseAway,
+    make_engine,
+    open_database,
+    reading,
+    write_together,
+)
 from service.jobs.state import Cancelled, Event, Failed, JobState, Lost
 from service.jobs.store import JobStore, Quota, QuotaExceeded
 from service.settings import Settings
@@ -228,4 +236,32 @@ def test_what_was_accepted_survives_a_kill(settings: Settings):
     whole = [job_id for job_id in accepted if len(job_id) == 32]
     assert set(store.many(whole)) == set(whole)
     assert store.counts()[JobState.QUEUED] <= len(whole) + 3
+    engine.dispose()
+
+
+def test_what_many_want_at_once_is_written_together(engine: Engine):
+    """Each gets its own answer; what one breaks is undone, and the others' stands."""
+
+    def wish(n: int) -> object:
+        def work(connection: Connection) -> int:
+            row = {"name": f"lease{n}", "holder": "me", "expires_at": 0.0}
+            connection.execute(tables.leases.insert().values(row))
+            if n % 3 == 0:
+                raise ValueError(n)
+            return n
+
+        return write_together(engine, work)
+
+    answers = at_once(*(partial(wish, n) for n in range(12)))
+    for n, answer in enumerate(answers):
+        assert answer == n if n % 3 else isinstance(answer, ValueError) and answer.args == (n,)
+    with reading(engine) as connection:
+        names = set(connection.execute(select(tables.leases.c.name)).scalars())
+    assert names == {f"lease{n}" for n in range(12) if n % 3}
+
+
+def test_a_database_that_is_away_is_so_for_all_who_wait(tmp_path: Path):
+    engine = make_engine(URL.create("sqlite", database=str(tmp_path / "gone" / "x.sqlite3")))
+    calls = [partial(write_together, engine, lambda connection: 1)] * 4
+    assert all(isinstance(answer, DatabaseAway) for answer in at_once(*calls))
     engine.dispose()

@@ -26,7 +26,30 @@ from service.settings import Settings
 from tests.service.database.examples import make_job
 
 
+def schema_of(engine: Engine) -> object:
+    with reading(engine) as connection:
+        look = inspect(connection)
+        return {
+            name: (
+                [(c["name"], str(c["type"]), c["nullable"]) for c in look.get_columns(name)],
+                look.get_pk_constraint(name),
+                sorted(look.get_indexes(name), key=str),
+                sorted(look.get_unique_constraints(name), key=str),
+                look.get_foreign_keys(name),
+            )
+            for name in look.get_table_names()
+        }
+
+
 def test_migrations_lead_to_the_tables(engine: Engine):
+    """A new database gets the tables at once; one that is migrated ends with the same."""
+    made_at_once = schema_of(engine)
+    with writing(engine) as connection:
+        for table in reversed(metadata.sorted_tables):
+            connection.execute(text(f"DROP TABLE {table.name}"))
+        connection.execute(text("DELETE FROM alembic_version"))
+    migrate(engine)
+    assert schema_of(engine) == made_at_once
     with reading(engine) as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []
