@@ -17,6 +17,7 @@ import typer
 from service import commands_serve
 from service.backup import commands as backup
 from service.controllers import commands as controllers
+from service.deliveries import commands as deliveries
 from service.environment import prepare_environment
 from service.farm import commands as farm
 from service.identification import commands as identification
@@ -318,6 +319,7 @@ security.register(app)
 farm.register(app)
 commands_serve.register(app)
 backup.register(app)
+deliveries.register(app)
 register_jobs(app)
 register_warm(app)
 

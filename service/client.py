@@ -327,6 +327,14 @@ class Client:
         """Return the document of a machine."""
         return self._document(self._ask("GET", f"/v1/machines/{quote(name, safe='')}"))
 
+    def check_printer(self, name: str, *, accept: bool = False) -> dict[str, Any]:
+        """Return how a printer compares with its machine (`service.deliveries.checking`).
+
+        With `accept` its configuration is remembered as it is now.
+        """
+        method, last = ("POST", "accept") if accept else ("GET", "check")
+        return self._document(self._ask(method, f"/v1/printers/{quote(name, safe='')}/{last}"))
+
     def version(self) -> str:
         """Return the version of the service."""
         return str(self._document(self._ask("GET", "/healthz")).get("version", ""))

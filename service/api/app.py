@@ -151,14 +151,12 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
         Archive(open_documents(settings, engine, "identifications"))
     )
     state.layers = assets.Layers(storage)
+    state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(
-        settings, state.store, storage, state.machines, state.printers, state.audit
+        settings, state.store, storage, state.machines, state.printers, state.audit, state.checker
     )
     await run_in_threadpool(state.intake.prepare)
-    state.checker = Checker(open_documents(settings, engine, "printers"))
-    state.deliveries = Sender(
-        engine, state.store, storage, settings, state.printers, state.checker
-    )
+    state.deliveries = Sender(engine, state.store, storage, settings, state.printers, state.checker)
     await run_in_threadpool(state.deliveries.start)
     stack.push_async_callback(run_in_threadpool, state.deliveries.stop)
     state.work = Work(settings, state.store, storage, runner=runner)

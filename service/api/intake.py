@@ -20,6 +20,7 @@ from service.api.problems import Problem
 from service.api.schemas import JobQuery
 from service.api.uploads import Upload, receive_upload
 from service.database.engine import DatabaseAway
+from service.deliveries.checking import Checker
 from service.deliveries.printers import Printer, printer_for
 from service.deliveries.targets import TargetRefused, check_webhook
 from service.jobs.state import Job
@@ -69,6 +70,8 @@ class Intake:
     printers : mapping
         That results may be sent to, by name.
     audit : AuditLog
+    checker : Checker
+        Compares a job's printer with its machine; what differs stands in the report.
     """
 
     def __init__(
@@ -79,9 +82,11 @@ class Intake:
         machines: Resolver,
         printers: Mapping[str, Printer],
         audit: AuditLog,
+        checker: Checker,
     ) -> None:
         self._settings = settings
         self._audit = audit
+        self._checker = checker
         self._store = store
         self._storage = storage
         self._machines = machines
@@ -122,7 +127,7 @@ class Intake:
             413, 422, 429 or 507; nothing of the upload is left then.
         """
         await run_in_threadpool(self._check_targets, wanted)
-        pinned = await run_in_threadpool(self._pinned, wanted.machine)
+        pinned = await run_in_threadpool(self._pinned, wanted)
         await run_in_threadpool(self._check_room, caller)
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
@@ -274,9 +279,11 @@ class Intake:
                 "limit; delete jobs that are over."
             )
 
-    def _pinned(self, name: str) -> PinnedMachine:
+    def _pinned(self, wanted: JobQuery) -> PinnedMachine:
+        """Return the job's machine, with warnings about it and about its printer."""
+        name = wanted.machine
         try:
-            return self._machines.for_job(name)
+            found = self._machines.for_job(name)
         except UnknownMachine:
             known = ", ".join(self._machines.names())
             detail = f"No machine is called {name[:80]!r}. Known: {known}."
@@ -285,6 +292,11 @@ class Intake:
             raise Problem(422, "Machine not approved", str(error)) from None
         except ModelError as error:
             raise Problem(422, "The machine cannot be used", str(error)) from None
+        printer = None if wanted.printer is None else self._printers.get(wanted.printer)
+        if printer is None:
+            return found
+        lines = self._checker.lines(printer, found.machine, method=wanted.method)
+        return found.model_copy(update={"warnings": (*found.warnings, *lines)})
 
     @contextmanager
     def _incoming(self, job_id: str) -> Iterator[Path]:

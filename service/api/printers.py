@@ -1,20 +1,27 @@
-"""Routes of printers that results can be sent to."""
+"""Routes of printers that results can be sent to, and of how they compare with their machines."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Path, Request
 from pydantic import BaseModel, Field
 
-from service.api.access import Reader
-from service.api.problems import responses
+from models.errors import ModelError
+from models.machine import Machine
+from service.api.access import Admin, Reader
+from service.api.problems import Problem, responses
+from service.deliveries.checking import Checker, PrinterCheck, PrinterUnknown
 from service.deliveries.printers import Printer
+from service.machines.resolve import Resolver
+from service.security.audit import record
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1/printers", tags=["printers"])
+
+Name = Annotated[str, Path(description="A printer of `/v1/printers`.", examples=["voron"])]
 
 
 class PrinterView(BaseModel):
@@ -44,3 +51,60 @@ def list_printers(request: Request, caller: Reader) -> list[PrinterView]:
         )
         for printer in printers.values()
     ]
+
+
+@router.get(
+    "/{name}/check",
+    responses=responses(401, 403, 404, 422, 424, 429),
+    summary="Compare a printer with its machine",
+)
+def check_printer(request: Request, name: Name, caller: Reader) -> PrinterCheck:
+    """Ask a Moonraker printer for its configuration and limits; say where the machine differs.
+
+    The first check with a revision of the machine remembers the configuration; later ones tell what
+    has changed since.
+    """
+    del caller
+    return _checked(request, name, accept=False)
+
+
+@router.post(
+    "/{name}/accept",
+    responses=responses(401, 403, 404, 422, 424, 429),
+    summary="Take a printer's configuration as it is now",
+)
+def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
+    """Remember the configuration as it is now: from here on changes are counted."""
+    found = _checked(request, name, accept=True)
+    record(request, caller, "accept", name, machine=found.machine)
+    return found
+
+
+def _checked(request: Request, name: str, *, accept: bool) -> PrinterCheck:
+    state = request.app.state
+    printers: Mapping[str, Printer] = state.printers
+    printer = printers.get(name)
+    if printer is None:
+        known = ", ".join(sorted(printers)) or "none"
+        raise Problem(404, "No such printer", f"No printer is called {name!r:.80}. Known: {known}.")
+    if printer.kind != "moonraker":
+        raise Problem(
+            422,
+            "Nothing to ask",
+            f"{name} is an OctoPrint, which cannot tell Klipper's configuration. Only Moonraker "
+            "printers can be checked.",
+        )
+    checker: Checker = state.checker
+    try:
+        return checker.check(printer, _machine(state.machines, printer), accept=accept)
+    except PrinterUnknown as error:
+        raise Problem(424, "The printer cannot be asked", str(error)) from None
+
+
+def _machine(machines: Resolver, printer: Printer) -> Machine:
+    try:
+        return machines.for_job(printer.machine).machine
+    except ModelError as error:
+        raise Problem(
+            422, "The printer's machine cannot be used", f"{printer.name}: {error}"
+        ) from None

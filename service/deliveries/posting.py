@@ -1,4 +1,4 @@
-"""One POST to a checked address: no redirects, no proxies, and an honest end."""
+"""One request to a checked address: no redirects, no proxies, and an honest end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.version import __version__
 if TYPE_CHECKING:
     import httpx2
 
-__all__ = ["Reply", "Unanswered", "Unreached", "post"]
+__all__ = ["Reply", "Unanswered", "Unreached", "get", "post"]
 
 _CONNECT_S = 10.0
 _LONGEST_REPLY_BYTES = 4096
@@ -68,12 +68,6 @@ def post(
         If the address is one that nothing is sent to.
     Unreached, Unanswered
     """
-    import httpx2
-
-    try:
-        addresses = addresses_of(target, loopback=loopback)
-    except Unresolved as error:
-        raise Unreached(str(error)) from None
     body: dict[str, Any] = {"content": content}
     if file is not None:
         name, stream = file
@@ -81,6 +75,63 @@ def post(
             "data": dict(fields or {}),
             "files": {"file": (name, stream, "application/octet-stream")},
         }
+    again = None if file is None else file[1]
+    return _exchange(
+        "POST",
+        target,
+        headers=headers,
+        body=body,
+        stream=again,
+        loopback=loopback,
+        timeout_s=timeout_s,
+        longest_bytes=_LONGEST_REPLY_BYTES,
+    )
+
+
+def get(
+    target: Target,
+    *,
+    headers: Mapping[str, str],
+    longest_bytes: int,
+    loopback: bool = False,
+    timeout_s: float = 10.0,
+) -> Reply:
+    """Ask for something; see `post`.
+
+    Parameters
+    ----------
+    longest_bytes : int
+        What comes behind that is not read.
+    """
+    return _exchange(
+        "GET",
+        target,
+        headers=headers,
+        body={},
+        stream=None,
+        loopback=loopback,
+        timeout_s=timeout_s,
+        longest_bytes=longest_bytes,
+    )
+
+
+def _exchange(
+    method: str,
+    target: Target,
+    *,
+    headers: Mapping[str, str],
+    body: Mapping[str, Any],
+    stream: BinaryIO | None,
+    loopback: bool,
+    timeout_s: float,
+    longest_bytes: int,
+) -> Reply:
+    import httpx2
+
+    try:
+        addresses = addresses_of(target, loopback=loopback)
+    except Unresolved as error:
+        raise Unreached(str(error)) from None
     # The environment's proxies would connect to where the name leads them.
     with httpx2.Client(
         trust_env=False,
@@ -90,11 +141,11 @@ def post(
         headers={"User-Agent": f"stillpath/{__version__}", "Accept-Encoding": "identity"},
     ) as client:
         for address in addresses:
-            if file is not None:
-                file[1].seek(0)
+            if stream is not None:
+                stream.seek(0)
             # To the address that was checked; the name goes into Host, and TLS asks for it.
             request = client.build_request(
-                "POST",
+                method,
                 httpx2.URL(
                     scheme=target.scheme,
                     host=address,
@@ -106,7 +157,7 @@ def post(
                 **body,
             )
             try:
-                return _sent(client, request)
+                return _sent(client, request, longest_bytes)
             except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout) as error:
                 reason = f"{target} cannot be reached: {error or type(error).__name__}"
             except httpx2.HTTPError as error:
@@ -116,14 +167,14 @@ def post(
     raise Unreached(reason)
 
 
-def _sent(client: httpx2.Client, request: httpx2.Request) -> Reply:
+def _sent(client: httpx2.Client, request: httpx2.Request, longest_bytes: int) -> Reply:
     response = client.send(request, stream=True)
     try:
         start = b""
         for chunk in response.iter_raw():
             start += chunk
-            if len(start) >= _LONGEST_REPLY_BYTES:
+            if len(start) >= longest_bytes:
                 break
     finally:
         response.close()
-    return Reply(response.status_code, start[:_LONGEST_REPLY_BYTES].decode("utf-8", "replace"))
+    return Reply(response.status_code, start[:longest_bytes].decode("utf-8", "replace"))

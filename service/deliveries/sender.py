@@ -9,8 +9,12 @@ from collections.abc import Mapping
 import structlog
 from sqlalchemy import Engine
 
+from models.errors import ModelError
+from models.machine import Machine
+from models.store import load_machine
 from service.database.engine import DatabaseAway
 from service.deliveries import rows
+from service.deliveries.checking import Checker, PrinterUnknown
 from service.deliveries.posting import Reply, Unanswered, Unreached
 from service.deliveries.printers import Printer, printer_for, upload, what_started
 from service.deliveries.rows import Delivery
@@ -18,6 +22,7 @@ from service.deliveries.targets import TargetRefused, check_webhook
 from service.deliveries.webhooks import send_webhook
 from service.jobs.state import Job
 from service.jobs.store import JobStore
+from service.machines.resolve import PinnedMachine
 from service.settings import Settings
 from service.storage.base import Storage, StorageError
 
@@ -39,6 +44,10 @@ class Sender:
     may arrive twice. An upload that shall start a print is never repeated unless it certainly did
     not arrive: a second print could begin on top of the first.
 
+    Before a printer gets a file it is compared with the file's machine
+    (`service.deliveries.checking`): what differs is noted, and where that makes a print unsafe, the
+    file is uploaded and not started.
+
     Parameters
     ----------
     engine : Engine
@@ -47,6 +56,8 @@ class Sender:
     settings : Settings
     printers : mapping
         From `service.deliveries.printers.load_printers`.
+    checker : Checker, optional
+        Without one, printers are not looked at.
     first_wait_s : float
         Before the second attempt; each further one takes three times as long.
     attempts : int
@@ -63,6 +74,7 @@ class Sender:
         storage: Storage,
         settings: Settings,
         printers: Mapping[str, Printer],
+        checker: Checker | None = None,
         *,
         first_wait_s: float = 5.0,
         attempts: int = 10,
@@ -74,6 +86,7 @@ class Sender:
         self._storage = storage
         self._settings = settings
         self._printers = printers
+        self._checker = checker
         self._first_wait_s = first_wait_s
         self._attempts = attempts
         self._claim_s = claim_s
@@ -212,17 +225,42 @@ class Sender:
 
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
+        warnings, unsafe = self._looked_at(printer, job)
+        starts = job.print_after and not unsafe
         with self._storage.local(f"{job.output}/result/{job.result_name}") as file:
-            reply = upload(
-                printer, file, job.result_name, sha256=job.result_sha256, start=job.print_after
-            )
+            reply = upload(printer, file, job.result_name, sha256=job.result_sha256, start=starts)
         state, error = _judged(reply)
-        if job.print_after:
-            if reply.status >= 500:  # perhaps of a proxy that lost patience
-                return "failed", _unknown(error or "")
-            if state == "done":
-                error = what_started(printer, reply)
+        if starts and reply.status >= 500:  # perhaps of a proxy that lost patience
+            return "failed", _unknown(error or "")
+        if state == "done":
+            told = what_started(printer, reply) if starts else None
+            if job.print_after and not starts:
+                told = "uploaded, but not started, because it would be unsafe"
+            error = "; ".join([*([told] if told else ()), *unsafe, *warnings]) or None
         return state, error
+
+    def _looked_at(self, printer: Printer, job: Job) -> tuple[list[str], list[str]]:
+        """Return what to mind of a printer, and what makes a print on it unsafe."""
+        if self._checker is None or printer.kind != "moonraker":
+            return [], []
+        try:
+            machine = self._machine(job)
+            method = str(job.options.get("method", "fbf"))
+            found = self._checker.check(printer, machine, method=method).findings
+        except (PrinterUnknown, ModelError) as error:
+            return [f"the printer was not compared with its machine: {error}"], []
+        return (
+            [finding.text for finding in found if not finding.unsafe],
+            [finding.text for finding in found if finding.unsafe],
+        )
+
+    def _machine(self, job: Job) -> Machine:
+        """Return the machine that the job was done with."""
+        try:
+            with self._storage.local(f"jobs/{job.id}/machine.json") as file:
+                return PinnedMachine.read(file, job.machine).machine
+        except FileNotFoundError:  # a job of an earlier version
+            return load_machine(job.machine)
 
 
 def _judged(reply: Reply) -> tuple[str, str | None]:

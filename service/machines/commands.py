@@ -65,7 +65,7 @@ def open_machines() -> Resolver:
 
 
 def open_documents(name: str) -> Documents:
-    """Return where this user's ``machines`` or ``identifications`` lie.
+    """Return where this user's ``machines``, ``identifications`` or ``printers`` lie.
 
     A folder, unless STILLPATH_DATABASE_URL names a PostgreSQL database.
     """

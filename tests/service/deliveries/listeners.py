@@ -1,8 +1,8 @@
 """Little HTTP servers that are sent to: anybody, a Moonraker and an OctoPrint.
 
 The latter two accept and answer what the programs' documentation says: Moonraker's
-docs/external_api/file_manager.md (`POST /server/files/upload`), OctoPrint's docs/api/files.rst
-(`POST /api/files/local`).
+docs/external_api/file_manager.md (`POST /server/files/upload`) and printer.md (`GET /printer/info`,
+`GET /printer/objects/query`), OctoPrint's docs/api/files.rst (`POST /api/files/local`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
 from email import message_from_bytes
 from email.policy import HTTP
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
 
-__all__ = ["Listener", "Seen", "moonraker", "octoprint", "until"]
+__all__ = ["Listener", "Seen", "moonraker", "octoprint", "until", "uploads"]
 
 
 @dataclass(frozen=True)
@@ -103,12 +105,40 @@ class Listener:
 
 
 @contextmanager
-def moonraker(*, key: str | None = None, can_print: bool = True) -> Iterator[Listener]:
-    """Serve as Moonraker does."""
+def moonraker(
+    *,
+    key: str | None = None,
+    can_print: bool = True,
+    status: dict[str, Any] | None = None,
+    state: str = "ready",
+) -> Iterator[Listener]:
+    """Serve as Moonraker does.
+
+    Parameters
+    ----------
+    key : str, optional
+        That callers must show.
+    can_print : bool
+        Whether a print begins when it is asked for.
+    status : dict, optional
+        Objects of the printer, read anew for each request; by default none is there.
+    state : str
+        Of Klipper; ``away``: it is not connected.
+    """
 
     def answer(seen: Seen) -> Answer:
         if key is not None and seen.headers.get("x-api-key") != key:
             return _told(401, {"error": {"code": 401, "message": "Unauthorized"}})
+        place, _, query = seen.path.partition("?")
+        if status is not None and seen.method == "GET" and place.startswith("/printer/"):
+            if state == "away":
+                return _told(503, {"error": {"code": 503, "message": "Klippy Host not connected"}})
+            if place == "/printer/info":
+                said = {"state": state, "state_message": f"Printer is {state}"}
+                return _told(200, {"result": said | {"software_version": "v0.13.0-300-g1"}})
+            if place == "/printer/objects/query":
+                found = _queried(status, query)
+                return _told(200, {"result": {"eventtime": 578243.5, "status": found}})
         if (seen.method, seen.path) != ("POST", "/server/files/upload"):
             return _told(404, {"error": {"code": 404, "message": "Not Found"}})
         parts = seen.parts()
@@ -128,6 +158,11 @@ def moonraker(*, key: str | None = None, can_print: bool = True) -> Iterator[Lis
 
     with Listener(answer) as listener:
         yield listener
+
+
+def uploads(server: Listener) -> list[Seen]:
+    """Return the requests that brought something."""
+    return [seen for seen in server.seen if seen.method == "POST"]
 
 
 @contextmanager
@@ -153,6 +188,17 @@ def until(condition: Callable[[], object], seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited in vain"
         time.sleep(0.02)
+
+
+def _queried(status: dict[str, Any], query: str) -> dict[str, Any]:
+    """Return of the objects what is asked for; what is not there is left out."""
+    found = {}
+    for part in query.split("&"):
+        name, _, wanted = part.partition("=")
+        if name in status:
+            fields = wanted.split(",") if wanted else list(status[name])
+            found[name] = {each: status[name][each] for each in fields if each in status[name]}
+    return deepcopy(found)
 
 
 def _told(status: int, document: object) -> Answer:

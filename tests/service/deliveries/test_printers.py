@@ -12,7 +12,7 @@ import pytest
 
 from service.deliveries.printers import PrinterFileError, load_printers, printer_for
 from service.deliveries.targets import TargetRefused
-from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until
+from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads
 from tests.service.deliveries.places import RESULT, SECRET, Place, open_place
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -41,7 +41,7 @@ def test_moonraker_gets_the_whole_file_and_checks_it(tmp_path: Path, prints: boo
         with place.sending():
             delivery = place.settled(job)
     assert (delivery.state, delivery.error) == ("done", None)
-    [seen] = server.seen
+    [seen] = uploads(server)
     parts = seen.parts()
     assert parts["file"] == (job.result_name, RESULT)
     assert parts["root"][1] == b"gcodes"
@@ -60,7 +60,7 @@ def test_octoprint_gets_it_below_a_prefix(tmp_path: Path, prints: bool):
         job = place.finish(tmp_path, printer="o", print_after=prints)
         with place.sending():
             assert place.settled(job).state == "done"
-    [seen] = server.seen
+    [seen] = uploads(server)
     parts = seen.parts()
     assert parts["file"] == (job.result_name, RESULT)
     word = b"true" if prints else b"false"
@@ -82,7 +82,7 @@ def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
         job = place.finish(tmp_path, printer="m")
         with place.sending():
             delivery = place.settled(job)
-    assert (delivery.state, len(server.seen)) == ("failed", 1)
+    assert (delivery.state, len(uploads(server))) == ("failed", 1)
     assert "401" in (delivery.error or "")
     assert "wrong" not in (delivery.error or "")
 
@@ -117,7 +117,7 @@ def test_a_printer_that_is_off_gets_it_when_it_is_on(tmp_path: Path):
             until(lambda: place.delivery(job).attempts >= 2)
             with Listener(port=port) as server:
                 assert place.settled(job).state == "done"
-    [seen] = server.seen
+    [seen] = uploads(server)
     assert seen.parts()["file"][1] == RESULT
 
 
@@ -139,7 +139,7 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
         job = place.finish(tmp_path, printer="m", print_after=True)
         with place.sending():
             delivery = place.settled(job)
-    assert (delivery.state, len(server.seen)) == ("failed", 1)
+    assert (delivery.state, len(uploads(server))) == ("failed", 1)
     assert "may have been started" in (delivery.error or "")
 
 
@@ -165,10 +165,10 @@ def test_a_sender_killed_in_between(tmp_path: Path, prints: bool):
         with place.sending():
             delivery = place.settled(job)
     if prints:
-        assert (delivery.state, len(server.seen)) == ("failed", 1)
+        assert (delivery.state, len(uploads(server))) == ("failed", 1)
         assert "look at it" in (delivery.error or "")
     else:
-        assert (delivery.state, len(server.seen)) == ("done", 2)
+        assert (delivery.state, len(uploads(server))) == ("done", 2)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from service.api import create_app
 from service.deliveries.webhooks import verify
 from service.settings import Settings
-from tests.service.deliveries.listeners import Listener, moonraker, until
+from tests.service.deliveries.listeners import Listener, moonraker, until, uploads
 from tests.service.deliveries.places import SECRET
 from tests.service.runners import pretend
 
@@ -56,7 +56,7 @@ def test_a_slicers_upload_reaches_the_printer(tmp_path: Path):
             for query in ("webhook=http://169.254.169.254/", "printer=nobody"):
                 refused = client.post(f"/v1/jobs?machine=ender3&{query}", content=b"G1 X3\n")
                 assert refused.status_code == 422
-    [seen] = server.seen
+    [seen] = uploads(server)
     assert seen.parts()["file"] == ("gear.stillpath.gcode", b"; compensated\nG1 X1\n")
     assert seen.parts()["print"][1] == b"true"
     [hook] = listener.seen

@@ -62,6 +62,8 @@ RULES = {
     "DELETE /v1/keys/{key_id}": ADMIN,
     "GET /v1/audit": ADMIN,
     "GET /v1/printers": READ,
+    "GET /v1/printers/{name}/check": READ,
+    "POST /v1/printers/{name}/accept": ADMIN,
     "GET /healthz": OPEN,
     "GET /readyz": OPEN,
     "GET /metrics": ADMIN,

@@ -1,0 +1,408 @@
+"""Is a printer what its machine model says? Asked before a result goes to it.
+
+A file is made for a machine document. Where printer.cfg says something else, times and vibration
+are not those that were computed; some of it makes a print unsafe, and then none is started. The
+configuration at a printer's first check with a machine is remembered, so that later changes are
+noticed that the document cannot tell: another pulley, another motor current.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import from_json
+
+from models.errors import ModelError
+from models.firmware import Klipper
+from models.machine import Machine
+from service.deliveries.moonraker import Asked, NotReady, ask
+from service.deliveries.posting import Unanswered, Unreached
+from service.deliveries.printers import Printer
+from service.deliveries.targets import TargetRefused
+from service.machines.checks import differences
+from service.machines.documents import Documents
+
+__all__ = ["Checker", "Finding", "PrinterCheck", "PrinterUnknown", "findings", "relevant"]
+
+_WRAPPED = ("PAUSE", "RESUME", "CANCEL_PRINT")
+_OURS = "Stillpath:"
+"""How the descriptions of our macros begin (integrations/klipper)."""
+# Limits that no command raises: a file that was planned with more is late.
+_FIXED = frozenset(
+    {
+        "max_z_velocity",
+        "max_z_accel",
+        "max_extrude_only_velocity",
+        "max_extrude_only_accel",
+        "max_extrude_cross_section",
+    }
+)
+_RELATIVE = 1e-6
+_WITHOUT_STREAM = ("none", "advise")
+# What changes the motion or the vibration, of sections that hold more than that.
+_STEPPER = frozenset(
+    {
+        "rotation_distance",
+        "gear_ratio",
+        "microsteps",
+        "full_steps_per_rotation",
+        "position_min",
+        "position_max",
+    }
+)
+_DRIVER = frozenset({"run_current", "interpolate", "stealthchop_threshold"})
+_EXTRUDER = _STEPPER | {
+    "nozzle_diameter",
+    "filament_diameter",
+    "pressure_advance",
+    "pressure_advance_smooth_time",
+    "instantaneous_corner_velocity",
+    "max_extrude_only_velocity",
+    "max_extrude_only_accel",
+    "max_extrude_cross_section",
+}
+_WHOLE = frozenset({"printer", "input_shaper", "firmware_retraction", "gcode_arcs"})
+
+
+class PrinterUnknown(Exception):
+    """A printer cannot be checked; the message says why."""
+
+
+class Finding(BaseModel):
+    """One thing that speaks against printing now.
+
+    Attributes
+    ----------
+    place : str
+        Section and option, command, or limit.
+    machine, printer
+        What the machine's document says (or what was remembered), and what the printer has.
+    unsafe : bool
+        Whether a print is not started because of it.
+    text : str
+        One line: place, both values, remedy.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    place: str
+    machine: Any = None
+    printer: Any = None
+    unsafe: bool = False
+    text: str
+
+
+class PrinterCheck(BaseModel):
+    """What was found when a printer was asked.
+
+    Attributes
+    ----------
+    printer, machine : str
+    machine_revision : str
+        `models.machine.Machine.revision` of what it was compared with.
+    software : str
+        Klipper's version.
+    remembered_at : datetime
+        Of the configuration that later ones are compared with.
+    findings : list of Finding
+        Empty: nothing speaks against it.
+    """
+
+    printer: str
+    machine: str
+    machine_revision: str
+    software: str
+    remembered_at: AwareDatetime
+    findings: list[Finding]
+
+    @property
+    def unsafe(self) -> list[Finding]:
+        """Those that keep a print from being started."""
+        return [finding for finding in self.findings if finding.unsafe]
+
+    @property
+    def lines(self) -> list[str]:
+        """What to tell a person, one line each."""
+        return [f"printer {self.printer}: {finding.text}" for finding in self.findings]
+
+
+class _Remembered(BaseModel):
+    """A printer's configuration as it was when it was first checked with a machine."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_version: Literal[1] = 1
+    printer: str
+    machine: str
+    machine_revision: str
+    when: AwareDatetime
+    sections: dict[str, dict[str, Any]] = Field(description="See `relevant`.")
+
+
+class Checker:
+    """Compares printers with machines, and remembers their configurations.
+
+    Parameters
+    ----------
+    documents : Documents
+        Where configurations are kept: ``PRINTER/REVISION.json``.
+    """
+
+    def __init__(self, documents: Documents) -> None:
+        self._documents = documents
+
+    def check(
+        self, printer: Printer, machine: Machine, *, method: str = "fbf", accept: bool = False
+    ) -> PrinterCheck:
+        """Ask a printer and compare it with the machine that files for it are made with.
+
+        Parameters
+        ----------
+        printer : Printer
+        machine : Machine
+        method : str
+            Of the file; those without a stream need no raised limits.
+        accept : bool
+            Remember the configuration as it is now, whatever it was before.
+
+        Raises
+        ------
+        PrinterUnknown
+            If it cannot be asked; nothing is known of it then.
+        """
+        if printer.kind != "moonraker":
+            raise PrinterUnknown(
+                f"{printer.name} is an OctoPrint, which cannot tell what Klipper's configuration "
+                "says; check by hand (`stillpath machines check NAME --printer-cfg FILE`)"
+            )
+        try:
+            asked = ask(printer)
+        except (Unreached, Unanswered, TargetRefused, NotReady) as error:
+            raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
+        known = self._remember(printer, machine, asked, accept=accept)
+        found = [*findings(machine, asked, method=method), *_changes(known, asked)]
+        return PrinterCheck(
+            printer=printer.name,
+            machine=machine.name,
+            machine_revision=machine.revision,
+            software=asked.software,
+            remembered_at=known.when,
+            findings=found,
+        )
+
+    def lines(self, printer: Printer, machine: Machine, *, method: str) -> list[str]:
+        """Return what to warn of in a report; not being able to ask is one of it."""
+        if printer.kind != "moonraker":
+            return []
+        try:
+            return self.check(printer, machine, method=method).lines
+        except PrinterUnknown as error:
+            return [f"printer {error}; its configuration was not compared with the machine"]
+
+    def _remember(
+        self, printer: Printer, machine: Machine, asked: Asked, *, accept: bool
+    ) -> _Remembered:
+        path = f"{printer.name}/{machine.revision}.json"
+        now = _Remembered(
+            printer=printer.name,
+            machine=machine.name,
+            machine_revision=machine.revision,
+            when=datetime.now(UTC),
+            sections=relevant(asked),
+        )
+        text = json.dumps(now.model_dump(mode="json"), indent=1) + "\n"
+        if accept:
+            self._documents.replace(path, text)
+            return now
+        try:
+            self._documents.create(path, text)
+        except FileExistsError:
+            return self._read(path)
+        return now
+
+    def _read(self, path: str) -> _Remembered:
+        try:
+            return _Remembered.model_validate(from_json(self._documents.read(path)))
+        except (ValidationError, ValueError):
+            raise PrinterUnknown(
+                f"{self._documents.place(path)} is damaged; delete it, and the printer's "
+                "configuration as it is then counts"
+            ) from None
+
+
+def findings(machine: Machine, asked: Asked, *, method: str = "fbf") -> list[Finding]:
+    """Return what speaks against printing a machine's file on a printer, unsafe things first."""
+    firmware = machine.firmware
+    if not isinstance(firmware, Klipper):
+        text = (
+            f"it runs Klipper, the machine {machine.name} runs {firmware.kind}, and so do files "
+            "made for it; name a Klipper machine in the file of printers"
+        )
+        return [Finding(place="firmware", machine=firmware.kind, unsafe=True, text=text)]
+    streams = method not in _WITHOUT_STREAM
+    found = [
+        *_differences(machine, asked),
+        *_in_force(machine, asked),
+        *(_commands(machine, asked) if streams else ()),
+        *(_wrappers(asked) if streams else ()),
+    ]
+    return sorted(found, key=lambda finding: not finding.unsafe)
+
+
+def relevant(asked: Asked) -> dict[str, dict[str, Any]]:
+    """Return of a configuration what changes motion or vibration, by section and option."""
+    found: dict[str, dict[str, Any]] = {}
+    for section, options in sorted(asked.settings.items()):
+        words = section.split()
+        if section in _WHOLE:
+            kept = set(options)
+        elif words[0].startswith("stepper_"):
+            kept = set(_STEPPER)
+        elif words[0].startswith("tmc") and words[-1] in ("stepper_x", "stepper_y"):
+            kept = set(_DRIVER)
+        elif words[0] == "extruder":
+            kept = set(_EXTRUDER)
+        else:
+            continue
+        found[section] = {name: options[name] for name in sorted(kept & set(options))}
+    return found
+
+
+def _differences(machine: Machine, asked: Asked) -> Iterator[Finding]:
+    """Compare the configuration with the document, option by option."""
+    try:
+        found = differences(machine, asked.config())
+    except ModelError as error:
+        yield Finding(place="printer.cfg", text=f"cannot be compared with the machine: {error}")
+        return
+    for entry in found:
+        place = f"[{entry.section}] {entry.option}".rstrip()
+        unsafe, why = False, ""
+        if entry.option == "kinematics":
+            unsafe, why = True, "; a file for other kinematics must not be printed"
+        elif entry.option in _FIXED and _less(entry.printer, entry.machine):
+            unsafe, why = True, "; no command raises this limit, so that the file would be late"
+        yield Finding(
+            place=place,
+            machine=entry.machine,
+            printer=entry.printer,
+            unsafe=unsafe,
+            text=entry.text + why,
+        )
+
+
+def _in_force(machine: Machine, asked: Asked) -> Iterator[Finding]:
+    """Compare what is in force with the configuration, unless a print may have changed it."""
+    if asked.prints:
+        return
+    for name, value in asked.limits.items():
+        configured = asked.settings["printer"].get(name)
+        if isinstance(configured, int | float) and not _close(value, float(configured)):
+            raised = name == "max_accel" and value > configured
+            told = f"{name} in force is {value:g}, printer.cfg says {configured:g}"
+            if raised:
+                told += "; the first moves of a print would be made with it"
+            yield Finding(
+                place=name,
+                machine=configured,
+                printer=value,
+                unsafe=raised,
+                text=f"{told}; send STILLPATH_RESTORE or restart Klipper",
+            )
+    advance, stated = asked.pressure_advance_s, machine.pressure_advance_s
+    configured = asked.settings.get("extruder", {}).get("pressure_advance", 0.0)
+    if advance is not None and not _close(advance, stated) and not _close(advance, configured):
+        text = (
+            f"pressure_advance in force is {advance:g}, printer.cfg says {configured:g}, the "
+            f"machine {stated:g}; set it in the file (SET_PRESSURE_ADVANCE), or restart Klipper"
+        )
+        yield Finding(place="pressure_advance", machine=stated, printer=advance, text=text)
+
+
+def _commands(machine: Machine, asked: Asked) -> Iterator[Finding]:
+    """Find macros that stand in the way of what a stream sets."""
+    from gcode.firmware.registry import kit  # heavy
+
+    own = {section.lower() for section in asked.sections}
+    limits = kit(machine).stream_limits(kit(machine).initial_limits())
+    needed = float(getattr(limits, "accel_mm_s2", 0.0))
+    configured = asked.settings["printer"].get("max_accel", 0.0)
+    if "gcode_macro set_velocity_limit" in own and configured < needed:
+        text = (
+            f"[gcode_macro SET_VELOCITY_LIMIT] stands before Klipper's own command, and max_accel "
+            f"is {configured:g} where a compensated file needs {needed:g}: nobody knows whether "
+            "the macro lets it be raised; take it out, or start the print at the printer"
+        )
+        yield Finding(place="SET_VELOCITY_LIMIT", machine=needed, unsafe=True, text=text)
+    if "gcode_macro set_input_shaper" in own:
+        text = (
+            "[gcode_macro SET_INPUT_SHAPER] stands before Klipper's own command: unless it passes "
+            "on SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0, the shaper works on top of the compensation; take "
+            "it out"
+        )
+        yield Finding(place="SET_INPUT_SHAPER", text=text)
+
+
+def _wrappers(asked: Asked) -> Iterator[Finding]:
+    """Find commands that would run under a stream's limits."""
+    missing = list(_unwrapped(asked))
+    if not missing:
+        return
+    files = "stillpath.cfg"
+    if "M600" in missing:
+        files = "stillpath-m600.cfg" if missing == ["M600"] else f"{files} and stillpath-m600.cfg"
+    names = ", ".join(missing)
+    text = (
+        f"{names} would move under a compensated stretch's limits: include {files} behind your own "
+        "macros in printer.cfg, then send STILLPATH_CHECK"
+    )
+    yield Finding(place=names, text=text)
+
+
+def _unwrapped(asked: Asked) -> Iterable[str]:
+    if asked.commands is None:
+        wrapped = {f"gcode_macro {name}" for name in ("Pause", "Resume", "Cancel_Print")}
+        return () if wrapped <= set(asked.sections) else _WRAPPED
+    known = asked.commands
+    looked_for = (*_WRAPPED, "M600") if "M600" in known else _WRAPPED
+    return [name for name in looked_for if not known.get(name, "").startswith(_OURS)]
+
+
+def _changes(known: _Remembered, asked: Asked) -> Iterator[Finding]:
+    """Compare with what was remembered."""
+    now = relevant(asked)
+    day = known.when.astimezone().strftime("%Y-%m-%d")
+    for section in sorted({*known.sections, *now}):
+        before, after = known.sections.get(section, {}), now.get(section, {})
+        for option in sorted({*before, *after}):
+            was, is_now = before.get(option), after.get(option)
+            # As JSON gives it back: tuples are lists there.
+            if _plain(was) != _plain(is_now):
+                text = (
+                    f"[{section}] {option} has changed since {day}, from {_word(was)} to "
+                    f"{_word(is_now)}; if it changes the motion, measure the machine anew, else "
+                    f"accept it (`stillpath printers accept {known.printer}`)"
+                )
+                place = f"[{section}] {option}"
+                yield Finding(place=place, machine=was, printer=is_now, text=text)
+
+
+def _plain(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def _word(value: Any) -> str:
+    return "nothing" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _less(value: Any, limit: Any) -> bool:
+    both = isinstance(value, int | float) and isinstance(limit, int | float)
+    return both and value < limit and not _close(value, limit)
+
+
+def _close(a: float, b: float) -> bool:
+    return abs(a - b) <= _RELATIVE * max(abs(a), abs(b))

@@ -1,0 +1,355 @@
+"""A printer compared with its machine, over HTTP with what Moonraker says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from models.machine import Machine
+from models.store import load_machine
+from service.api import create_app
+from service.deliveries.checking import Checker, PrinterUnknown
+from service.deliveries.printers import Printer
+from service.machines.documents import DocumentFolder
+from service.settings import Settings
+from tests.service.deliveries.listeners import Listener, moonraker, octoprint, until, uploads
+from tests.service.deliveries.places import Place, open_place
+from tests.service.deliveries.recorded_printer import status_of
+from tests.service.runners import pretend
+
+MACHINE = load_machine("ender3")
+
+
+def printer_at(server: Listener, **more: Any) -> Printer:
+    fields = {"name": "left", "kind": "moonraker", "url": server.url, "machine": "ender3"}
+    return Printer(**(fields | more))
+
+
+def checked(tmp_path: Path, status: dict[str, Any], machine: Machine = MACHINE, **how: Any):
+    with moonraker(status=status) as server:
+        return Checker(DocumentFolder(tmp_path)).check(printer_at(server), machine, **how)
+
+
+def settings_of(status: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return status["configfile"]["settings"]
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_a_printer_as_its_machine_says(tmp_path: Path, name: str):
+    machine = load_machine(name)
+    found = checked(tmp_path, status_of(machine), machine)
+    assert (found.findings, found.software) == ([], "v0.13.0-300-g1")
+    assert found.machine_revision == machine.revision
+
+
+def _kinematics(status: dict[str, Any]) -> None:
+    settings_of(status)["printer"]["kinematics"] = "limited_cartesian"
+
+
+def _slower_z(status: dict[str, Any]) -> None:
+    settings_of(status)["printer"]["max_z_accel"] *= 0.5
+
+
+def _faster_z(status: dict[str, Any]) -> None:
+    settings_of(status)["printer"]["max_z_accel"] *= 2.0
+
+
+def _configured_accel(status: dict[str, Any]) -> None:
+    settings_of(status)["printer"]["max_accel"] = 1234.0
+    status["toolhead"]["max_accel"] = 1234.0
+
+
+def _raised(status: dict[str, Any]) -> None:
+    status["toolhead"]["max_accel"] = 300_000.0
+
+
+def _raised_by_a_print(status: dict[str, Any]) -> None:
+    _raised(status)
+    status["print_stats"]["state"] = "paused"
+
+
+def _lowered(status: dict[str, Any]) -> None:
+    status["toolhead"]["max_accel"] = 100.0
+
+
+def _shaper(status: dict[str, Any]) -> None:
+    settings_of(status).setdefault("input_shaper", {})["shaper_freq_x"] = 61.5
+
+
+def _corner(status: dict[str, Any]) -> None:
+    settings_of(status)["printer"]["square_corner_velocity"] = 8.0
+    status["toolhead"]["square_corner_velocity"] = 8.0
+
+
+def _advance(status: dict[str, Any]) -> None:
+    settings_of(status)["extruder"]["pressure_advance"] = 0.123
+    status["extruder"]["pressure_advance"] = 0.123
+
+
+def _advance_in_force(status: dict[str, Any]) -> None:
+    status["extruder"]["pressure_advance"] = 0.321
+
+
+def _own_limit_macro(status: dict[str, Any]) -> None:
+    status["configfile"]["config"]["gcode_macro Set_Velocity_Limit"] = {}
+
+
+def _own_shaper_macro(status: dict[str, Any]) -> None:
+    status["configfile"]["config"]["gcode_macro SET_INPUT_SHAPER"] = {}
+
+
+def _not_wrapped(status: dict[str, Any]) -> None:
+    status["gcode"]["commands"]["PAUSE"]["help"] = "Pause the actual running print"
+
+
+def _m600(status: dict[str, Any]) -> None:
+    status["gcode"]["commands"]["M600"] = {"help": "G-Code macro"}
+
+
+def _old_klipper(status: dict[str, Any]) -> None:
+    del status["gcode"]
+
+
+def _travel(status: dict[str, Any]) -> None:
+    settings_of(status)["stepper_x"]["position_max"] -= 10.0
+
+
+@pytest.mark.parametrize(
+    ("change", "place", "words", "unsafe"),
+    [
+        (_kinematics, "[printer] kinematics", "limited_cartesian", True),
+        (_slower_z, "[printer] max_z_accel", "no command raises", True),
+        (_faster_z, "[printer] max_z_accel", "put ", False),
+        (_configured_accel, "[printer] max_accel", "1234", False),
+        (_raised, "max_accel", "300000, printer.cfg says", True),
+        (_lowered, "max_accel", "STILLPATH_RESTORE", False),
+        (_shaper, "[input_shaper] shaper_freq_x", "61.5", False),
+        (_corner, "[printer] square_corner_velocity", "8", False),
+        (_advance, "[extruder] pressure_advance", "0.123", False),
+        (_advance_in_force, "pressure_advance", "0.321", False),
+        (_own_limit_macro, "SET_VELOCITY_LIMIT", "take it out", True),
+        (_own_shaper_macro, "SET_INPUT_SHAPER", "on top of", False),
+        (_not_wrapped, "PAUSE", "include stillpath.cfg", False),
+        (_m600, "M600", "include stillpath-m600.cfg", False),
+        (_old_klipper, "PAUSE, RESUME, CANCEL_PRINT", "include stillpath.cfg", False),
+        (_travel, "[stepper_x] position_max", "travel.x.max_mm", False),
+    ],
+)
+def test_what_differs_is_found(tmp_path: Path, change, place: str, words: str, unsafe: bool):
+    status = status_of(MACHINE)
+    change(status)
+    found = {finding.place: finding for finding in checked(tmp_path, status).findings}
+    assert place in found, list(found)
+    assert words in found[place].text
+    assert found[place].unsafe is unsafe
+
+
+def test_limits_of_a_print_under_way_are_its_own(tmp_path: Path):
+    status = status_of(MACHINE)
+    _raised_by_a_print(status)
+    assert checked(tmp_path, status).findings == []
+
+
+@pytest.mark.parametrize("method", ["none", "advise"])
+def test_a_file_without_a_stream_needs_no_macros(tmp_path: Path, method: str):
+    status = status_of(MACHINE)
+    for change in (_not_wrapped, _own_limit_macro, _own_shaper_macro):
+        change(status)
+    assert checked(tmp_path, status, method=method).findings == []
+
+
+def test_another_firmware(tmp_path: Path):
+    text = (Path(__file__).parents[3] / "examples/firmware/marlin.json").read_text()
+    document = MACHINE.model_dump(mode="json") | {"firmware": json.loads(text)}
+    marlin = Machine.model_validate(document)
+    [finding] = checked(tmp_path, status_of(MACHINE), marlin).findings
+    assert finding.unsafe
+    assert "runs marlin" in finding.text
+
+
+def test_what_changed_since_the_first_check_until_it_is_accepted(tmp_path: Path):
+    status = status_of(MACHINE)
+    assert checked(tmp_path, status).findings == []
+    settings_of(status)["stepper_x"]["rotation_distance"] = 32.0
+    settings_of(status)["stepper_x"]["endstop_pin"] = "^PC7"
+    settings_of(status)["tmc2209 stepper_x"]["run_current"] = 0.8
+    first = checked(tmp_path, status)
+    assert [finding.place for finding in first.findings] == [
+        "[stepper_x] rotation_distance",
+        "[tmc2209 stepper_x] run_current",
+    ]
+    assert "from 40 to 32" in first.findings[0].text
+    assert "stillpath printers accept left" in first.findings[0].text
+    assert checked(tmp_path, status).findings == first.findings
+    assert checked(tmp_path, status, accept=True).findings == []
+    assert checked(tmp_path, status).findings == []
+
+
+def test_a_new_revision_of_the_machine_begins_anew(tmp_path: Path):
+    status = status_of(MACHINE)
+    checked(tmp_path, status)
+    settings_of(status)["stepper_x"]["rotation_distance"] = 32.0
+    newer = MACHINE.model_copy(update={"source": "measured again"})
+    assert newer.revision != MACHINE.revision
+    assert checked(tmp_path, status, newer).findings == []
+    assert len(checked(tmp_path, status).findings) == 1
+
+
+def test_a_damaged_memory_is_named(tmp_path: Path):
+    checked(tmp_path, status_of(MACHINE))
+    [file] = tmp_path.rglob("*.json")
+    file.write_text("{}")
+    with pytest.raises(PrinterUnknown, match=r"left/\w+\.json is damaged"):
+        checked(tmp_path, status_of(MACHINE))
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [("shutdown", r"not ready \(shutdown\)"), ("startup", "startup"), ("away", "not connected")],
+)
+def test_a_klipper_that_is_not_ready(tmp_path: Path, state: str, words: str):
+    with moonraker(status=status_of(MACHINE), state=state) as server:
+        checker = Checker(DocumentFolder(tmp_path))
+        with pytest.raises(PrinterUnknown, match=words):
+            checker.check(printer_at(server), MACHINE)
+    assert not list(tmp_path.rglob("*.json"))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"[]", b"<html>", b'{"result": 1}', b'{"result": {"state": "ready"}}', b"[" * 50_000],
+    ids=["empty", "list", "page", "number", "half", "deep"],
+)
+def test_answers_that_are_not_moonrakers(tmp_path: Path, body: bytes):
+    with (
+        Listener(lambda _: (200, {}, body)) as server,
+        pytest.raises(PrinterUnknown, match="left cannot be asked"),
+    ):
+        Checker(DocumentFolder(tmp_path)).check(printer_at(server), MACHINE)
+
+
+def test_a_printer_that_is_off_and_an_octoprint(tmp_path: Path):
+    with Listener() as server:
+        off = printer_at(server)
+    checker = Checker(DocumentFolder(tmp_path))
+    with pytest.raises(PrinterUnknown, match="cannot be reached"):
+        checker.check(off, MACHINE)
+    with octoprint(key="k") as server, pytest.raises(PrinterUnknown, match="OctoPrint"):
+        checker.check(printer_at(server, kind="octoprint"), MACHINE)
+    assert server.seen == []
+
+
+# When a result is handed over
+
+
+def delivered(tmp_path: Path, status: dict[str, Any], **fields: Any) -> tuple[Any, list[Any]]:
+    with moonraker(status=status, key="k1") as server:
+        file = tmp_path / "printers.toml"
+        file.write_text(
+            f"[printer.m]\nkind = 'moonraker'\nurl = '{server.url}'\napi_key = 'k1'\n"
+            "machine = 'ender3'\nstart = true\n"
+        )
+        with open_place(tmp_path / "data", printers=file) as place:
+            job = place.finish(tmp_path, printer="m", **fields)
+            with place.sending(checker=_checker(place)):
+                return place.settled(job), uploads(server)
+
+
+def _checker(place: Place) -> Checker:
+    return Checker(DocumentFolder(place.settings.data_dir / "printers"))
+
+
+@pytest.mark.parametrize("prints", [False, True])
+def test_a_sound_printer_gets_its_file_without_a_word(tmp_path: Path, prints: bool):
+    delivery, [upload] = delivered(tmp_path, status_of(MACHINE), print_after=prints)
+    assert (delivery.state, delivery.error) == ("done", None)
+    assert upload.parts()["print"][1] == (b"true" if prints else b"false")
+
+
+def test_what_differs_is_noted_and_the_print_begins(tmp_path: Path):
+    status = status_of(MACHINE)
+    _not_wrapped(status)
+    delivery, [upload] = delivered(tmp_path, status, print_after=True)
+    assert (delivery.state, upload.parts()["print"][1]) == ("done", b"true")
+    assert "stillpath.cfg" in delivery.error
+
+
+def test_what_is_unsafe_is_uploaded_and_not_started(tmp_path: Path):
+    status = status_of(MACHINE)
+    _kinematics(status)
+    delivery, [upload] = delivered(tmp_path, status, print_after=True)
+    assert (delivery.state, upload.parts()["print"][1]) == ("done", b"false")
+    assert delivery.error.startswith("uploaded, but not started, because it would be unsafe; ")
+    assert "limited_cartesian" in delivery.error
+
+
+# Over HTTP, and on the command line
+
+
+def printers_file(tmp_path: Path, server: Listener, machine: str = "ender3") -> Path:
+    file = tmp_path / "printers.toml"
+    file.write_text(
+        f"[printer.left]\nkind = 'moonraker'\nurl = '{server.url}'\nmachine = '{machine}'\n"
+        "[printer.octo]\nkind = 'octoprint'\nurl = 'http://127.0.0.1:9'\nmachine = 'ender3'\n"
+    )
+    return file
+
+
+def test_over_http_and_in_the_report(tmp_path: Path):
+    status = status_of(MACHINE)
+    with moonraker(status=status) as server:
+        settings = Settings(data_dir=tmp_path / "data", printers=printers_file(tmp_path, server))
+        app = create_app(settings, runner=pretend)
+        with TestClient(app, base_url="http://localhost") as client:
+            assert client.get("/v1/printers/left/check").json()["findings"] == []
+            settings_of(status)["stepper_y"]["rotation_distance"] = 32.0
+            [finding] = client.get("/v1/printers/left/check").json()["findings"]
+            assert finding["place"] == "[stepper_y] rotation_distance"
+            job = client.post(
+                "/v1/jobs", params={"machine": "ender3", "printer": "left"}, content=b"G1 X1\n"
+            ).json()
+            place = client.app.state.storage
+            with place.local(f"jobs/{job['id']}/machine.json") as pinned:
+                [warning] = json.loads(pinned.read_text())["warnings"]
+            assert warning.startswith("printer left: [stepper_y] rotation_distance has changed")
+            until(lambda: client.get(f"/v1/jobs/{job['id']}").json()["state"] == "done", 300)
+            until(lambda: uploads(server))
+            until(lambda: _delivery(client, job)["state"] == "done")
+            assert "rotation_distance has changed" in _delivery(client, job)["error"]
+            assert client.post("/v1/printers/left/accept").json()["findings"] == []
+            assert client.get("/v1/printers/left/check").json()["findings"] == []
+            for name, code in (("nobody", 404), ("octo", 422)):
+                assert client.get(f"/v1/printers/{name}/check").status_code == code
+
+
+def _delivery(client: TestClient, job: dict[str, Any]) -> dict[str, Any]:
+    [delivery] = client.get(f"/v1/jobs/{job['id']}").json()["deliveries"]
+    return delivery
+
+
+def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
+    from service.cli import run
+
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.delenv("STILLPATH_SERVER", raising=False)
+    status = status_of(MACHINE)
+    with moonraker(status=status) as server:
+        file = printers_file(tmp_path, server)
+        command = ["printers", "check", "left", "--printers", str(file)]
+        assert run(command) == 0
+        assert "as the machine ender3 says" in capsys.readouterr().out
+        _kinematics(status)
+        assert run(command) == 2
+        assert capsys.readouterr().out.startswith("unsafe: [printer] kinematics")
+        accept = ["printers", "accept", "left", "--printers", str(file)]
+        assert run(accept) == 0
+        assert run(["printers", "check", "nobody", "--printers", str(file)]) == 2
+        assert "known: left, octo" in capsys.readouterr().err
+    assert run(command) == 2
+    assert "cannot be reached" in capsys.readouterr().err
+    assert run(["printers", "check", "left"]) == 2
+    assert "STILLPATH_PRINTERS" in capsys.readouterr().err
