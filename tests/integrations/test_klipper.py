@@ -1,0 +1,225 @@
+"""The macros for Klipper: what reaches the firmware, and in which order."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from gcode.firmware.klipper.kit import KlipperKit
+from models.store import load_machine
+from tests.integrations.klipper import SETTINGS, CommandError, ConfigError, Klipper, macros_of
+
+FOLDER = Path(__file__).resolve().parents[2] / "integrations" / "klipper"
+OURS = FOLDER / "stillpath.cfg"
+M600 = FOLDER / "stillpath-m600.cfg"
+
+USERS = """
+[gcode_macro PAUSE]
+rename_existing: PAUSE_BASE
+gcode:
+  PAUSE_BASE
+  G91
+  G1 Z5 F900   # my own lift
+[gcode_macro RESUME]
+rename_existing: RESUME_BASE
+gcode:
+  RESUME_BASE {rawparams}
+[gcode_macro CANCEL_PRINT]
+rename_existing: CANCEL_PRINT_BASE
+gcode:
+  G1 X0 Y0 F9000
+  CANCEL_PRINT_BASE
+"""
+CHANGES = """
+[gcode_macro M600]
+gcode:
+  PAUSE
+  G1 E-50 F1000
+"""
+OWN = "SET_VELOCITY_LIMIT VELOCITY=300.0 ACCEL=5000.0 SQUARE_CORNER_VELOCITY=5.0 "
+OWN_LIMITS = OWN + "MINIMUM_CRUISE_RATIO=0.5"
+OWN_SHAPER = (
+    'SET_INPUT_SHAPER SHAPER_FREQ_X=57.8 SHAPER_FREQ_Y=45.2 SHAPER_TYPE_X="mzv" SHAPER_TYPE_Y="ei"'
+)
+
+
+def in_stretch(*files: Path | str, **more) -> Klipper:
+    """A printer in the middle of a compensated stretch, by our encoder's own lines."""
+    printer = Klipper(macros_of(*files), **more)
+    machine = load_machine("voron-v24-250")
+    firmware = KlipperKit(machine, machine.firmware)
+    voice = firmware.voice()
+    printer.run(voice.limits(firmware.stream_limits(firmware.initial_limits())).decode())
+    printer.run(voice.shaper_off.decode())
+    assert printer.toolhead["max_accel"] >= 100_000
+    printer.state = "printing"
+    printer.sent.clear()
+    return printer
+
+
+def limits(printer: Klipper) -> tuple:
+    return tuple(printer.toolhead.values()), printer.shaper["shaper_freq_x"]
+
+
+def test_without_macros_of_ones_own():
+    printer = in_stretch(OURS)
+    before = limits(printer)
+    printer.run("PAUSE")
+    assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "PAUSE"]
+    printer.sent.clear()
+    printer.run("RESUME VELOCITY=80")
+    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, "RESUME"]
+    assert limits(printer) == before
+
+
+def test_ones_own_macros_move_under_ones_own_limits():
+    printer = in_stretch(USERS, OURS)
+    before = limits(printer)
+    printer.run("PAUSE")
+    assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "PAUSE", "G91", "G1 Z5 F900"]
+    printer.run("SET_VELOCITY_LIMIT ACCEL=9000")  # somebody plays while it is paused
+    printer.sent.clear()
+    printer.run("RESUME")
+    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, "RESUME"]
+    assert limits(printer) == before
+    printer.sent.clear()
+    printer.run("CANCEL_PRINT")
+    assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "G1 X0 Y0 F9000", "CANCEL_PRINT"]
+    printer.run("RESUME")
+    assert limits(printer)[0] == (300.0, 5000.0, 5.0, 0.5)  # nothing of the cancelled print
+
+
+def test_a_pause_outside_of_stretches_gives_the_files_limits_back_and_leaves_the_shaper():
+    printer = Klipper(macros_of(USERS, OURS))
+    printer.run("SET_VELOCITY_LIMIT ACCEL=2500 SQUARE_CORNER_VELOCITY=3")
+    printer.run("PAUSE")
+    printer.run("PAUSE")  # twice, as impatient people do
+    printer.run("RESUME")
+    assert limits(printer) == ((300.0, 2500.0, 3.0, 0.5), 57.8)
+
+
+def test_a_pause_among_the_files_own_moves_of_a_stretch():
+    """There the file's limits are in force, marked, and the shaper is off."""
+    printer = Klipper(macros_of(OURS))
+    machine = load_machine("voron-v24-250")
+    firmware = KlipperKit(machine, machine.firmware)
+    voice = firmware.voice()
+    printer.run(voice.limits(voice.in_stream(firmware.initial_limits())).decode())
+    printer.run(voice.shaper_off.decode())
+    before = limits(printer)
+    printer.run("PAUSE")
+    assert printer.shaper["shaper_freq_x"] == 57.8
+    printer.run("RESUME")
+    assert limits(printer) == before
+    assert printer.shaper["shaper_freq_x"] == 0.0
+
+
+@pytest.mark.parametrize("file_position", [None, 4711])
+def test_a_change_of_filament_in_mid_stretch(file_position: int | None):
+    extra = {} if file_position is None else {"virtual_sdcard": {"file_position": file_position}}
+    printer = in_stretch(USERS, CHANGES, OURS, M600, extra=extra)
+    before = limits(printer)
+    printer.run("M600 X10")
+    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, OWN_LIMITS]
+    assert printer.sent[-1] == "G1 E-50 F1000"
+    assert limits(printer)[0] == (300.0, 5000.0, 5.0, 0.5)
+    printer.run("RESUME")
+    assert limits(printer) == before
+
+
+def test_a_change_of_filament_that_does_not_pause():
+    printer = in_stretch("[gcode_macro M600]\ngcode:\n  G1 E-50 F1000\n", OURS, M600)
+    before = limits(printer)
+    printer.run("M600")
+    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, "G1 E-50 F1000"]
+    assert limits(printer) == before
+
+
+def test_a_change_of_filament_that_broke_spoils_no_later_pause():
+    fails = "[gcode_macro M600]\ngcode:\n  { action_raise_error('no filament') }\n"
+    place = {"virtual_sdcard": {"file_position": 100}}
+    printer = in_stretch(fails, OURS, M600, extra=place)
+    with pytest.raises(CommandError):
+        printer.run("M600")
+    place["virtual_sdcard"]["file_position"] = 7  # another print
+    printer.run("SET_VELOCITY_LIMIT ACCEL=1234")
+    printer.run("PAUSE")
+    printer.run("RESUME")
+    assert printer.toolhead["max_accel"] == 1234
+
+
+def test_the_second_file_needs_a_macro():
+    with pytest.raises(ConfigError, match="M600"):
+        Klipper(macros_of(OURS, M600))
+
+
+def test_a_klipper_from_before_2024():
+    settings = {"printer": dict(SETTINGS["printer"]), "input_shaper": SETTINGS["input_shaper"]}
+    del settings["printer"]["minimum_cruise_ratio"]
+    settings["printer"]["max_accel_to_decel"] = 2500.0
+    printer = in_stretch(OURS, settings=settings)
+    before = limits(printer)
+    printer.run("PAUSE")
+    assert printer.sent[0] == OWN + "ACCEL_TO_DECEL=2500.0"
+    printer.run("RESUME")
+    assert limits(printer) == before
+
+
+def test_a_printer_without_a_shaper():
+    settings = {"printer": SETTINGS["printer"]}
+    printer = Klipper(macros_of(USERS, OURS), settings=settings)
+    printer.run("PAUSE")
+    printer.run("RESUME")
+    printer.run("STILLPATH_CHECK")
+    assert not [line for line in printer.sent if "SHAPER" in line]
+    assert printer.told == ["Stillpath: PAUSE, RESUME and CANCEL_PRINT restore the limits first"]
+
+
+def test_check_is_content():
+    printer = Klipper(macros_of(USERS, CHANGES, OURS, M600))
+    printer.run("STILLPATH_CHECK STOP=1")
+    assert printer.told[0].startswith("Stillpath: printer.cfg says shaper_freq_x:57.800")
+    assert printer.told[-1].startswith("shaper_type_x:mzv shaper_freq_x:57.8")
+    assert "restore the limits first" in printer.told[1]
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ((OURS, USERS), r"PAUSE does not .* behind it"),
+        ((USERS, CHANGES, OURS), r"M600 does not .*stillpath-m600\.cfg"),
+    ],
+    ids=["wrong order", "M600 left out"],
+)
+def test_check_finds_wrappers_that_are_missing(files, words: str):
+    printer = Klipper(macros_of(*files))
+    printer.run("STILLPATH_CHECK")
+    assert re.search(words, "\n".join(printer.told))
+    with pytest.raises(CommandError, match="STILLPATH_CHECK"):
+        printer.run("STILLPATH_CHECK STOP=1")
+
+
+@pytest.mark.parametrize("shows_commands", [True, False])
+def test_check_finds_a_wrapper_that_was_cut_out(shows_commands: bool):
+    text = re.sub(r"\[gcode_macro Cancel_Print\].*?(?=\n\[)", "", OURS.read_text(), flags=re.S)
+    printer = Klipper(macros_of(text), shows_commands=shows_commands)
+    printer.run("STILLPATH_CHECK")
+    assert [line for line in printer.told if line.startswith("Stillpath: CANCEL_PRINT does not")]
+
+
+def test_check_finds_limits_that_stayed():
+    printer = in_stretch(OURS)
+    printer.run("STILLPATH_CHECK")
+    assert "a print runs" in printer.told[-2] or "a print runs" in printer.told[0]
+    printer.state = "cancelled"
+    printer.told.clear()
+    printer.run("STILLPATH_CHECK")
+    told = "\n".join(printer.told)
+    assert re.search(r"max_accel is \d+, printer.cfg says 5000: STILLPATH_RESTORE", told)
+    assert "the input shaper is off" in told
+    printer.run("STILLPATH_RESTORE")
+    printer.told.clear()
+    printer.run("STILLPATH_CHECK STOP=1")
+    assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
