@@ -299,6 +299,7 @@ def printers_file(tmp_path: Path, server: Listener, machine: str = "ender3") -> 
     return file
 
 
+@pytest.mark.slow
 def test_over_http_and_in_the_report(tmp_path: Path):
     status = status_of(MACHINE)
     with moonraker(status=status) as server:

@@ -1,0 +1,194 @@
+"""Stand-ins for what Moonraker gives its components; and the real one, where it is installed.
+
+The contract is Moonraker 0.11's: server.py, confighelper.py, components/file_manager (metadata:
+`run_gcode_processors`, `file_manager:metadata_processed`), klippy_apis.py.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import inspect
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+__all__ = ["COMPONENT", "Config", "Server", "ServerError", "component_module"]
+
+COMPONENT = Path(__file__).resolve().parents[2] / "integrations" / "moonraker" / "stillpath.py"
+
+
+def component_module() -> ModuleType:
+    """Load the component's file, as Moonraker imports it from its own folder."""
+    spec = importlib.util.spec_from_file_location("moonraker_components_stillpath", COMPONENT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class ServerError(Exception):
+    def __init__(self, message: str, status_code: int = 400) -> None:
+        super().__init__(message)
+        self.status_code = status_code
+
+
+class Config:
+    """A section of moonraker.conf."""
+
+    error = ServerError
+
+    def __init__(self, server: Server, options: dict[str, str]) -> None:
+        self._server, self._options = server, options
+
+    def get_server(self) -> Server:
+        return self._server
+
+    def get(self, name: str, *default: Any) -> Any:
+        if name not in self._options and not default:
+            raise ServerError(f"No option '{name}' found in section [stillpath]")
+        return self._options.get(name, *default)
+
+    def getboolean(self, name: str, default: bool) -> bool:
+        return {"True": True, "False": False}[self._options.get(name, str(default))]
+
+    def getfloat(self, name: str, default: float, above: float | None = None) -> float:
+        value = float(self._options.get(name, default))
+        assert above is None or value > above
+        return value
+
+    def load_template(self, name: str, default: str) -> Any:
+        text = self._options.get(name, default)
+        return type("Template", (), {"render": staticmethod(lambda: text)})
+
+
+class Server:
+    """Moonraker, as far as a component sees it.
+
+    Attributes
+    ----------
+    print_stats : dict
+        Of the printer; empty: Klipper is away.
+    console : list of str
+    started : list of str
+        Prints that were asked for.
+    """
+
+    error = ServerError
+
+    def __init__(self, folder: Path) -> None:
+        self.data = folder / "printer_data"
+        self.gcodes = self.data / "gcodes"
+        self.gcodes.mkdir(parents=True, exist_ok=True)
+        self.print_stats: dict[str, Any] = {"state": "standby", "filename": ""}
+        self.console: list[str] = []
+        self.changes: list[dict[str, Any]] = []
+        self.started: list[str] = []
+        self.endpoints: dict[str, Callable[..., Any]] = {}
+        self.methods: dict[str, Callable[..., Any]] = {}
+        self.directories: dict[str, str] = {}
+        self.processors: dict[str, dict[str, Any]] = {}
+        self._handlers: dict[str, Callable[..., Any]] = {}
+
+    # What a component uses
+
+    def get_app_args(self) -> dict[str, Any]:
+        return {"data_path": str(self.data)}
+
+    def lookup_component(self, name: str) -> Any:
+        assert name in ("file_manager", "klippy_apis")
+        return self
+
+    def register_event_handler(self, event: str, callback: Callable[..., Any]) -> None:
+        self._handlers[event] = callback
+
+    def register_notification(self, event: str) -> None:
+        assert ":" in event
+
+    def register_endpoint(self, place: str, kinds: list[str], callback: Callable[..., Any]) -> None:
+        self.endpoints[f"{' '.join(kinds)} {place}"] = callback
+
+    def register_remote_method(self, name: str, callback: Callable[..., Any]) -> None:
+        self.methods[name] = callback
+
+    def send_event(self, event: str, *given: Any) -> None:
+        if event == "server:gcode_response":
+            self.console.extend(given)
+        elif event == "stillpath:changed":
+            self.changes.extend(given)
+
+    # The file manager and its metadata
+
+    def get_metadata_storage(self) -> Any:
+        storage = type("Storage", (), {})()
+        storage.register_gcode_processor = self.processors.__setitem__
+        storage.get = self._metadata
+        return storage
+
+    def register_directory(self, root: str, path: str) -> bool:
+        self.directories[root] = path
+        return Path(path).is_dir()
+
+    def get_directory(self, root: str = "gcodes") -> str:
+        assert root == "gcodes"
+        return str(self.gcodes)
+
+    def _metadata(self, file: str, default: Any = None) -> Any:
+        path = self.gcodes / file
+        return {"file_processors": self._finished(path)} if path.is_file() else default
+
+    def _finished(self, path: Path) -> list[str]:
+        """Names of the processors that recognise a file, or run on it, as Moonraker does."""
+        head = path.read_bytes()[: 1 << 20].decode(errors="ignore")
+        found = []
+        for name, processor in self.processors.items():
+            assert processor["timeout"] > 0
+            assert processor["ident"]["location"] == "header"
+            if re.search(processor["ident"]["regex"], head, re.MULTILINE):
+                found.append(name)
+            else:
+                assert not processor.get("enabled", True), "it would hold the upload back"
+        return found
+
+    def upload(self, name: str, content: str) -> Path:
+        """Bring a file, as a slicer does; its metadata are read, and then told of."""
+        path = self.gcodes / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+        assert self._handlers["file_manager:metadata_processed"](name) is None
+        return path
+
+    # Klipper
+
+    async def query_objects(self, objects: dict[str, Any], default: Any) -> Any:
+        return {"print_stats": dict(self.print_stats)} if self.print_stats else default
+
+    async def start_print(self, filename: str) -> str:
+        if self.print_stats.get("state") == "error":
+            raise ServerError("Must home axis first")
+        self.started.append(filename)
+        return "ok"
+
+    async def call(self, place: str, **given: Any) -> Any:
+        """Send a request to an endpoint."""
+        request = type("Request", (), {})()
+        request.get_str = lambda name: given[name]
+        request.get_boolean = lambda name, default: given.get(name, default)
+        return await self.endpoints[place](request)
+
+    async def from_macro(self, name: str, **given: Any) -> None:
+        """Call a remote method, as a macro does."""
+        answer = self.methods[name](**given)
+        if inspect.isawaitable(answer):
+            await answer
+
+    async def until(self, condition: Callable[[], Any], seconds: float = 120.0) -> Any:
+        """Wait for a condition."""
+        deadline = asyncio.get_running_loop().time() + seconds
+        while not (found := condition()):
+            assert asyncio.get_running_loop().time() < deadline, self.console
+            await asyncio.sleep(0.02)
+        return found
