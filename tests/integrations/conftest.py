@@ -1,4 +1,4 @@
-"""One server for all tests here; and which slicers were not there, said loudly."""
+"""One server for all tests here; and which programs were not there, said loudly."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.integrations.octoprint import NO_OCTOPRINT
 from tests.integrations.running import Running
 from tests.integrations.slicers import NOT_HERE
 from tests.service.test_server import server
@@ -30,14 +31,16 @@ def address(running: Running) -> str:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    skipped = [
-        report
-        for report in terminalreporter.getreports("skipped")
-        if NOT_HERE in str(report.longrepr)
-    ]
-    if skipped:
-        terminalreporter.write_line(
-            f"NOT CHECKED: {len(skipped)} tests need a slicer (tests/integrations/get-slicers)",
-            yellow=True,
-            bold=True,
-        )
+    for missing, needed in (
+        (NOT_HERE, "a slicer (tests/integrations/get-slicers)"),
+        (NO_OCTOPRINT, "OctoPrint (tests/get-tools)"),
+    ):
+        skipped = [
+            report
+            for report in terminalreporter.getreports("skipped")
+            if missing in str(report.longrepr)
+        ]
+        if skipped:
+            terminalreporter.write_line(
+                f"NOT CHECKED: {len(skipped)} tests need {needed}", yellow=True, bold=True
+            )

@@ -1,0 +1,270 @@
+"""A client of the service that needs the standard library only."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import time
+import urllib.request
+from typing import TYPE_CHECKING, Any
+from urllib.error import HTTPError
+from urllib.parse import quote, urlencode, urlsplit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+    from typing import BinaryIO
+
+__all__ = ["Failure", "Service"]
+
+# Client of the service: the same in slicers/, cura/ and octoprint/.
+
+
+class Failure(Exception):
+    """It was not done: one line for the user; code 1: another try may help, 2: it will not."""
+
+    def __init__(self, message: object, code: int = 2) -> None:
+        super().__init__(" ".join(str(message).split()))
+        self.code = code
+
+
+class Service:
+    """A Stillpath server.
+
+    Parameters
+    ----------
+    address : str
+        As in a browser: ``http://127.0.0.1:8000``.
+    key : str
+        Sent as a bearer token; empty for none.
+    timeout_s : float
+        How long the server may be silent, or away while a job is there, before it is given up.
+    tell : callable
+        Is told the stage, and the share that is done or None; may raise to stop the work.
+    """
+
+    _FIRST_PATIENCE_S = 3.0
+    _BUSY = (429, 502, 503, 504)
+    _LONGEST_PAUSE_S = 2.0
+
+    def __init__(
+        self,
+        address: str,
+        key: str = "",
+        timeout_s: float = 60.0,
+        tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
+    ) -> None:
+        parts = urlsplit(address)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
+        self._address = address.rstrip("/")
+        self._headers = {"Authorization": f"Bearer {key}"} if key else {}
+        self._timeout_s = timeout_s
+        self._tell = tell
+        # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
+        handlers: list[Any] = [_Web()]
+        if parts.hostname in ("localhost", "127.0.0.1", "::1"):
+            handlers.append(urllib.request.ProxyHandler({}))
+        self._opener = urllib.request.build_opener(*handlers)
+
+    def compensate(
+        self, source: Path, target: Path, options: Mapping[str, Any], wait_s: float | None = None
+    ) -> bytes:
+        """Send a file, wait, fetch the result and return the page of the report.
+
+        Parameters
+        ----------
+        source, target : Path
+            The target is written in place: guard it.
+        options : dict
+            `machine`, `name` (of the file, in the report) and other parameters of a job.
+        wait_s : float, optional
+            Give up after this time.
+
+        Raises
+        ------
+        Failure
+        """
+        self._tell("asking the server", None)
+        machine = quote(options["machine"], safe="")
+        # Whether address, key and machine are right is known before a long upload.
+        self._ask("GET", f"/v1/machines/{machine}", min(self._FIRST_PATIENCE_S, self._timeout_s))
+        job = self._send(source, options)
+        path = f"/v1/jobs/{job}"
+        try:
+            self._wait(path, wait_s)
+            self._ask(
+                "GET", f"{path}/result", self._timeout_s, take=lambda a: self._save(a, target)
+            )
+            return self._ask("GET", f"{path}/report", self._timeout_s)
+        finally:
+            self._forget(path)
+
+    def _send(self, source: Path, options: Mapping[str, Any]) -> str:
+        size = source.stat().st_size
+        # A job of our own: it is deleted behind us, also if others send the same file.
+        name = options["name"][-255:]
+        query = urlencode({**options, "name": name, "fresh": "true"}, errors="replace")
+        with source.open("rb") as file:
+            body = _Told(file, size, lambda share: self._tell("sending", share))
+            job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
+        if job.get("source_bytes") != size:
+            self._forget(f"/v1/jobs/{job.get('id')}")
+            raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
+        return str(job["id"])
+
+    def _wait(self, path: str, wait_s: float | None) -> None:
+        began, pause_s = time.monotonic(), 0.1
+        while True:
+            job = self._document(self._ask("GET", path, self._timeout_s))
+            state = job.get("state")
+            if state == "done":
+                return
+            if state in ("failed", "cancelled"):
+                problem = job.get("error") or {}
+                reason = problem.get("detail", f"the job was {state} on the server")
+                raise Failure(reason, 2 if problem.get("status", 422) < 500 else 1)
+            if wait_s is not None and time.monotonic() - began > wait_s:
+                raise Failure(f"not done within {wait_s:.0f} s; given up", 1)
+            waiting = job.get("queue_position")
+            stage = f"waiting behind {waiting} jobs" if waiting else job.get("stage") or "waiting"
+            self._tell(stage, job.get("progress"))
+            time.sleep(pause_s)
+            pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _save(self, answer: Any, target: Path) -> bytes:
+        expected, read = int(answer.headers.get("Content-Length") or -1), 0
+        with target.open("wb") as file:
+            while chunk := _read(answer, 1 << 18):
+                read += file.write(chunk)
+                self._tell("fetching", read / expected if expected > 0 else None)
+        if not read or read != expected >= 0:
+            raise _Broken(f"{read} of {expected} bytes came")
+        return b""
+
+    def _forget(self, path: str) -> None:
+        """Delete the job, unless it is gone, or the server: nobody wants it any more."""
+        with contextlib.suppress(Failure, _Broken):
+            self._open("DELETE", path, timeout_s=min(5.0, self._timeout_s)).close()
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        patience_s: float,
+        body: _Told | None = None,
+        take: Callable[[Any], bytes] = lambda answer: _read(answer),
+    ) -> bytes:
+        """Return what is taken of the answer; what may pass by itself is tried for some time."""
+        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        while True:
+            try:
+                with self._open(method, path, body) as answer:
+                    return take(answer)
+            except _Broken as error:
+                if time.monotonic() + pause_s > deadline:
+                    raise Failure(f"no answer from {self._address}: {error}", 1) from None
+            self._tell("the server does not answer; trying again", None)
+            time.sleep(pause_s)
+            pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
+
+    def _open(
+        self, method: str, path: str, body: _Told | None = None, timeout_s: float | None = None
+    ) -> Any:
+        """Return the open answer; raise `Failure` if it is no, `_Broken` if there is none."""
+        headers = dict(self._headers)
+        if body is not None:
+            headers["Content-Type"] = "application/octet-stream"
+            headers["Content-Length"] = str(body.size)
+        request = urllib.request.Request(
+            self._address + path, data=body, headers=headers, method=method
+        )
+        try:
+            return self._opener.open(request, timeout=timeout_s or self._timeout_s)
+        except HTTPError as error:
+            with error:
+                if error.code in self._BUSY:
+                    raise _Broken(f"{error.code} {error.reason}") from None
+                raise self._refusal(error) from None
+        except (OSError, http.client.HTTPException) as error:
+            raise _Broken(str(getattr(error, "reason", "") or error)) from None
+
+    def _document(self, answer: bytes) -> dict[str, Any]:
+        document = _object(answer)
+        if not document:
+            raise Failure(f"{self._address} answers, but not as a Stillpath server", 1)
+        return document
+
+    def _refusal(self, error: HTTPError) -> Failure:
+        """Return the error for an answer of status 300 or above."""
+        reason = f"{self._address} answers {error.code} {error.reason}"
+        with contextlib.suppress(_Broken):
+            reason = _object(_read(error, 1 << 16)).get("detail") or reason
+        if error.code == 401:
+            reason = f"the server does not accept the key (401): {reason}"
+        elif 300 <= error.code < 400:
+            reason = f"{self._address} has moved to {error.headers.get('Location')}; name that"
+        elif error.code == 404 and "/v1/jobs/" in error.url:
+            reason = f"the job was cancelled on the server: {reason}"
+        return Failure(reason, 2 if error.code < 500 else 1)
+
+
+class _Broken(Exception):
+    """There is no answer, or not all of it: another try may bring it."""
+
+
+def _read(answer: Any, size: int | None = None) -> bytes:
+    try:
+        return bytes(answer.read(size))
+    except (OSError, http.client.HTTPException) as error:
+        raise _Broken(str(error) or type(error).__name__) from None
+
+
+def _object(answer: bytes) -> dict[str, Any]:
+    """Return a JSON object, empty for anything else."""
+    with contextlib.suppress(ValueError):
+        if isinstance(found := json.loads(answer), dict):
+            return found
+    return {}
+
+
+class _EarlyAnswer(http.client.HTTPConnection):
+    """Reads the answer even if the server does not take the whole request."""
+
+    def send(self, data: Any) -> None:
+        if self.sock is None:
+            self.connect()
+        with contextlib.suppress(ConnectionError):
+            super().send(data)
+
+
+class _EarlyAnswerTls(_EarlyAnswer, http.client.HTTPSConnection):
+    pass
+
+
+class _Web(
+    urllib.request.HTTPHandler, urllib.request.HTTPSHandler, urllib.request.HTTPRedirectHandler
+):
+    def http_open(self, request: Any) -> Any:
+        return self.do_open(_EarlyAnswer, request)
+
+    def https_open(self, request: Any) -> Any:
+        return self.do_open(_EarlyAnswerTls, request)
+
+    def redirect_request(self, *_: Any) -> None:
+        """Go nowhere else."""
+
+
+class _Told:
+    """A file that tells which share of it has been read."""
+
+    def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
+        self._file, self.size, self._tell = file, size, tell
+
+    def read(self, size: int = -1) -> bytes:
+        self._tell(min(self._file.tell() / max(self.size, 1), 1.0))
+        return self._file.read(size)
+
+
+# End of the client.
