@@ -20,7 +20,7 @@ from gcode.firmware.registry import kit
 from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
 from models.machine import Machine
 
-__all__ = ["Passage", "Piece", "Splitter"]
+__all__ = ["Passage", "Piece", "Splitter", "excerpt"]
 
 T = TypeVar("T", Moves, Events, Phases)
 S = TypeVar("S", Moves, Events)
@@ -302,6 +302,24 @@ class Splitter:
             self._moves = _rows(moves, slice(m, None))
             self._events = _shifted(_rows(events, slice(e, None)), -m)
         return taken
+
+
+def excerpt(piece: Piece, first: int, last: int, machine: Machine) -> Piece:
+    """Return moves first..last - 1 of a piece as one of its own, from rest to rest.
+
+    It has no text and holds no memory of the piece. Its first and last move must be of X or Y.
+    """
+    moves = replace(
+        piece.moves,
+        **{f.name: getattr(piece.moves, f.name)[first:last].copy() for f in fields(piece.moves)},
+    )
+    return replace(
+        piece,
+        moves=moves,
+        events=_rows(piece.events, slice(0, 0)),
+        text=b"",
+        phases=plan_moves(moves, piece.limits, machine),
+    )
 
 
 @lru_cache(maxsize=64)

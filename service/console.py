@@ -16,9 +16,9 @@ from service.interruption import interruptible
 if TYPE_CHECKING:
     from service.pipeline.motion import PlannedTime
     from service.pipeline.progress import Progress
-    from service.pipeline.result import Result
+    from service.pipeline.result import BudgetFigures, Result
 
-__all__ = ["print_planned", "print_result", "progress_shown", "shown"]
+__all__ = ["budget_line", "print_planned", "print_result", "progress_shown", "shown"]
 
 _PLAIN_EVERY_S = 5.0
 
@@ -63,6 +63,8 @@ def print_result(result: Result, console: Console | None = None) -> None:
             f"size {result.original_bytes / 1e6:.2f} -> {result.written_bytes / 1e6:.2f} MB, "
             f"{result.segments_per_s:.0f} segments/s (peak {result.peak_segments_per_s:.0f})"
         )
+        if result.budget is not None:
+            console.print(budget_line(result.budget))
         console.print(
             f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
             f"{100 * result.put_back_extruding_share:.2f} % of the extruding time"
@@ -74,6 +76,24 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def budget_line(budget: BudgetFigures) -> str:
+    """Return what a budget of contour error bought, and at which accelerations."""
+    against = (
+        f"{100 * budget.saved_share_against_shaper:.1f} % less than with the best shaper within it "
+        f"({budget.shaper_time_s:.1f} s)"
+        if budget.saved_share_against_shaper is not None
+        else "the best shaper cannot keep it"
+    )
+    classes = ", ".join(
+        f"{one.name} {one.acceleration_factor:.3g}x ({one.contour_rms_um:.2f} µm)"
+        for one in budget.classes
+    )
+    return (
+        f"budget {budget.budget_um:g} µm: {100 * budget.saved_share:.1f} % less time, {against}; "
+        f"accelerations: {classes}"
+    )
 
 
 def print_planned(planned: PlannedTime, console: Console | None = None) -> None:

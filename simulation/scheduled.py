@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models.machine import Machine
 from models.operating import OperatingGrid, machine_at
-from models.plants import discretise
+from models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
 from models.ripple import MachineRipple
 from models.schedule import EMPTY, OperatingPoint
 from simulation.response import PlantStream
@@ -37,10 +37,20 @@ class MachineStream:
     dt_s : float
     point : OperatingPoint
         Where the machine is at first; without schedules it does not matter.
+    member : int, optional
+        The plants with this number in the sets of both axes answer, not the nominal ones.
     """
 
-    def __init__(self, machine: Machine, dt_s: float, point: OperatingPoint = EMPTY) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        dt_s: float,
+        point: OperatingPoint = EMPTY,
+        *,
+        member: int | None = None,
+    ) -> None:
         self._machine, self._dt_s = machine, dt_s
+        self._member = member
         self._ripple = MachineRipple(machine.kinematics, machine.ripple)
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
@@ -64,7 +74,7 @@ class MachineStream:
         self._streams = []
         for node in self._grid.at_level(level):
             axes = machine_at(self._machine, node).axes
-            stream = PlantStream([discretise(axes[a].nominal, self._dt_s) for a in ("x", "y")])
+            stream = PlantStream([self._plant(axes[a]) for a in ("x", "y")])
             stream.push(self._past)
             self._streams.append(stream)
 
@@ -82,6 +92,11 @@ class MachineStream:
             self._past = past[:, -self._remembered :].copy()
         moved = self._answer(received, path_mm)
         return moved + self._ripple.added_mm(path_mm) if self._machine.ripple else moved
+
+    def _plant(self, axis: PlantSetSpec) -> DiscretePlant:
+        if self._member is None:
+            return discretise(axis.nominal, self._dt_s)
+        return plant_set(axis, self._dt_s).members[self._member]
 
     def _answer(self, u_mm: Array, path_mm: Array) -> Array:
         if len(self._streams) == 1:

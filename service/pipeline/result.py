@@ -5,7 +5,12 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict
 
 __all__ = [
+    "AdviceFigures",
+    "AdvisedFeature",
+    "AdvisedShaper",
     "AxisSpectrum",
+    "BudgetClass",
+    "BudgetFigures",
     "Channel",
     "ErrorFigures",
     "GroupFigures",
@@ -129,6 +134,83 @@ class StageTime(_Figures):
     """CPU time [s]."""
 
 
+class BudgetClass(_Figures):
+    """How quick one class of moves became within a budget, and its error."""
+
+    name: str
+    """The slicer's name of the feature, or `travel`."""
+    acceleration_factor: float
+    """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
+    shaper_acceleration_factor: float
+    """The same with the best firmware shaper at the same budget."""
+    contour_rms_um: float
+    """Contour error of what it extrudes, root mean square of the worst plant of the machine's set
+    [um]; for travel of what is extruded in the 50 ms behind one."""
+    seconds: float
+    """Time in which that was measured [s]."""
+
+
+class BudgetFigures(_Figures):
+    """What a budget of contour error bought."""
+
+    budget_um: float
+    """Contour error that every class of moves may have [um]."""
+    saved_share: float
+    """Part of the original's print time that is saved."""
+    shaper_time_s: float | None
+    """How long the print takes with the best firmware shaper instead, as quick as the same budget
+    allows [s]; null where it cannot keep the budget."""
+    saved_share_against_shaper: float | None
+    """Part of that time that is saved."""
+    classes: list[BudgetClass]
+    """By class of moves."""
+
+
+class AdvisedShaper(_Figures):
+    """A firmware shaper that is advised."""
+
+    layer: int
+    """From which layer on; the first holds from the beginning of the file."""
+    label: str
+    """Type and frequencies for a person."""
+
+
+class AdvisedFeature(_Figures):
+    """What is advised for one feature, and what it does."""
+
+    name: str
+    """The slicer's name of the feature, or `unnamed`."""
+    accel_mm_s2: float | None
+    """Acceleration [mm/s^2]: exactly this for walls, at least this for what is not seen; null: as
+    the file has it."""
+    bound_um: float | None
+    """Contour error that it may have, root mean square of the worst plant of the machine's set
+    [um]; null where the file's accelerations are kept whatever they do."""
+    within_bound: bool
+    """Whether it has no more."""
+    before_um: float
+    """Contour error as sliced, root mean square of the worst plant of the machine's set [um]."""
+    after_um: float
+    """The same of the advised file [um]."""
+    before_s: float
+    """Time in which it is extruded as sliced [s]."""
+    after_s: float
+    """The same of the advised file [s]."""
+
+
+class AdviceFigures(_Figures):
+    """What is advised for a file: firmware commands among its lines."""
+
+    before_shaper: str
+    """The firmware's shaper before the file's first line, as the machine states it."""
+    shapers: list[AdvisedShaper]
+    """Those that the file sets now; empty: it leaves the firmware's."""
+    features: list[AdvisedFeature]
+    """By feature."""
+    lines: int
+    """Lines that were added."""
+
+
 class Result(_Figures):
     """Report of one job; `service.reports` turns it into HTML, the API returns it as JSON."""
 
@@ -202,3 +284,7 @@ class Result(_Figures):
     """Some layers to draw."""
     stages: list[StageTime]
     """CPU time by stage."""
+    budget: BudgetFigures | None = None
+    """What the budget bought, where there was one."""
+    advice: AdviceFigures | None = None
+    """What is advised, by method `advise`."""

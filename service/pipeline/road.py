@@ -33,6 +33,8 @@ from gcode.slicers.retiming import Retiming
 from gcode.types import EventKind, Events, Moves, Phases
 from models.errors import ModelError
 from models.machine import Machine
+from service.pipeline.budget import SpeedBudget
+from service.pipeline.budget_measure import BudgetMeasurement
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import (
     DT_S,
@@ -52,6 +54,7 @@ from service.pipeline.options import Options
 from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
+from service.pipeline.samples import take_samples
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
@@ -111,6 +114,23 @@ def compensate_file(
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
+    if options.method == "advise":
+        if trace is not None:
+            raise GcodeError(
+                "an advised file has moves of its own times: ask for the trajectories of the "
+                "written file, not compensated"
+            )
+        from service.pipeline.advising.advise import advise_file
+
+        return advise_file(
+            source,
+            target,
+            machine,
+            options,
+            cache_dir=cache_dir,
+            progress=progress,
+            layers=layers,
+        )
     unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
     with (
         contextlib.ExitStack() as files,
@@ -184,20 +204,24 @@ class _Job:
         self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._operation = Operation(machine)
-        self._measurement = Measurement(
-            machine,
-            DT_S,
-            self._shaper,
-            compensated=True,
-            take_layer=layers.add if layers else None,
-            trace=trace,
-        )
+        self._budget: SpeedBudget | None = None
+        take_layer = layers.add if layers else None
+        if self._changes and options.budget_um is not None:
+            self._measurement: Measurement = BudgetMeasurement(
+                machine, DT_S, self._shaper, take_layer=take_layer, trace=trace
+            )
+        else:
+            self._measurement = Measurement(
+                machine, DT_S, self._shaper, compensated=True, take_layer=take_layer, trace=trace
+            )
         if self._changes:
             self._writer = StreamWriter(self._kit, self._stamp())
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum = _Sums()
         self._sum.warnings += doubts(source, machine, options.dialect)
+        if options.budget_um is not None and not self._changes:
+            self._sum.warnings.append("The method none changes nothing: the budget was not used.")
 
     @property
     def delay_s(self) -> float:
@@ -206,6 +230,8 @@ class _Job:
 
     def run(self, name: str, facts: SlicerFacts) -> Result:
         size = max(self._source.seek(0, io.SEEK_END), 1)
+        if isinstance(self._measurement, BudgetMeasurement):
+            self._choose_paces(size)
         self._source.seek(0)
         for item in self._items():
             self._point = self._operation.at(item.moves)
@@ -225,6 +251,18 @@ class _Job:
             self._layers.finish(self._reader.feature_names)
         self._say("done", 1.0)
         return self._result(name, size, facts)
+
+    def _choose_paces(self, size: int) -> None:
+        """Find how quick the print may be."""
+        self._source.seek(0)
+        with self._clock.stage("budget"):
+            found = take_samples(
+                self._source,
+                self._machine,
+                dialect_for(self._machine, self._options.dialect),
+                lambda read: self._say("choosing speeds", read / size),
+            )
+            self._budget = SpeedBudget.chosen(found, self._machine, self._options, self._shaper)
 
     def _items(self) -> Iterator[Piece | Passage]:
         while True:
@@ -262,10 +300,48 @@ class _Job:
             # Homed, say: the machine did not come here along the path.
             self._work.compensator.reset(piece.phases.start_mm[0, :2])
             self._sum.jumped = False
+        # Where nothing can follow the raised speeds the file's own are tried.
+        quick = self._quickened(piece)
+        for paced in [piece] if quick is piece else [quick, piece]:
+            try:
+                made, executed, gap, text = self._attempt(piece, paced)
+                break
+            except (Unfit, GcodeError) as error:
+                reason = str(error)
+        else:
+            self._put_back(piece, original_s, reason)
+            return
+        self._work.compensator.commit()
+        self._sum.add_piece(made, executed, gap)
+        with self._clock.stage("measure"):
+            planned, position, row, extruding = as_executed(made, paced.phases, executed)
+            last = len(row) - 1
+            samples = self._samples(piece, row, planned, position, extruding)
+            # The last sample of an item is the first one of the next.
+            self._measure_piece(piece, part_of(samples, 0, last))
+        late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
+        self._emit(text, piece, np.append(delay_s + late_s, self.delay_s))
+
+    def _quickened(self, piece: Piece) -> Piece:
+        if self._budget is None:
+            return piece
+        with self._clock.stage("plan"):
+            return self._budget.quickened(piece)
+
+    def _attempt(
+        self, piece: Piece, paced: Piece
+    ) -> tuple[CompensatedPiece, Phases, np.ndarray, bytes]:
+        """Compensate and write a piece at a pace and read it back; or leave everything as it was.
+
+        Parameters
+        ----------
+        piece, paced : Piece
+            As it came, and as its moves are planned now.
+        """
         writer, checker = copy.copy(self._writer), None
         try:
             with self._clock.stage("compensate"):
-                made = self._work.compensate(piece, self._point)
+                made = self._work.compensate(paced, self._point)
             with self._clock.stage("write"):
                 text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
             with self._clock.stage("read back"):
@@ -273,22 +349,23 @@ class _Job:
                 executed = self._read_back(text)
                 gap = deviation(made, executed)
                 self._verify(piece, made, gap, executed)
-        except (Unfit, GcodeError) as error:
+        except (Unfit, GcodeError):
             self._writer = writer
             if checker is not None:
                 self._checker = checker
-            self._put_back(piece, original_s, str(error))
+            raise
+        return made, executed, gap, text
+
+    def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
+        if self._budget is None or not isinstance(self._measurement, BudgetMeasurement):
+            self._measurement.add(written)
             return
-        self._work.compensator.commit()
-        self._sum.add_piece(made, executed, gap)
-        with self._clock.stage("measure"):
-            planned, position, row, extruding = as_executed(made, piece.phases, executed)
-            last = len(row) - 1
-            samples = self._samples(piece, row, planned, position, extruding)
-            # The last sample of an item is the first one of the next.
-            self._measurement.add(part_of(samples, 0, last))
-        late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
-        self._emit(text, piece, np.append(delay_s + late_s, self.delay_s))
+        phases = piece.phases
+        count = max(round(_duration_s(phases) / DT_S), 1)
+        position, row = sample_phases(phases, (0.0, DT_S, count))
+        sliced = self._samples(piece, row, position, position, _feeding(phases)[row])
+        self._measurement.add_pair(written, sliced)
+        self._budget.correct(self._measurement.errors())
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece leave as it came."""
@@ -306,6 +383,8 @@ class _Job:
         )
         self._sum.original_s -= seconds
         self._sum.moves -= len(piece.moves)
+        if self._budget is not None:
+            self._budget.passed(-seconds)
         self._passage(piece)
 
     def _passage(self, passage: Passage) -> None:
@@ -319,7 +398,10 @@ class _Job:
         self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
         with self._clock.stage("plan"):
             parts = list(plan_passage(passage, self._machine))
-        self._check_end(passage, sum(_takes_s(part) for part in parts))
+        seconds = sum(_takes_s(part) for part in parts)
+        self._check_end(passage, seconds)
+        if self._budget is not None:
+            self._budget.passed(seconds)
         with self._clock.stage("measure"):
             for part in parts:
                 if part is None:
@@ -464,6 +546,8 @@ class _Job:
                 "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
                 "is switched off and stays off; set it again after the print."
             )
+        if self._changes and self._writer.shaper_note is not None:
+            warnings.append(self._writer.shaper_note)
         put_back_share = put_back_s / total.extruding_s if total.extruding_s else 0.0
         if put_back_share > _WARN_PUT_BACK_SHARE:
             longest = max(total.put_back, key=lambda piece: piece.extruding_seconds)
@@ -472,7 +556,12 @@ class _Job:
                 f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
                 f"{longest.reason}"
             )
-        shaper = self._shaper
+        shaper, notes, budget = self._shaper, self._operation.notes(), None
+        if self._budget is not None and isinstance(measured, BudgetMeasurement):
+            names, errors = self._reader.feature_names, measured.errors()
+            budget = self._budget.figures(errors, names, total.original_s, total.time_s)
+            warnings += self._budget.warnings(errors, names)
+            notes = [*notes, measured.note]
         return Result(
             version=__version__,
             machine=self._machine.name,
@@ -502,13 +591,14 @@ class _Job:
             put_back=total.put_back,
             put_back_extruding_share=put_back_share,
             warnings=warnings,
-            notes=self._operation.notes(),
+            notes=notes,
             layers=measured.layers(),
             features=measured.features(self._reader.feature_names),
             track=measured.track(),
             spectra=measured.spectra(),
             layer_views=measured.layer_views(),
             stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            budget=budget,
         )
 
 

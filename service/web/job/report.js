@@ -27,6 +27,7 @@ export function reportSections(job, report, signal) {
     trackChart(report, channels, labels, signal),
     spectra(report, channels, labels, signal),
     features(report, channels, labels),
+    budget(report),
     putBack(report, channels),
     trajectories(job, signal),
     written(report),
@@ -84,6 +85,19 @@ function features(report, channels, labels) {
   return section("By feature", longTable("Contour error by feature, root mean square", [{ title: "Contour, rms, µm", text: true },
     ...channels.map((c) => ({ title: key(c.name, labels[c.name]) })), { title: "Time", wide: true }], groups, (g) => [
     feature(g.name), ...channels.map((c) => um(g.contour_rms_um[c.name])), duration(g.seconds)], 12));
+}
+
+/** @param {any} report */
+function budget(report) {
+  const found = report.budget;
+  if (!found) return null;
+  const saved = (/** @type {number} */ share) => `${(100 * share).toFixed(1)} %`;
+  const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
+    : `, and ${saved(found.saved_share_against_shaper)} less than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
+  return section("Speed budget",
+    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every class of moves) the print takes ${saved(found.saved_share)} less time than the file as it came${shaper}.`),
+    longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
+      feature(c.name), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
 }
 
 /** @param {any} report @param {any[]} channels */

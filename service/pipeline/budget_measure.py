@@ -1,0 +1,119 @@
+"""Figures of a print that became quicker, beside those of the print as it was sliced.
+
+What is written runs in a time of its own. The errors of the file as it came, and of it with the
+best shaper, are those at the file's own speeds, and are measured there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from models.machine import Machine
+from models.schedule import OperatingPoint
+from service.pipeline.budget import error_classes
+from service.pipeline.layers import LayerTile
+from service.pipeline.measure import Measurement, MotionSamples, Trace
+from service.pipeline.result import Channel, GroupFigures
+from service.pipeline.set_errors import ClassError, SetErrors
+from service.pipeline.yardstick import BestShaper
+
+__all__ = ["BudgetMeasurement"]
+
+_STRIDE = 24
+"""Of the errors of the set, whose plants are many."""
+
+
+class BudgetMeasurement(Measurement):
+    """Measure both motions; parameters as `Measurement` has them.
+
+    Channels, layers and features are those of the written file, with `before` and `shaper` at the
+    speeds of the file as it came. What is drawn along the print (track, spectra, tiles of layers)
+    shows all channels at the new speeds.
+    """
+
+    note = (
+        "Curves along the print, spectra and layers show the motion without compensation, and that "
+        "with the best shaper, at the new speeds; all other figures of these at the file's own."
+    )
+
+    def __init__(
+        self,
+        machine: Machine,
+        dt_s: float,
+        shaper: BestShaper,
+        *,
+        take_layer: Callable[[LayerTile], None] | None = None,
+        trace: Callable[[Trace], None] | None = None,
+    ) -> None:
+        super().__init__(
+            machine, dt_s, shaper, compensated=True, take_layer=take_layer, trace=trace
+        )
+        self._sliced = Measurement(machine, dt_s, shaper, compensated=False)
+        self._set = SetErrors(machine, dt_s, stride=_STRIDE)
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is from now on."""
+        super().operate_at(point)
+        self._sliced.operate_at(point)
+        self._set.operate_at(point)
+
+    def add(self, samples: MotionSamples) -> None:
+        """Add motion that leaves as it came."""
+        self.add_pair(samples, samples)
+
+    def add_pair(self, written: MotionSamples, sliced: MotionSamples) -> None:
+        """Add the motion of a piece as it is written, and as it was sliced."""
+        super().add(written)
+        self._sliced.add(sliced)
+        if len(written):
+            classes = error_classes(written.moves)[written.row]
+            self._set.add(written.path_mm, written.executed_mm, written.extruding, classes)
+
+    def jump(self) -> None:
+        """Say that the position is lost: the machine stands still when motion goes on."""
+        super().jump()
+        self._sliced.jump()
+        self._set.jump()
+
+    def finish(self) -> None:
+        """Say that the motion has ended."""
+        super().finish()
+        self._sliced.finish()
+        self._set.finish()
+
+    def errors(self) -> dict[int, ClassError]:
+        """Return the errors of the written file's worst plant by class of moves, so far."""
+        return self._set.errors()
+
+    def channels(self) -> list[Channel]:
+        """Return the figures of every channel."""
+        sliced = {channel.name: channel for channel in self._sliced.channels()}
+        return [sliced.get(channel.name, channel) for channel in super().channels()]
+
+    def layers(self) -> list[GroupFigures]:
+        """Return the figures by layer."""
+        return _joined(super().layers(), self._sliced.layers())
+
+    def features(self, names: Sequence[str]) -> list[GroupFigures]:
+        """Return the figures by feature."""
+        return _joined(super().features(names), self._sliced.features(names))
+
+
+def _joined(written: list[GroupFigures], sliced: list[GroupFigures]) -> list[GroupFigures]:
+    """Put the figures of the file as it came over those at the new speeds."""
+    before = {group.name: group for group in sliced}
+    joined = []
+    for group in written:
+        other = before.get(group.name)
+        if other is None:
+            joined.append(group)
+            continue
+        joined.append(
+            group.model_copy(
+                update={
+                    "contour_rms_um": group.contour_rms_um | other.contour_rms_um,
+                    "contour_max_um": group.contour_max_um | other.contour_max_um,
+                }
+            )
+        )
+    return joined
