@@ -239,6 +239,7 @@ def discretise(spec: PlantSpec, dt_s: float) -> DiscretePlant:
     return _discretised(spec, float(dt_s))
 
 
+@lru_cache(maxsize=64)
 def plant_set(spec: PlantSetSpec, dt_s: float) -> PlantSet:
     """Discretise the nominal plant and the members of `spec`."""
     listed = spec.weighted_members()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.shaper_pulses import Pulses, shaper_pulses
+from models.shaper_pulses import SHAPERS, Pulses, shaper_pulses
 
 __all__ = ["OFF", "AxisShaper", "Shaping"]
 
@@ -61,6 +61,18 @@ class Shaping:
     def is_on(self) -> bool:
         """It changes the command of an axis."""
         return self.x.is_on or self.y.is_on
+
+    @property
+    def unknown_types(self) -> list[str]:
+        """Types that are on and have no model."""
+        types = {s.type for s in (self.x, self.y) if s.is_on}
+        return sorted(types - set(SHAPERS))
+
+    @property
+    def modelled(self) -> Shaping:
+        """The same without axes whose type has no model."""
+        x, y = (AxisShaper() if s.is_on and s.type not in SHAPERS else s for s in (self.x, self.y))
+        return Shaping(x, y)
 
     @property
     def label(self) -> str:

@@ -25,6 +25,7 @@ __all__ = [
     "ContourMeter",
     "GroupTally",
     "MotionMeter",
+    "PathDistances",
     "Tally",
     "contour_error",
     "distance_to_path",
@@ -335,12 +336,29 @@ def distance_to_path(
     index : ndarray of int64, shape (m,)
         Rising; each within the path.
     """
-    path = np.ascontiguousarray(path_mm)
-    out = np.empty(len(index))
-    points = np.ascontiguousarray(points_mm)
-    window = round(window_s / dt_s)
-    contour_distances(path, *_path_tables(path), points, index, window, out)
-    return out
+    return PathDistances(path_mm, dt_s, window_s).at(points_mm, index)
+
+
+class PathDistances:
+    """Contour errors of chosen samples of many motions beside one path.
+
+    Parameters
+    ----------
+    path_mm : ndarray, shape (2, n)
+        The whole planned motion.
+    """
+
+    def __init__(self, path_mm: Array, dt_s: float = 1e-3, window_s: float = 0.08) -> None:
+        self._path = np.ascontiguousarray(path_mm)
+        self._tables = _path_tables(self._path)
+        self._window = round(window_s / dt_s)
+
+    def at(self, points_mm: Array, index: NDArray[np.int64]) -> Array:
+        """Return the errors of positions (2, m) at the samples `index`, rising."""
+        out = np.empty(len(index))
+        points = np.ascontiguousarray(points_mm)
+        contour_distances(self._path, *self._tables, points, index, self._window, out)
+        return out
 
 
 def _path_tables(path: Array) -> tuple[Array, Array]:

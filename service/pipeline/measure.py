@@ -34,7 +34,7 @@ from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 from simulation.scheduled import MachineStream
 
-__all__ = ["Measurement", "MotionSamples", "Trace", "channel_names", "part_of"]
+__all__ = ["MeasuredPoints", "Measurement", "MotionSamples", "Trace", "channel_names", "part_of"]
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,15 @@ class Measurement:
     shaper : BestShaper
         The yardstick.
     compensated : bool
-        Whether there is a channel `after` beside `before` and `shaper`.
+        Whether there is a channel `after` beside `before` and `shaper`. If not, `before` is the
+        executed motion: the firmware's own shaper may be in it.
+    names : sequence of str, optional
+        Channels to measure, where it is not all of these.
+    beside : callable, optional
+        Gives the errors of the other channels at measured points, (2, n): `before` and `shaper`,
+        measured earlier (`service.pipeline.earlier`), for what is shown along the path.
+    noted : callable, optional
+        Is given measured points with their errors.
     take_layer : callable, optional
         Is given every layer as soon as it is measured; channels as `channel_names` has them.
     trace : callable, optional
@@ -96,28 +104,35 @@ class Measurement:
         shaper: BestShaper,
         *,
         compensated: bool,
+        names: tuple[str, ...] | None = None,
         take_layer: Callable[[LayerTile], None] | None = None,
         trace: Callable[[Trace], None] | None = None,
+        beside: Callable[[MeasuredPoints], Array] | None = None,
+        noted: Callable[[MeasuredPoints, Array], None] | None = None,
     ) -> None:
+        self._compensated = compensated
+        self._beside, self._noted = beside, noted
         self._stride = STRIDE if trace is None else 1
         self._tracer = None if trace is None else _Tracer(trace)
         self._dt_s = dt_s
         self._machine = machine
         self._point = EMPTY
         self._band = BandContent(machine, dt_s)
-        self._names = channel_names(compensated=compensated)
+        self._names = names or channel_names(compensated=compensated)
+        shown = channel_names(compensated=True) if beside else self._names
+        self._shown = shown
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._streams: dict[str, MachineStream] = {}
         self._shaper = _ShaperStream(shaper, dt_s)
         self._shaper_label = f"best shaper ({shaper.label})"
-        self._track = _Bins(len(self._names))
+        self._track = _Bins(len(shown))
         self._spectra = ErrorSpectra(machine, dt_s, self._names)
-        self._views = LayerViews(self._names)
+        self._views = LayerViews(shown)
         takers = [self._views.add] + ([take_layer] if take_layer else [])
-        self._tiles = LayerRecorder(len(self._names), self._stride * dt_s, takers)
+        self._tiles = LayerRecorder(len(shown), self._stride * dt_s, takers)
         self._count = 0
-        self._waiting: list[_Points] = []
+        self._waiting: list[MeasuredPoints] = []
         self._fresh = self._jumped = True
         self._last: MotionSamples | None = None
 
@@ -131,7 +146,9 @@ class Measurement:
         """Add motion."""
         if len(samples):
             self._last = part_of(samples, len(samples) - 1, len(samples))
-            points = _Points.of(samples, slice(-self._count % self._stride, None, self._stride))
+            points = MeasuredPoints.of(
+                samples, slice(-self._count % self._stride, None, self._stride)
+            )
             if len(points):
                 self._waiting.append(replace(points, jumped=self._jumped))
                 self._jumped = False
@@ -184,7 +201,11 @@ class Measurement:
             for stream in self._streams.values():
                 stream.stand()
         self._fresh = False
-        commands = {"before": shaped.path_mm, "after": shaped.executed_mm, "shaper": shaped.command}
+        commands = {
+            "before": shaped.path_mm if self._compensated else shaped.executed_mm,
+            "after": shaped.executed_mm,
+            "shaper": shaped.command,
+        }
         answers = np.stack(
             [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
         )
@@ -210,6 +231,14 @@ class Measurement:
                 self._tracer.tell(points, found)
             self._layers.add(found, moves.layer[row], points.extruding)
             self._features.add(found, moves.feature[row], points.extruding)
+            if self._noted is not None:
+                self._noted(points, found)
+            shown = found
+            if self._beside is not None:
+                before, shaper = self._beside(points)
+                shown = np.stack([before, found[0], shaper])
+                index = errors.index[done - count : done]
+                self._track.add(index, shown, self._dt_s)
             self._tiles.add(
                 points.path_mm,
                 points.z_mm,
@@ -217,10 +246,11 @@ class Measurement:
                 row,
                 moves,
                 points.first_move,
-                found,
+                shown,
                 jumped=points.jumped,
             )
-        self._track.add(errors, self._dt_s)
+        if self._beside is None:
+            self._track.add(errors.index, errors.error_mm, self._dt_s)
 
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""
@@ -252,7 +282,7 @@ class Measurement:
     def _groups(self, groups: GroupTally, names: Sequence[str] | None) -> list[GroupFigures]:
         tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
-        for key, tally in tallies["before"].items():
+        for key, tally in tallies[self._names[0]].items():
             label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
             if names is None and key < 0:
                 label = "before the first layer"
@@ -270,7 +300,7 @@ class Measurement:
         """Return the error along the print."""
         rows = self._track.rms_um()
         return Track(
-            bin_s=self._track.width_s, contour_rms_um=dict(zip(self._names, rows, strict=True))
+            bin_s=self._track.width_s, contour_rms_um=dict(zip(self._shown, rows, strict=True))
         )
 
     def layer_views(self) -> list[LayerView]:
@@ -330,7 +360,7 @@ class _Tracer:
             self._executed = np.concatenate([self._executed, executed_mm], axis=1)
             self._simulated = np.concatenate([self._simulated, simulated_mm], axis=2)
 
-    def tell(self, points: _Points, error_mm: Array) -> None:
+    def tell(self, points: MeasuredPoints, error_mm: Array) -> None:
         count = len(points)
         assert self._executed is not None
         executed, simulated = self._executed[:, :count], self._simulated[:, :, :count]
@@ -353,7 +383,7 @@ class _Tracer:
 
 
 @dataclass(frozen=True, slots=True)
-class _Points:
+class MeasuredPoints:
     """What belongs to the samples at which contour errors are measured."""
 
     path_mm: Array
@@ -365,7 +395,8 @@ class _Points:
     jumped: bool = False
 
     @classmethod
-    def of(cls, samples: MotionSamples, which: slice) -> _Points:
+    def of(cls, samples: MotionSamples, which: slice) -> MeasuredPoints:
+        """Return what belongs to some samples."""
         return cls(
             samples.path_mm[:, which].copy(),
             samples.z_mm[which].copy(),
@@ -375,8 +406,9 @@ class _Points:
             samples.first_move,
         )
 
-    def part(self, which: slice) -> _Points:
-        return _Points(
+    def part(self, which: slice) -> MeasuredPoints:
+        """Return some of the points."""
+        return MeasuredPoints(
             self.path_mm[:, which],
             self.z_mm[which],
             self.extruding[which],
@@ -458,18 +490,18 @@ class _Bins:
         self._count = np.zeros(_TRACK_BINS)
         self._used = 0
 
-    def add(self, errors: ContourErrors, dt_s: float) -> None:
-        if len(errors) == 0:
+    def add(self, index: NDArray[np.int64], error_mm: Array, dt_s: float) -> None:
+        if len(index) == 0:
             return
-        last = float(errors.index[-1]) * dt_s
+        last = float(index[-1]) * dt_s
         while last >= self.width_s * _TRACK_BINS:
             half = _TRACK_BINS // 2
             pairs = self._sum.reshape(-1, half, 2).sum(axis=2)
             self._sum = np.pad(pairs, ((0, 0), (0, half)))
             self._count = np.pad(self._count.reshape(half, 2).sum(axis=1), (0, half))
             self.width_s *= 2.0
-        at = (errors.index * (dt_s / self.width_s)).astype(np.int64)
-        for total, error in zip(self._sum, errors.error_mm, strict=True):
+        at = (index * (dt_s / self.width_s)).astype(np.int64)
+        for total, error in zip(self._sum, error_mm, strict=True):
             total += np.bincount(at, error**2, _TRACK_BINS)
         self._count += np.bincount(at, minlength=_TRACK_BINS)
         self._used = int(last / self.width_s) + 1

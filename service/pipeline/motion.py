@@ -9,10 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from gcode.containers.opening import open_text
+from gcode.dialect import Dialect
 from gcode.errors import GcodeError
 from gcode.firmware.planning import check_moves_end, check_print_ends
 from gcode.firmware.registry import kit
@@ -21,6 +23,8 @@ from gcode.sampler import Sampler, Samples
 from gcode.slicers.facts import SlicerFacts
 from gcode.types import EventKind, Moves, Phases, ProgramBlock
 from models.machine import Machine
+from models.schedule import OperatingPoint
+from models.shaping import OFF, Shaping
 from service.pipeline.clock import StageClock
 from service.pipeline.columns import npz_table
 from service.pipeline.compensating import DT_S
@@ -32,10 +36,18 @@ from service.pipeline.operating import Operation
 from service.pipeline.progress import Progress, ProgressCallback, telling
 from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from service.pipeline.result import Result, StageTime
+from service.pipeline.shaping import ShapedMotion
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
-__all__ = ["STANDING_S", "PlannedTime", "plan_file", "simulate_file"]
+__all__ = [
+    "STANDING_S",
+    "MotionPart",
+    "PlannedTime",
+    "TextMotion",
+    "plan_file",
+    "simulate_file",
+]
 
 STANDING_S = 2.0
 """How long a stand is measured: all vibration has died down after that."""
@@ -139,22 +151,33 @@ def simulate_file(
             take_layer=writer.add if writer else None,
             trace=trace,
         )
+        shaper_stream = ShapedMotion(DT_S)
+
+        def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
+            for samples, point in ready:
+                measurement.operate_at(point)
+                measurement.add(samples)
+
         for part in motion:
             if part.jumped:
+                add(shaper_stream.flush())
                 measurement.jump()
             with clock.stage("measure"):
                 samples = part.motion()
                 moves = part.own_moves()
-                measurement.operate_at(operation.at(moves))
-                measurement.add(samples)
+                add(shaper_stream.push(samples, part.shaping, operation.at(moves)))
                 operation.passed(moves)
             extruding_s += DT_S * float(np.sum(samples.extruding))
             if len(samples) > 1:
                 step = np.hypot(*np.diff(samples.path_mm))
                 peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
+        add(shaper_stream.flush())
         measurement.finish()
         if writer is not None:
             writer.finish(motion.feature_names)
+    notes = operation.notes()
+    if any(label != OFF.label for label in motion.shapers):
+        notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")
     size = source.stat().st_size
     return Result(
         version=__version__,
@@ -185,7 +208,7 @@ def simulate_file(
         put_back=[],
         put_back_extruding_share=0.0,
         warnings=[*motion.warnings, *measurement.warnings()],
-        notes=operation.notes(),
+        notes=notes,
         layers=measurement.layers(),
         features=measurement.features(motion.feature_names),
         track=measurement.track(),
@@ -196,13 +219,18 @@ def simulate_file(
 
 
 @dataclass(frozen=True, slots=True)
-class _Part:
-    """Samples with the moves they belong to; `jumped`: the position was lost before them."""
+class MotionPart:
+    """Samples with the moves they belong to.
+
+    `jumped`: the position was lost before them. `shaping`: what the file has set the firmware's
+    shaper to.
+    """
 
     samples: Samples
     moves: Moves
     first_move: int
     jumped: bool
+    shaping: Shaping
 
     def own_moves(self) -> Moves:
         """Return the moves in which the samples lie."""
@@ -227,76 +255,123 @@ class _Part:
         )
 
 
-class _Motion:
-    """Iterate over the sampled motion of a file in bounded memory."""
+class TextMotion:
+    """Iterate over the sampled motion of a text in bounded memory.
+
+    Parameters
+    ----------
+    file : binary file
+        Plain G-code, seekable; read from its beginning.
+    machine : Machine
+    dialect : Dialect
+    dt_s : float
+    longest_stand_s : float
+        What the machine stands longer is left out of the samples.
+    shaping : Shaping
+        The firmware's shaper before the first line.
+    told : callable, optional
+        Is given the share of the file that is read and the time that it takes, now and then.
+    each : callable, optional
+        Is given every block of the program before its motion.
+
+    Attributes
+    ----------
+    time_s : float
+        Time of the motion that is planned.
+    reader : Interpreter
+    shapers : list of str
+        Labels of the shapers that the file sets, each once.
+    """
 
     def __init__(
         self,
-        source: Path,
-        plate: int | None,
+        file: BinaryIO,
         machine: Machine,
-        dialect: DialectName | None,
+        dialect: Dialect,
         dt_s: float,
-        progress: ProgressCallback | None,
         *,
         longest_stand_s: float = np.inf,
+        shaping: Shaping = OFF,
+        told: Callable[[float, float], None] = lambda _share, _time_s: None,
+        each: Callable[[ProgramBlock], None] = lambda _block: None,
     ) -> None:
-        self._longest_stand_s = longest_stand_s
+        self._file, self._machine, self._dialect = file, machine, dialect
+        self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
+        self._told, self._each = told, each
         self._left_out_s = self._end_s = 0.0
-        self._source, self._plate, self._machine = source, plate, machine
-        self._dialect = dialect_for(machine, dialect)
-        self._asked = dialect
-        self._dt_s, self._progress = dt_s, progress
-        self._began = time.monotonic()
         self._held: list[tuple[int, Moves]] = []
         self._jumps: list[int] = []
         """Moves in front of which the position was lost, by their index in the file."""
+        self._shaping = self._read_shaping = shaping
+        self._changes: list[tuple[int, Shaping]] = []
+        """Moves in front of which the shaper was set, and to what."""
+        self._adviser = kit(machine).adviser(dialect)
+        self._unmodelled: set[str] = set()
+        self.shapers: list[str] = []
         self.time_s = 0.0
-        self.feature_names: list[str] = []
-        self.facts = SlicerFacts()
-        self.warnings: list[str] = []
+        self.reader = Interpreter(machine, dialect=dialect)
 
-    def __iter__(self) -> Iterator[_Part]:
-        reader = Interpreter(self._machine, dialect=self._dialect)
+    @property
+    def warnings(self) -> list[str]:
+        """What the firmware passes over, or what is not modelled."""
+        return [*passed_over(self.reader), *sorted(self._unmodelled)]
+
+    def __iter__(self) -> Iterator[MotionPart]:
+        file = self._file
         planner = kit(self._machine).planner()
         sampler = Sampler(self._dt_s)
-        self.feature_names = reader.feature_names
         moves = 0
-        unpacking = telling(self._progress, "unpacking", 0.0)
-        with open_text(self._source, plate=self._plate, told=unpacking) as container:
-            self.facts = container.facts()
-            file = container.text
-            doubtful = doubts(file, self._machine, self._asked)
-            guard = LengthGuard(file, self._machine, self._dialect)
-            size = max(file.seek(0, io.SEEK_END), 1)
-            file.seek(0)
-            while True:
-                data = file.read(_BLOCK_BYTES)
-                for block in reader.push(data) if data else reader.flush():
-                    moves += len(block.moves)
-                    self._hold(block)
-                    phases = planner.push(block)
-                    self._check(phases, planner.time_s, guard.check)
-                    for samples in sampler.push(self._shortened(phases)):
-                        yield from self._parts(samples)
-                self.time_s = planner.time_s
-                self._say(file.tell() / size)
-                if not data:
-                    break
+        guard = LengthGuard(file, self._machine, self._dialect)
+        size = max(file.seek(0, io.SEEK_END), 1)
+        file.seek(0)
+        while True:
+            data = file.read(_BLOCK_BYTES)
+            for block in self.reader.push(data) if data else self.reader.flush():
+                moves += len(block.moves)
+                self._each(block)
+                self._hold(block)
+                phases = planner.push(block)
+                self._check(phases, planner.time_s, guard.check)
+                for samples in sampler.push(self._shortened(phases)):
+                    yield from self._parts(samples)
+            self.time_s = planner.time_s
+            self._told(file.tell() / size, self.time_s)
+            if not data:
+                break
         phases = planner.flush()
         self._check(phases, planner.time_s, check_print_ends)
         for samples in chain(sampler.push(self._shortened(phases)), sampler.flush()):
             yield from self._parts(samples)
         self.time_s = planner.time_s
-        self.warnings = [*doubtful, *passed_over(reader)]
         if moves == 0:
             raise GcodeError("the file contains no moves: is it G-code?")
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):
             self._held.append((block.first_move, block.moves))
-        lost = block.events.kind == EventKind.UNKNOWN
-        self._jumps += block.events.move_index[lost].tolist()
+        events = block.events
+        lost = events.kind == EventKind.UNKNOWN
+        self._jumps += events.move_index[lost].tolist()
+        for row in np.flatnonzero(events.kind == EventKind.SHAPER).tolist():
+            self._set_shaper(block, row)
+
+    def _set_shaper(self, block: ProgramBlock, row: int) -> None:
+        events, offset = block.events, block.text_offset
+        line = block.text[int(events.byte_start[row]) - offset : int(events.byte_end[row]) - offset]
+        try:
+            found = self._adviser.read_shaper(line.decode("utf-8", "replace"), self._read_shaping)
+        except ValueError:
+            return
+        self._read_shaping = found
+        shaping = found.modelled
+        for kind in found.unknown_types:
+            self._unmodelled.add(
+                f"the shaper {kind} has no model: figures are those without it (line "
+                f"{int(events.line[row])})"
+            )
+        if shaping.label not in self.shapers:
+            self.shapers.append(shaping.label)
+        self._changes.append((int(events.move_index[row]), shaping))
 
     def _check(
         self, phases: Phases, time_s: float, check_length: Callable[[float, int], None]
@@ -319,28 +394,83 @@ class _Motion:
         self._left_out_s, self._end_s = float(left_out_s[-1]), float(end_s[-1])
         return replace(phases, t_s=phases.t_s - left_out_s)
 
-    def _parts(self, samples: Samples) -> Iterator[_Part]:
-        """Cut samples where the position is lost between two moves."""
-        begun, jumped = 0, False
-        while self._jumps and self._jumps[0] <= samples.move_index[-1]:
-            at = int(np.searchsorted(samples.move_index, self._jumps.pop(0)))
+    def _parts(self, samples: Samples) -> Iterator[MotionPart]:
+        """Cut samples where the position is lost or the shaper changes between two moves."""
+        begun, jumped, last = 0, False, int(samples.move_index[-1])
+        while True:
+            jump = self._jumps[0] if self._jumps else last + 1
+            change = self._changes[0][0] if self._changes else last + 1
+            if min(jump, change) > last:
+                break
+            at = int(np.searchsorted(samples.move_index, min(jump, change)))
             if at > begun:
                 yield self._part(samples.part(begun, at), jumped)
-            begun, jumped = at, True
+                begun, jumped = at, False
+            if jump <= change:
+                self._jumps.pop(0)
+                jumped = True
+            else:
+                self._shaping = self._changes.pop(0)[1]
         yield self._part(samples.part(begun, len(samples)), jumped)
 
-    def _part(self, samples: Samples, jumped: bool) -> _Part:
+    def _part(self, samples: Samples, jumped: bool) -> MotionPart:
         first = int(samples.move_index[0])
         while len(self._held) > 1 and self._held[1][0] <= first:
             self._held.pop(0)
-        return _Part(samples, _joined([m for _, m in self._held]), self._held[0][0], jumped)
+        moves = _joined([m for _, m in self._held])
+        return MotionPart(samples, moves, self._held[0][0], jumped, self._shaping)
 
-    def _say(self, fraction: float) -> None:
+
+class _Motion:
+    """Iterate over the sampled motion of a print file of any kind."""
+
+    def __init__(
+        self,
+        source: Path,
+        plate: int | None,
+        machine: Machine,
+        dialect: DialectName | None,
+        dt_s: float,
+        progress: ProgressCallback | None,
+        *,
+        longest_stand_s: float = np.inf,
+    ) -> None:
+        self._source, self._plate, self._machine = source, plate, machine
+        self._dialect = dialect_for(machine, dialect)
+        self._asked = dialect
+        self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
+        self._progress = progress
+        self._began = time.monotonic()
+        self.time_s = 0.0
+        self.feature_names: list[str] = []
+        self.facts = SlicerFacts()
+        self.warnings: list[str] = []
+        self.shapers: list[str] = []
+
+    def __iter__(self) -> Iterator[MotionPart]:
+        unpacking = telling(self._progress, "unpacking", 0.0)
+        with open_text(self._source, plate=self._plate, told=unpacking) as container:
+            self.facts = container.facts()
+            doubtful = doubts(container.text, self._machine, self._asked)
+            motion = TextMotion(
+                container.text,
+                self._machine,
+                self._dialect,
+                self._dt_s,
+                longest_stand_s=self._longest_stand_s,
+                told=self._say,
+            )
+            self.feature_names = motion.reader.feature_names
+            yield from motion
+        self.time_s, self.shapers = motion.time_s, motion.shapers
+        self.warnings = [*doubtful, *motion.warnings]
+
+    def _say(self, fraction: float, time_s: float) -> None:
         if self._progress is None:
             return
         elapsed = time.monotonic() - self._began
         eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
-        self._progress(Progress("planning", min(fraction, 1.0), self.time_s, elapsed, eta))
+        self._progress(Progress("planning", min(fraction, 1.0), time_s, elapsed, eta))
 
 
 def _joined(parts: list[Moves]) -> Moves:

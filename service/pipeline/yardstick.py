@@ -37,6 +37,7 @@ __all__ = [
     "BestShaper",
     "cached_shaper",
     "evaluate_shaper",
+    "shaped_at",
     "tune_each",
     "tune_shaper",
 ]
@@ -222,12 +223,19 @@ class _Trial:
         if key not in self._shaped:
             pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
             index = self._points[points].index
-            self._shaped[key] = _shaped_at(self._answer[axis], self._dt_s, pulses, index)
+            self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, index)
         return self._shaped[key]
 
 
-def _shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
-    """`shape(answer)[index]`, without the rest."""
+def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
+    """Return `shape(answer)[index]`, without the rest: what a plant answers to a shaped command.
+
+    Parameters
+    ----------
+    answer : ndarray, shape (n,)
+        Of the plant to the plan.
+    index : ndarray of int64, shape (m,)
+    """
     weights, delays = pulses
     shift = float(weights @ delays)
     last = len(answer) - 1
