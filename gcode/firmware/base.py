@@ -107,6 +107,13 @@ class Voice(Protocol):
     def shaper_on(self) -> bytes | None:
         """Lines that set it to what the machine states; None: the machine does not say."""
 
+    @property
+    def file_shaper_off(self) -> bytes:
+        """Lines that switch off a shaper that the file has set, whatever the machine states."""
+
+    def conflict(self, line: bytes) -> str | None:
+        """Return why a line must not stand in a file with a stream; None: it may."""
+
     def limits(self, limits: Limits) -> bytes:
         """Lines that set the planner's limits."""
 

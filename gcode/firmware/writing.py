@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.errors import GcodeError
 from gcode.firmware._writing_kernels import format_moves
 from gcode.firmware.base import FirmwareKit
 from gcode.firmware.encoding import Encoded
@@ -28,8 +29,11 @@ _SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 _POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")
 _EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)")
 _E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)", re.IGNORECASE)
+_NUMBERED = re.compile(rb"^\s*N\d+\s*")
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
+_NO_SHAPER = "M572"
+"""Pressure advance, which a stream has off like the shaper (RepRapFirmware)."""
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
 """32-bit floats hold a micrometre up to here."""
@@ -66,6 +70,8 @@ class StreamWriter:
         self._shaper_off = False
         self._shaper_lines: dict[bytes, bytes] = {}
         """The file's own lines, the last of each form."""
+        self._shaper_names: dict[str, tuple[int, int]] = {}
+        """Commands of the file that set a shaper: number of the first line, and how many."""
         self._at_rest = True
         self._modal: ModalState | None = None
         """What the printer's modes are now, where they may differ from the file's."""
@@ -77,6 +83,20 @@ class StreamWriter:
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set behind the last piece."""
         self.shaper_unknown = False
+
+    @property
+    def shaper_note(self) -> str | None:
+        """What became of the shapers that the file itself sets; None: it sets none."""
+        if not self._shaper_names:
+            return None
+        said = ", ".join(
+            f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
+            for name, (line, count) in self._shaper_names.items()
+        )
+        return (
+            f"The file sets the firmware's input shaper: {said}. Compensation and shaper do not "
+            "add up: in compensated stretches it is off, around them as the file sets it."
+        )
 
     def header(self) -> bytes:
         """Lines that say who processed the file, and what to mind."""
@@ -100,11 +120,22 @@ class StreamWriter:
         passage : Passage
         extruder_mm : float
             What the printer takes for E behind all that was written before.
+
+        Raises
+        ------
+        GcodeError
+            For a line that must not stand in a file with a stream.
         """
         moves, events = passage.moves, passage.events
         lead = self._off(passage, extruder_mm)
-        for row in np.flatnonzero(events.kind == EventKind.SHAPER):
+        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)):
             line = passage.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
+            conflict = self._voice.conflict(line)
+            if conflict is not None:
+                raise GcodeError(conflict, line=int(events.line[row]))
+            if events.kind[row] != EventKind.SHAPER:
+                continue
+            self._note_shaper(line, int(events.line[row]))
             form = _VALUE.sub(b"", line.split(b";", 1)[0])
             others = {k: text for k, text in self._shaper_lines.items() if k != form}
             self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
@@ -306,6 +337,14 @@ class StreamWriter:
         self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
+    def _note_shaper(self, line: bytes, number: int) -> None:
+        words = _NUMBERED.sub(b"", line).split()
+        name = words[0].decode("ascii", "replace").upper() if words else ""
+        if name.startswith(_NO_SHAPER):
+            return
+        first, count = self._shaper_names.get(name, (number, 0))
+        self._shaper_names[name] = (first, count + 1)
+
     def _on(self, piece: Piece, limits: Limits) -> bytes:
         """Lines before the first segment of a piece."""
         parts: list[bytes] = []
@@ -313,8 +352,11 @@ class StreamWriter:
             parts.append(self._voice.stand_still)
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
-            if not self._shaper_off and self._voice.shaper_off:
-                parts.append(self._voice.shaper_off)
+            off = self._voice.shaper_off
+            if not off and self._shaper_lines:
+                off = self._voice.file_shaper_off
+            if not self._shaper_off and off:
+                parts.append(off)
                 self._shaper_off = True
             parts.append(self._voice.limits(limits))
             self._limits_now = limits

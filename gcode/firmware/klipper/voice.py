@@ -29,6 +29,7 @@ class KlipperVoice:
     coarse_extruder = False
     one_command = True
     shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"
+    file_shaper_off = shaper_off
 
     def __init__(self, firmware: Klipper) -> None:
         self._shaper = firmware.shaper
@@ -44,6 +45,10 @@ class KlipperVoice:
             f"DAMPING_RATIO_X={s.damping_x:g} SHAPER_TYPE_Y={s.type_y} "
             f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
         ).encode()
+
+    def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
+        """Return None: nothing of Klipper's own stands in the way."""
+        return None
 
     def limits(self, limits: Limits) -> bytes:
         """Return the line that sets the planner's limits."""

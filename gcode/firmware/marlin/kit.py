@@ -70,6 +70,12 @@ class MarlinKit:
                 "too late by that; install release 2.1.2 and say so in `variant`, or "
                 + _ALTERNATIVE
             )
+        if firmware.ft_motion:
+            return (
+                "fixed-time motion (ft_motion, M493) has a planner of its own, which would smooth "
+                "a stream; build without FT_MOTION, or switch it off (M493 S0) and say so in "
+                "`ft_motion`, or use --method advise, which sets its shaper"
+            )
         if firmware.board == "avr":
             return (
                 "an 8-bit board computes step rates in 16 bits and takes some hundred segments a "

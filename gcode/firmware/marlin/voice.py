@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import cast
 
 from gcode.firmware.marlin.limits import MarlinLimits
@@ -9,6 +10,9 @@ from gcode.types import Limits
 from models.firmware import Marlin
 
 __all__ = ["MarlinVoice"]
+
+_FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*[A-Z]", re.IGNORECASE)
+_FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0*(?![\d.])", re.IGNORECASE)
 
 
 class MarlinVoice:
@@ -27,6 +31,7 @@ class MarlinVoice:
     positioning_sets_extruder = True
     coarse_extruder = True
     one_command = True
+    file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:
         self._shaper = firmware.shaper
@@ -51,6 +56,15 @@ class MarlinVoice:
         return (
             f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\nM593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
         ).encode()
+
+    def conflict(self, line: bytes) -> str | None:
+        """Return why not, for a line that switches fixed-time motion on."""
+        if not _FIXED_TIME.match(line) or _FIXED_TIME_OFF.match(line):
+            return None
+        return (
+            "M493 sets fixed-time motion, whose planner and shapers would work on top of the "
+            "compensation; take it out of the start code (M493 S0 is fine), or use --method advise"
+        )
 
     def limits(self, limits: Limits) -> bytes:
         """Return the lines that set the planner's limits."""

@@ -42,10 +42,15 @@ class RepRapVoice:
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:
         shaper = firmware.shaper
         self.shaper_off = b'M593 P"none"\n' + _advance(0.0)
+        self.file_shaper_off = self.shaper_off
         restored = 'M593 P"none"\n'
         if shaper.type != "none":
             restored = f'M593 P"{shaper.type}" F{shaper.freq_hz:g} S{shaper.damping:g}\n'
         self.shaper_on: bytes | None = restored.encode() + _advance(pressure_advance_s)
+
+    def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
+        """Return None: nothing of RepRapFirmware's own stands in the way."""
+        return None
 
     def limits(self, limits: Limits) -> bytes:
         """Lines that set the planner's limits for the moves behind them, M572 left out."""
