@@ -15,6 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from service import commands_serve
+from service.advice import register as register_advice
 from service.backup import commands as backup
 from service.controllers import commands as controllers
 from service.deliveries import commands as deliveries
@@ -48,7 +49,8 @@ _WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
 _METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
     "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
-    "it undoes the machine's ripple too"
+    "it undoes the machine's ripple too; or advise: leave all moves as they are and add firmware "
+    "commands for shaper and acceleration"
 )
 
 Input = Annotated[
@@ -315,6 +317,7 @@ proof.register(app)
 controllers.register(app)
 scanning.register(app)
 register_trajectories(app)
+register_advice(app)
 security.register(app)
 farm.register(app)
 commands_serve.register(app)

@@ -91,6 +91,7 @@ _SETTINGS: dict[str, dict[str, Any]] = {
             "shaper:ei": "shaper: ei",
             "shaper:2hump_ei": "shaper: 2hump_ei",
             "shaper:3hump_ei": "shaper: 3hump_ei",
+            "advise": "advise (moves stay)",
             "none": "none",
         },
         "default_value": "fbf",

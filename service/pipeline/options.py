@@ -34,6 +34,7 @@ class Options(BaseModel):
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
     with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
+    `advise` leaves every move as it is and adds firmware commands (`service.pipeline.advising`).
     `basis`, `robust` and `along` are settings of `fbf`: `along` is the weight of the error along
     the path against that across it (None: as suits `robust`). `plate` chooses one of several in a
     3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
@@ -48,8 +49,8 @@ class Options(BaseModel):
     method: Annotated[
         str,
         Field(
-            pattern=r"^(fbf|npz-ignore|zmetc|zpetc|ebzpetc|ts|none"
-            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))(\+ripple)?$"
+            pattern=r"^(advise|(fbf|npz-ignore|zmetc|zpetc|ebzpetc|ts|none"
+            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))(\+ripple)?)$"
         ),
     ] = "fbf"
     basis: BasisName = "ce-opt"

@@ -15,7 +15,7 @@ const METHODS = [
   ["", [["fbf", "Compensate"]]],
   ["Approximate inverses", [["zpetc", "ZPETC"], ["ebzpetc", "Extended-bandwidth ZPETC"], ["ts", "Truncated series"], ["zmetc", "ZMETC"], ["npz-ignore", "NPZ-ignore"]]],
   ["Firmware shapers", [["shaper:zv", "ZV"], ["shaper:mzv", "MZV"], ["shaper:ei", "EI"], ["shaper:2hump_ei", "2-hump EI"], ["shaper:3hump_ei", "3-hump EI"]]],
-  ["", [["none", "None: measure only"]]],
+  ["", [["advise", "Advise: moves stay, firmware commands are added"], ["none", "None: measure only"]]],
 ];
 const DIALECTS = [["", "As the machine's firmware reads it"], ["klipper", "Klipper"], ["marlin", "Marlin"], ["prusa", "Prusa"], ["bambu", "Bambu"], ["reprapfirmware", "RepRapFirmware"]];
 

@@ -1,0 +1,506 @@
+"""Advise a print file: its moves stay, and firmware commands for shaper and acceleration come in.
+
+The file is measured as it came, samples of it are tried, the choice is written, and what was
+written is read and measured again: by the firmware's rules, with the firmware's own shaper as the
+written lines set it. Where a feature exceeds its bound there, it is made slower and written anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from gcode.containers.opening import open_text, rewriting
+from gcode.errors import GcodeError
+from gcode.firmware.registry import kit
+from gcode.interpreter import Interpreter
+from gcode.slicers.facts import SlicerFacts
+from gcode.types import EventKind, Moves, ProgramBlock
+from models.machine import Machine
+from models.operating import OperatingGrid
+from models.schedule import EMPTY, OperatingPoint
+from models.shaping import OFF
+from service.pipeline.advising.choosing import LEVEL_STEP, Choice, choose
+from service.pipeline.advising.earlier import EarlierErrors
+from service.pipeline.advising.inserting import MARK, AdviceWriter
+from service.pipeline.clock import StageClock
+from service.pipeline.compensating import DT_S
+from service.pipeline.files import default_cache_dir, replacing
+from service.pipeline.layer_files import LayerWriter, written_layers
+from service.pipeline.measure import STRIDE, Measurement, MotionSamples, channel_names
+from service.pipeline.motion import STANDING_S, TextMotion
+from service.pipeline.operating import Operation
+from service.pipeline.options import Options
+from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.reading import dialect_for, doubts
+from service.pipeline.result import (
+    AdviceFigures,
+    AdvisedFeature,
+    AdvisedShaper,
+    AxisSpectrum,
+    GroupFigures,
+    Result,
+    StageTime,
+)
+from service.pipeline.samples import take_samples
+from service.pipeline.set_errors import ClassError, SetErrors
+from service.pipeline.shaping import ShapedMotion
+from service.pipeline.yardstick import cached_shaper
+from service.version import __version__
+
+__all__ = ["advise_file"]
+
+_BLOCK_BYTES = 1 << 17
+_COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
+_ROUNDS = 6
+_TOLERANCE = 1.001
+_UNDO = (
+    f"Moves are untouched, and so are the slicer's times in the file; deleting the lines that hold "
+    f"{MARK.decode()!r} gives back the original."
+)
+
+
+def advise_file(
+    source: Path,
+    target: Path,
+    machine: Machine,
+    options: Options,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+    layers: Path | None = None,
+) -> Result:
+    """Write a file with advice.
+
+    Parameters and errors are those of `service.pipeline.road.compensate_file`. The slicer's times
+    in the file stay as they are, whatever `options.times` says: only lines of our own are added.
+    """
+    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    with (
+        contextlib.ExitStack() as files,
+        replacing(target) as temporary,
+        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+    ):
+        writer = None
+        with (
+            rewriting(container, temporary, name=target, told=packing) as text,
+            tempfile.TemporaryFile(dir=target.parent) as spool,
+            EarlierErrors(target.parent, 2) as earlier,
+        ):
+            if layers is not None:
+                names = channel_names(compensated=True)
+                writer = files.enter_context(written_layers(layers, names))
+            job = _Job(container.text, spool, machine, options, cache_dir, progress)
+            result = job.run(source.name, container.facts(), earlier, writer)
+            spool.seek(0)
+            shutil.copyfileobj(spool, text, _BLOCK_BYTES)
+        sizes = {
+            "original_bytes": source.stat().st_size,
+            "written_bytes": temporary.stat().st_size,
+        }
+        return result.model_copy(update=sizes)
+
+
+class _Job:
+    """One file on its way."""
+
+    def __init__(
+        self,
+        source: BinaryIO,
+        spool: BinaryIO,
+        machine: Machine,
+        options: Options,
+        cache_dir: Path | None,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._source, self._spool = source, spool
+        self._machine, self._options = machine, options
+        self._progress, self._began = progress, time.monotonic()
+        self._clock = StageClock()
+        self._kit = kit(machine)
+        self._dialect = dialect_for(machine, options.dialect)
+        self._adviser = self._kit.adviser(self._dialect)
+        stated = self._adviser.stated or OFF
+        self._before, self._unmodelled = stated.modelled, stated.unknown_types
+        self._doubts = doubts(source, machine, options.dialect)
+        self._say("tuning the yardstick", 0.0)
+        with self._clock.stage("yardstick"):
+            self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+
+    def run(
+        self, name: str, facts: SlicerFacts, earlier: EarlierErrors, layers: LayerWriter | None
+    ) -> Result:
+        machine, options = self._machine, self._options
+        original = Measurement(machine, DT_S, self._shaper, compensated=False, noted=earlier.note)
+        before = SetErrors(machine, DT_S, stride=STRIDE)
+        levels = _Levels(machine)
+        with self._clock.stage("measure the original"):
+            asked = self._go(
+                self._source, [original, before], "measuring the original", (0.0, 0.25), levels.see
+            )
+        was = before.errors()
+        names = asked.reader.feature_names
+        with self._clock.stage("choose"):
+            self._source.seek(0)
+            samples = take_samples(self._source, machine, self._dialect)
+            choice = choose(
+                samples,
+                names,
+                machine,
+                self._adviser,
+                self._before,
+                options.budget_um,
+                levels.table,
+                lambda share: self._say("choosing", 0.3 + 0.3 * share),
+            )
+        with self._clock.stage("verify"):
+            writer, now = self._settled(choice, was, samples.first_layer)
+        earlier.rewind()
+        advised = Measurement(
+            machine,
+            DT_S,
+            self._shaper,
+            compensated=True,
+            names=("after",),
+            take_layer=layers.add if layers else None,
+            beside=earlier.at,
+        )
+        with self._clock.stage("measure"):
+            written = self._go(self._spool, [advised], "measuring", (0.8, 1.0), lambda _: None)
+        if layers is not None:
+            layers.finish(names)
+        self._say("done", 1.0)
+        figures = self._figures(choice, names, was, now, writer.lines)
+        return self._result(name, facts, asked, written, original, advised, figures, writer)
+
+    def _settled(
+        self, choice: Choice, was: dict[int, ClassError], first_layer: int
+    ) -> tuple[AdviceWriter, dict[int, ClassError]]:
+        """Write and measure until every feature is within its bound or at its slowest."""
+        for attempt in range(_ROUNDS):
+            writer = self._write(choice, first_layer)
+            after = SetErrors(self._machine, DT_S, stride=STRIDE)
+            self._go(self._spool, [after], "verifying", (0.6 + 0.03 * attempt, 0.8), lambda _: None)
+            now = after.errors()
+            over = {
+                f: now[f].rms_um / self._bound_um(f, was)
+                for f in choice.rung
+                if f in now and now[f].rms_um > _TOLERANCE * self._bound_um(f, was)
+            }
+            if attempt + 1 == _ROUNDS or not over or not choice.mended(over):
+                break
+        return writer, now
+
+    def _bound_um(self, feature: int, was: dict[int, ClassError]) -> float:
+        if self._options.budget_um is not None:
+            return self._options.budget_um
+        return max(was[feature].rms_um, 1e-3) if feature in was else np.inf
+
+    def _write(self, choice: Choice, first_layer: int) -> AdviceWriter:
+        """Write the advised text to the spool."""
+        reader = Interpreter(self._machine, dialect=self._dialect)
+        writer = AdviceWriter(
+            self._adviser,
+            choice.advice(first_layer),
+            reader.feature_names,
+            self._kit.initial_limits(),
+            self._stamp(),
+        )
+        out = self._spool
+        out.seek(0)
+        out.truncate()
+        self._source.seek(0)
+        header = writer.header()
+        while data := self._source.read(_BLOCK_BYTES):
+            for block in reader.push(data):
+                text = writer.block(block)
+                at = _first_command(text) if header else -1
+                if at >= 0:
+                    text, header = text[:at] + header + text[at:], b""
+                out.write(text)
+        rest = reader.flush()
+        # Behind a line without an end nothing can be added: the end comes before it.
+        out.write(header + writer.end())
+        for block in rest:
+            out.write(block.text)
+        out.seek(0)
+        return writer
+
+    def _go(
+        self,
+        file: BinaryIO,
+        sinks: Sequence[Measurement | SetErrors],
+        stage: str,
+        shares: tuple[float, float],
+        each: Callable[[ProgramBlock], None],
+    ) -> TextMotion:
+        """Measure the motion of a text."""
+        low, high = shares
+        motion = TextMotion(
+            file,
+            self._machine,
+            self._dialect,
+            DT_S,
+            longest_stand_s=STANDING_S,
+            shaping=self._before,
+            told=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
+            each=each,
+        )
+        operation, shaper = Operation(self._machine), ShapedMotion(DT_S)
+        for part in motion:
+            if part.jumped:
+                _add(shaper.flush(), sinks)
+                for sink in sinks:
+                    sink.jump()
+            moves = part.own_moves()
+            _add(shaper.push(part.motion(), part.shaping, operation.at(moves)), sinks)
+            operation.passed(moves)
+        _add(shaper.flush(), sinks)
+        for sink in sinks:
+            sink.finish()
+        self._notes = operation.notes()
+        return motion
+
+    def _stamp(self) -> str:
+        options = self._options.model_dump_json(exclude={"plate"})
+        settings = hashlib.sha256(options.encode()).hexdigest()[:8]
+        return (
+            f"{__version__} machine={self._machine.name} model={self._machine.revision} "
+            f"method=advise settings={settings}"
+        )
+
+    def _say(self, stage: str, fraction: float, print_s: float = 0.0) -> None:
+        if self._progress is None:
+            return
+        elapsed = time.monotonic() - self._began
+        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
+        self._progress(Progress(stage, min(fraction, 1.0), print_s, elapsed, eta))
+
+    def _figures(
+        self,
+        choice: Choice,
+        names: Sequence[str],
+        was: dict[int, ClassError],
+        now: dict[int, ClassError],
+        lines: int,
+    ) -> AdviceFigures:
+        bounds = choice.bounds()
+        features = []
+        for f, error in sorted(now.items()):
+            if f not in was:
+                continue
+            bound = bounds.get(f)
+            limit = self._bound_um(f, was) if f in choice.rung else None
+            features.append(
+                AdvisedFeature(
+                    name=names[f] if f >= 0 else "unnamed",
+                    accel_mm_s2=bound.at_least if bound else None,
+                    bound_um=None if limit is None or np.isinf(limit) else limit,
+                    within_bound=limit is None or error.rms_um <= _TOLERANCE * limit,
+                    before_um=was[f].rms_um,
+                    after_um=error.rms_um,
+                    before_s=round(was[f].seconds, 3),
+                    after_s=round(error.seconds, 3),
+                )
+            )
+        return AdviceFigures(
+            before_shaper=self._before.label,
+            shapers=[AdvisedShaper(layer=n, label=s.label) for n, s in choice.shapers],
+            features=features,
+            lines=lines,
+        )
+
+    def _warnings(self, figures: AdviceFigures, writer: AdviceWriter) -> list[str]:
+        found = [
+            f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
+            "as it came are those without it."
+            for kind in self._unmodelled
+        ]
+        if not self._adviser.shapers:
+            found.append(
+                "No shaper is advised: the machine does not say that its firmware has one "
+                "(firmware.shaper)."
+            )
+        if writer.shaper_left:
+            found.append(
+                "The printer's own shaper is not known (firmware.shaper in the machine): the one "
+                "advised stays in force after the print, until the firmware restarts."
+            )
+        return found + [
+            f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
+            f"{feature.bound_um:.1f} um it may have; no acceleration that it may be given would do."
+            for feature in figures.features
+            if not feature.within_bound
+        ]
+
+    def _result(
+        self,
+        name: str,
+        facts: SlicerFacts,
+        asked: TextMotion,
+        written: TextMotion,
+        original: Measurement,
+        advised: Measurement,
+        figures: AdviceFigures,
+        writer: AdviceWriter,
+    ) -> Result:
+        machine, names = self._machine, asked.reader.feature_names
+        before, shaper = original.channels()
+        if self._before.is_on or any(label != OFF.label for label in asked.shapers):
+            before = before.model_copy(update={"label": "as sliced, with the firmware's shaper"})
+        after = advised.channels()[0].model_copy(update={"label": "advised"})
+        features = _merged(original.features(names), advised.features(names))
+        return Result(
+            version=__version__,
+            machine=machine.name,
+            machine_title=machine.title,
+            machine_revision=machine.revision,
+            settings=self._options.model_dump(exclude_none=True),
+            source_name=name,
+            channels=[before, after, shaper],
+            best_shaper=self._shaper.label,
+            original_time_s=asked.time_s,
+            time_s=written.time_s,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
+            original_bytes=0,
+            written_bytes=0,
+            segments=0,
+            segments_per_s=0.0,
+            peak_segments_per_s=0.0,
+            peak_velocity_mm_s=0.0,
+            peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
+            emission_rms_um=0.0,
+            emission_max_um=0.0,
+            filament_error_mm=0.0,
+            compensated_s=0.0,
+            extruding_s=sum(group.seconds for group in features),
+            pieces=0,
+            put_back=[],
+            put_back_extruding_share=0.0,
+            warnings=[
+                *self._doubts,
+                *asked.warnings,
+                *self._warnings(figures, writer),
+                *advised.warnings(),
+            ],
+            notes=[*self._notes, _UNDO],
+            layers=_merged(original.layers(), advised.layers()),
+            features=features,
+            track=advised.track(),
+            spectra=_merged_spectra(original.spectra(), advised.spectra()),
+            layer_views=advised.layer_views(),
+            advice=figures,
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+        )
+
+
+def _first_command(text: bytes) -> int:
+    """Return where the first line begins that is no comment: what slicers say comes before it."""
+    found = _COMMAND.search(text)
+    return found.start() if found else -1
+
+
+class _Levels:
+    """Where the machine is from which layer on, as far as its plants notice."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._follows = bool(machine.schedules)
+        self._operation = Operation(machine)
+        self._grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
+        self._layer: int | None = None
+        self._level: OperatingPoint | None = None
+        self.table: list[tuple[int, OperatingPoint]] = [(-1, EMPTY)]
+
+    def see(self, block: ProgramBlock) -> None:
+        """Take note of a block; refuse a file that was processed, or could not be restored."""
+        stamps = np.flatnonzero(block.events.kind == EventKind.STAMP)
+        if len(stamps):
+            raise GcodeError(
+                "this file was already processed by stillpath; advise the original",
+                line=int(block.events.line[stamps[0]]),
+            )
+        if MARK in block.text:
+            raise GcodeError(
+                f"the file has lines with {MARK.decode()!r}, so that advice could not be undone; "
+                "take them out (stillpath remove-advice) first"
+            )
+        if not self._follows or len(block.moves) == 0:
+            return
+        edges = np.flatnonzero(np.diff(block.moves.layer)) + 1
+        for first, last in pairwise([0, *edges.tolist(), len(block.moves)]):
+            moves = _rows(block.moves, first, last)
+            point, layer = self._operation.at(moves), int(moves.layer[0])
+            self._operation.passed(moves)
+            if layer == self._layer:
+                continue
+            level = self._grid.level(point)
+            if level != self._level:
+                self._level = level
+                if self._layer is None:
+                    self.table = [(layer, point)]
+                else:
+                    self.table.append((layer, point))
+            self._layer = layer
+
+
+def _rows(moves: Moves, first: int, last: int) -> Moves:
+    return Moves(**{f.name: getattr(moves, f.name)[first:last] for f in fields(moves)})
+
+
+def _add(
+    ready: Iterator[tuple[MotionSamples, OperatingPoint]], sinks: Sequence[Measurement | SetErrors]
+) -> None:
+    for samples, point in ready:
+        for sink in sinks:
+            sink.operate_at(point)
+            if isinstance(sink, Measurement):
+                sink.add(samples)
+            else:
+                feature = samples.moves.feature[samples.row]
+                sink.add(samples.path_mm, samples.executed_mm, samples.extruding, feature)
+
+
+def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> list[GroupFigures]:
+    """Put the figures of both files side by side."""
+    known = {group.name: group for group in after}
+    out = []
+    for group in before:
+        other = known.get(group.name)
+        if other is None:
+            continue
+        out.append(
+            GroupFigures(
+                name=group.name,
+                seconds=other.seconds,
+                contour_rms_um=_in_order(group.contour_rms_um | other.contour_rms_um),
+                contour_max_um=_in_order(group.contour_max_um | other.contour_max_um),
+            )
+        )
+    return out
+
+
+def _in_order(values: dict[str, float]) -> dict[str, float]:
+    return {n: values[n] for n in channel_names(compensated=True) if n in values}
+
+
+def _merged_spectra(
+    before: Sequence[AxisSpectrum], after: Sequence[AxisSpectrum]
+) -> list[AxisSpectrum]:
+    out = []
+    for one, other in zip(before, after, strict=False):
+        values = one.um_per_sqrt_hz | other.um_per_sqrt_hz
+        ordered = {n: values[n] for n in channel_names(compensated=True) if n in values}
+        out.append(one.model_copy(update={"um_per_sqrt_hz": ordered}))
+    return out

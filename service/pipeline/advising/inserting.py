@@ -1,0 +1,204 @@
+"""The advised file: the lines of the original, and between them lines of our own.
+
+Every line of our own stands by itself and carries `MARK`. Whoever deletes the lines with the mark
+has the original, byte for byte.
+
+The file's own commands keep their meaning. Where it sets an acceleration, or a shaper, ours is set
+again behind; before lines that may do anything (homing, macros, pauses, a change of tool) the
+printer gets back what the file has set, and behind them ours again.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from gcode.firmware.base import Adviser
+from gcode.slicers.features import feature_of
+from gcode.types import EventKind, Limits, ProgramBlock
+from models.shaping import Shaping
+from service.pipeline.advising.advice import Advice, wanted_accel
+
+__all__ = ["MARK", "AdviceWriter"]
+
+MARK = b"; stillpath advise"
+"""Every inserted line holds it, and no line of a file that is advised."""
+
+_VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
+_HEEDED = np.array([EventKind.LIMITS, EventKind.UNKNOWN, EventKind.SHAPER])
+
+
+class AdviceWriter:
+    """Write a file with advice.
+
+    Parameters
+    ----------
+    adviser : Adviser
+    advice : Advice
+    names : list of str
+        The reader's names of features; it may grow.
+    initial : Limits
+        Before the first line.
+    stamp : str
+        Says who processed the file.
+
+    Attributes
+    ----------
+    lines : int
+        Lines of our own.
+    shaper_left : bool
+        At the end nobody knew what the printer's shaper was before: ours stays.
+    """
+
+    def __init__(
+        self, adviser: Adviser, advice: Advice, names: list[str], initial: Limits, stamp: str
+    ) -> None:
+        self._adviser, self._advice, self._names, self._stamp = adviser, advice, names, stamp
+        self._file = adviser.accel_mm_s2(initial)
+        """Acceleration that the file has set."""
+        self._now: float | None = self._file
+        """What the printer has; None: nobody knows."""
+        self._layer = -1
+        self._shaper: Shaping | None = None
+        """The shaper of ours that is in force; None: another, or nobody knows."""
+        self._shaped = False
+        self._own_shaper: dict[bytes, bytes] = {}
+        """The file's own lines that set a shaper, the last of each form."""
+        self._rests = True
+        self.lines = 0
+        self.shaper_left = False
+
+    def header(self) -> bytes:
+        """Lines that say who processed the file, and how to undo it."""
+        return self.footer() + self._line(
+            b"", "without the lines that hold this mark, the file is as it came"
+        )
+
+    def footer(self) -> bytes:
+        """Line that says who processed the file."""
+        self.lines += 1
+        return f"; Processed by stillpath {self._stamp} ".encode() + MARK + b"\n"
+
+    def block(self, block: ProgramBlock) -> bytes:
+        """Return the text of a block with the lines that belong into it."""
+        parts: list[bytes] = []
+        done = 0
+        for at, is_move, row in self._places(block):
+            lead = self._move(block, row) if is_move else self._event(block, row)
+            if lead:
+                parts += [block.text[done:at], lead]
+                done = at
+        parts.append(block.text[done:])
+        return b"".join(parts)
+
+    def end(self) -> bytes:
+        """Return lines that give the printer back, at the end of the file."""
+        text = self._give_back()
+        if not self._shaped:
+            return text + self.footer()
+        stated = self._adviser.stated
+        if self._own_shaper:
+            lines = tuple(self._own_shaper.values())
+            if stated is not None:
+                lines = (*self._adviser.shaper_lines(stated), *lines)
+        elif stated is not None:
+            lines = self._adviser.shaper_lines(stated)
+        else:
+            self.shaper_left = True
+            lines = ()
+        for line in lines:
+            text += self._line(line, "the printer's own shaper")
+        return text + self.footer()
+
+    def _places(self, block: ProgramBlock) -> list[tuple[int, bool, int]]:
+        """Return where lines may be needed: offset in the text, whether a move, and its row."""
+        moves, events, start = block.moves, block.events, block.text_offset
+        heeded = np.flatnonzero(np.isin(events.kind, _HEEDED))
+        places = [(int(events.byte_start[k]) - start, False, k) for k in heeded.tolist()]
+        if len(moves):
+            self._wanted, self._theirs = wanted_accel(
+                moves, block.limits, self._advice, self._adviser
+            )
+            due = np.zeros(len(moves), dtype=bool)
+            due[0] = True
+            # NaN is never equal: one of a row of travels is enough.
+            key = np.where(np.isnan(self._wanted), -1.0, self._wanted)
+            due[1:] = (key[1:] != key[:-1]) | (moves.layer[1:] != moves.layer[:-1])
+            due[1:] |= moves.limits_id[1:] != moves.limits_id[:-1]
+            after = events.move_index[heeded] - block.first_move
+            due[after[after < len(moves)]] = True
+            # Of the pieces of an arc only the first has a line before it.
+            due[1:] &= moves.byte_start[1:] != moves.byte_start[:-1]
+            rows = np.flatnonzero(due).tolist()
+            places += [(int(moves.byte_start[k]) - start, True, k) for k in rows]
+        return sorted(places)
+
+    def _event(self, block: ProgramBlock, row: int) -> bytes:
+        events = block.events
+        kind = int(events.kind[row])
+        first, last = (
+            int(events.byte_start[row]) - block.text_offset,
+            int(events.byte_end[row]) - block.text_offset,
+        )
+        line = block.text[first:last]
+        lead = b""
+        if kind == EventKind.UNKNOWN:
+            lead = self._give_back()
+            self._now, self._shaper, self._rests = None, None, True
+        elif kind == EventKind.SHAPER:
+            code = line.split(b";", 1)[0].strip()
+            form = _VALUE.sub(b"", code.upper())
+            self._own_shaper = {k: v for k, v in self._own_shaper.items() if k != form}
+            self._own_shaper[form] = code
+            self._shaper, self._rests = None, True
+        self._file = self._adviser.accel_mm_s2(block.limits[int(events.limits_id[row])])
+        if kind == EventKind.LIMITS and self._sets_accel(line):
+            self._now = self._file
+        return lead
+
+    def _move(self, block: ProgramBlock, row: int) -> bytes:
+        wanted, self._file = float(self._wanted[row]), float(self._theirs[row])
+        self._layer = int(block.moves.layer[row])
+        prints = not np.isnan(wanted)
+        lead = self._set_shaper(prints)
+        self._rests = False
+        if prints:
+            unknown_but_theirs = self._now is None and wanted == self._file
+            if self._now != wanted and not unknown_but_theirs:
+                lead += self._accel(wanted, self._title(int(block.moves.feature[row])))
+        elif not self._adviser.travel_apart and self._now is not None and self._now < self._file:
+            # Travel is not made slower than the file has it.
+            lead += self._accel(self._file, "travel")
+        return lead
+
+    def _set_shaper(self, prints: bool) -> bytes:
+        """Set the shaper of the layer, where the machine rests or nothing is printed."""
+        wanted = self._advice.shaping(self._layer)
+        if wanted is None or wanted == self._shaper or (prints and not self._rests):
+            return b""
+        self._shaper, self._shaped = wanted, True
+        layer = f" from layer {self._layer} on" if self._layer > 0 else ""
+        lines = self._adviser.shaper_lines(wanted)
+        return b"".join(self._line(line, f"shaper{layer}") for line in lines)
+
+    def _give_back(self) -> bytes:
+        """Set the acceleration that the file has set."""
+        if self._now is None or self._now == self._file:
+            return b""
+        return self._accel(self._file, "as the file has it")
+
+    def _accel(self, accel_mm_s2: float, why: str) -> bytes:
+        self._now = accel_mm_s2
+        return b"".join(self._line(line, why) for line in self._adviser.accel_lines(accel_mm_s2))
+
+    def _line(self, code: bytes, why: str) -> bytes:
+        self.lines += 1
+        return code + (b" " if code else b"") + MARK + f": {why}\n".encode()
+
+    def _title(self, feature: int) -> str:
+        found = feature_of(self._names[feature]) if feature >= 0 else None
+        return found.value if found is not None else "print"
+
+    def _sets_accel(self, line: bytes) -> bool:
+        return self._adviser.sets_accel(line.decode("utf-8", "replace"))
