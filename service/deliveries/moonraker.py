@@ -128,6 +128,8 @@ def _result(printer: Printer, path: str) -> dict[str, Any]:
         told = None
     if reply.status == 503:
         raise NotReady(f"Klipper is away: {_reason(told) or 'Moonraker answers 503'}")
+    if reply.status == 404:  # Klipper brings these places along when it connects
+        raise NotReady("Klipper is not connected, or there is no Moonraker (404 Not Found)")
     result = told.get("result") if isinstance(told, dict) else None
     if reply.status != 200 or not isinstance(result, dict):
         raise Unanswered(
