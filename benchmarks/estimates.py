@@ -27,6 +27,7 @@ from models.firmware.marlin import Marlin, MarlinPlanner, PerAxis, PerAxisLimit
 from models.machine import AxisTravel, Machine
 from models.store import load_machine
 
+GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"
 _REASONS = {
     "Cura": "Cura's limits are settings of the printer and not in the file",
     "KISSlicer": "KISSlicer's limits are not in the file",
@@ -58,7 +59,7 @@ def marlin(facts: SlicerFacts) -> Machine:
     )
     firmware = Marlin(planner=planner, junction="classic_jerk", slowdown=False)
     wide = {axis: AxisTravel(min_mm=-5000, max_mm=5000) for axis in ("x", "y", "z")}
-    machine = load_machine("klipper-golden")
+    machine = load_machine(GOLDEN)
     return machine.model_copy(update={"firmware": firmware, "travel": wide})
 
 

@@ -18,6 +18,7 @@ from gcode.types import Phases
 from models.machine import Machine
 from models.store import load_machine
 
+GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"
 _COLUMNS = "t accel_t cruise_t decel_t start_x start_y start_z r_x r_y r_z start_v cruise_v accel"
 _OTHER_LIMITS = {
     "max_accel_mm_s2": 10_000.0,
@@ -30,7 +31,7 @@ _LIMIT = 1e-6
 
 def machine_for(name: str) -> Machine:
     """Return the machine of an archive; `__a10000_scv8_mcr0` says other limits."""
-    machine = load_machine("klipper-golden")
+    machine = load_machine(GOLDEN)
     if "__" not in name:
         return machine
     planner = machine.firmware.planner.model_copy(update=_OTHER_LIMITS)

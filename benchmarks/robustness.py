@@ -37,6 +37,7 @@ from simulation.response import response
 Array = NDArray[np.float64]
 Figure = Callable[[Array], float]
 
+GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"
 DT = 1e-3
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24")
 METHODS = ("off", "ensemble/1", "ensemble", "minimax")
@@ -148,7 +149,7 @@ def _machine(nominal: ModesSpec, spread: float) -> Machine:
     """Return a machine with the same plant on both axes and five members of scaled frequency."""
     scale = tuple(1.0 + spread * share for share in (-1.0, -0.5, 0.0, 0.5, 1.0))
     axis = PlantSetSpec(nominal=nominal, members=ParametricMembers(frequency_scale=scale))
-    return load_machine("klipper-golden").model_copy(update={"axes": {"x": axis, "y": axis}})
+    return load_machine(GOLDEN).model_copy(update={"axes": {"x": axis, "y": axis}})
 
 
 def _figures() -> Path2:
@@ -159,7 +160,7 @@ def _motion(name: str, shared: Path | None, seconds: float) -> Path2:
     """Plan the longest section of a file and take its first part, up to where it moves slowest."""
     with tempfile.TemporaryDirectory(prefix="stillpath-robustness-") as folder:
         file = plain_copy(find_input(name, shared), Path(folder))
-        motion = read_motion(file, load_machine("klipper-golden"))
+        motion = read_motion(file, load_machine(GOLDEN))
     section = max(Own.sections(motion), key=lambda s: s.samples)
     position, extruding = section.path(0, min(section.samples, round(seconds / DT_S)))
     every = round(DT / DT_S)

@@ -28,7 +28,7 @@ def machine() -> Machine:
         nominal=ModesSpec(modes=(Mode(f_hz=45.0, zeta=0.05),)),
         members=ParametricMembers(frequency_scale=scale),
     )
-    return load_machine("klipper-golden").model_copy(update={"axes": {"x": axis, "y": axis}})
+    return load_machine("generic-bedslinger").model_copy(update={"axes": {"x": axis, "y": axis}})
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,13 @@ def shared_dir() -> Path:
     return folder
 
 
+GOLDEN = Path(__file__).parents[2] / "examples" / "machines" / "klipper-golden.json"
+
+
 @pytest.fixture(scope="session")
 def golden_machine() -> Machine:
     """Klipper with the limits of the golden plans; X Y Z travel -1000 to 1000 mm."""
-    return load_machine("klipper-golden")
+    return load_machine(GOLDEN)
 
 
 @pytest.fixture(scope="session")

@@ -36,6 +36,7 @@ from service.reports.charts import Chart, Line, Mark, draw
 from service.settings import Settings
 from tests.service.runners import pretend
 
+GOLDEN = Path(__file__).parents[2] / "examples" / "machines" / "klipper-golden.json"
 DT = 1e-3
 ERRORS = (-20.0, 0.0, 10.0)
 TUNED = {
@@ -268,7 +269,7 @@ def test_the_same_again_and_through_json(machine: Machine, off: DesignReport) ->
 
 
 def test_refusals_are_findings() -> None:
-    lone = load_machine("klipper-golden")
+    lone = load_machine(GOLDEN)
     report = report_of(lone, basis="robust")
     assert report.chosen is None
     assert Summary(report).own is None
@@ -282,7 +283,7 @@ def test_refusals_are_findings() -> None:
 def test_taps_have_no_frequencies() -> None:
     taps = FirSpec(taps=(0.1, 0.3, 0.4, 0.2), dt_s=DT)
     axis = PlantSetSpec(nominal=taps)
-    made = load_machine("klipper-golden").model_copy(update={"axes": {"x": axis, "y": axis}})
+    made = load_machine(GOLDEN).model_copy(update={"axes": {"x": axis, "y": axis}})
     report = report_of(made)
     assert report.robustness.errors_percent == ()
     assert "no frequencies to scale" in " ".join(report.robustness.missing)
