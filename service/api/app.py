@@ -96,6 +96,7 @@ def create_app(
     state.settings = settings
     state.keys_required = keys_required
     state.limits = Limits(settings.requests_per_minute)
+    state.readiness = health.Readiness()
     state.printers = load_printers(settings.printers)
     state.designs = designs.Designs()
     state.controllers = controllers.Controllers()

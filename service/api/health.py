@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import structlog
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
@@ -13,7 +16,9 @@ from service.jobs.store import JobStore
 from service.storage.base import Storage, StorageError
 from service.version import __version__
 
-__all__ = ["reason_not_ready", "router"]
+__all__ = ["Readiness", "router"]
+
+_FRESH_S = 2.0
 
 router = APIRouter(tags=["health"])
 
@@ -26,16 +31,39 @@ async def healthz() -> Health:
 
 @router.get("/readyz", responses=responses(503), summary="Are jobs taken and done?")
 async def readyz(request: Request) -> Health:
-    """Answer `ok` while database, storage and workers are there, else 503 with the reason."""
-    found = await run_in_threadpool(reason_not_ready, request)
-    if found is not None:
-        part, reason = found
-        structlog.get_logger("api").warning("not ready", part=part, reason=reason)
-        raise Problem(503, "Not ready", f"{part}: {reason}", part=part)
+    """Answer `ok` while database, storage and workers are there, else 503 and which is not.
+
+    Anybody may ask, as often as he likes: the parts are asked once in two seconds, and why one
+    does not answer, which may name other computers, stands in the log.
+    """
+    part = await run_in_threadpool(request.app.state.readiness.missing, request)
+    if part is not None:
+        raise Problem(503, "Not ready", f"{part}: see the log of the service", part=part)
     return Health(status="ok", version=__version__)
 
 
-def reason_not_ready(request: Request) -> tuple[str, str] | None:
+class Readiness:
+    """Which part of the service does not answer, as of a moment ago."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._asked_at = -_FRESH_S
+        self._missing: str | None = None
+
+    def missing(self, request: Request) -> str | None:
+        """Return `database`, `storage` or `workers`; None: all answer."""
+        with self._lock:
+            if time.monotonic() - self._asked_at >= _FRESH_S:
+                found = _reason(request)
+                if found is not None:
+                    part, reason = found
+                    structlog.get_logger("api").warning("not ready", part=part, reason=reason)
+                self._missing = found and found[0]
+                self._asked_at = time.monotonic()
+            return self._missing
+
+
+def _reason(request: Request) -> tuple[str, str] | None:
     """Return which part does not answer, and why; None: all do."""
     store: JobStore = request.app.state.store
     storage: Storage = request.app.state.storage
