@@ -16,7 +16,7 @@ from service.interruption import interruptible
 if TYPE_CHECKING:
     from service.pipeline.motion import PlannedTime
     from service.pipeline.progress import Progress
-    from service.pipeline.result import BudgetFigures, Result
+    from service.pipeline.result import AdviceFigures, BudgetFigures, Result
 
 __all__ = ["budget_line", "print_planned", "print_result", "progress_shown", "shown"]
 
@@ -65,6 +65,9 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
         if result.budget is not None:
             console.print(budget_line(result.budget))
+        if result.advice is not None:
+            console.print(_advice_line(result.advice), markup=False)
+    if any(channel.name == "after" for channel in result.channels) and result.advice is None:
         console.print(
             f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
             f"{100 * result.put_back_extruding_share:.2f} % of the extruding time"
@@ -93,6 +96,23 @@ def budget_line(budget: BudgetFigures) -> str:
     return (
         f"budget {budget.budget_um:g} µm: {100 * budget.saved_share:.1f} % less time, {against}; "
         f"accelerations: {classes}"
+    )
+
+
+def _advice_line(advice: AdviceFigures) -> str:
+    """Return what is advised."""
+    shapers = "; ".join(
+        f"{'' if one.layer <= 0 else f'from layer {one.layer} on '}{one.label}"
+        for one in advice.shapers
+    )
+    features = ", ".join(
+        f"{one.name} {'as sliced' if one.accel_mm_s2 is None else f'{one.accel_mm_s2:.0f} mm/s2'} "
+        f"({one.before_um:.2f} -> {one.after_um:.2f} µm)"
+        for one in advice.features
+    )
+    return (
+        f"advice: shaper {shapers or f'as it is ({advice.before_shaper})'}; {features}; "
+        f"{advice.lines} lines added"
     )
 
 

@@ -145,7 +145,8 @@ class BudgetClass(_Figures):
     """The same with the best firmware shaper at the same budget."""
     contour_rms_um: float
     """Contour error of what it extrudes, root mean square of the worst plant of the machine's set
-    [um]; for travel of what is extruded in the 50 ms behind one."""
+    [um]; for travel of what is extruded in the 50 ms behind one, where it may be two budgets (it
+    counts for its feature as well)."""
     seconds: float
     """Time in which that was measured [s]."""
 
@@ -154,7 +155,7 @@ class BudgetFigures(_Figures):
     """What a budget of contour error bought."""
 
     budget_um: float
-    """Contour error that every class of moves may have [um]."""
+    """Contour error that every feature may have [um]."""
     saved_share: float
     """Part of the original's print time that is saved."""
     shaper_time_s: float | None
@@ -181,8 +182,9 @@ class AdvisedFeature(_Figures):
     name: str
     """The slicer's name of the feature, or `unnamed`."""
     accel_mm_s2: float | None
-    """Acceleration [mm/s^2]: exactly this for walls, at least this for what is not seen; null: as
-    the file has it."""
+    """Acceleration [mm/s^2]; null: as the file has it."""
+    exact: bool
+    """Whether it is exactly this, as for walls, or only where the file has less."""
     bound_um: float | None
     """Contour error that it may have, root mean square of the worst plant of the machine's set
     [um]; null where the file's accelerations are kept whatever they do."""

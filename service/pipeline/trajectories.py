@@ -60,6 +60,8 @@ def write_trajectories(
     machine : Machine
     options : Options or None
         Those of the job; with None the file stays as it came, and no column is called ``after``.
+        Of an advised file the motion is that of the written one, and so are its lines; no column
+        is called ``before``.
     format : {"csv", "npz"}
         Text (some 110 bytes a row, lengths to 0.1 um), or NumPy arrays.
     start_s, stop_s : float
@@ -87,12 +89,19 @@ def write_trajectories(
             "ends behind its start"
         )
     names = _SHOWN if options is not None else _SHOWN[:1]
+    if options is not None and options.method == "advise":
+        names = _SHOWN[1:]
     with (
         _table(target, format, names) as table,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-road-") as folder,
     ):
         window = _Window(table, names, start_s, stop_s)
         try:
+            if options is not None and options.method == "advise":
+                written = Path(folder, "advised.gcode")
+                compensate_file(source, written, machine, options, cache_dir=cache_dir)
+                source, plate, dialect = written, None, options.dialect
+                options = None
             if options is None:
                 simulate_file(
                     source,
@@ -147,7 +156,7 @@ class _Window:
                 "y_mm": trace.path_mm[1, part],
                 "z_mm": trace.z_mm[part],
             }
-            if len(self._names) > 1:
+            if "after" in self._names:
                 columns |= {
                     "after_x_mm": trace.executed_mm[0, part],
                     "after_y_mm": trace.executed_mm[1, part],
@@ -172,7 +181,7 @@ class _Passed(Exception):
 @contextmanager
 def _table(target: Path, form: str, names: tuple[str, ...]) -> Iterator[Table]:
     lengths = ["x_mm", "y_mm", "z_mm"]
-    if len(names) > 1:
+    if "after" in names:
         lengths += ["after_x_mm", "after_y_mm"]
     lengths += [f"{name}_sim_{axis}_mm" for name in names for axis in ("x", "y")]
     errors = [f"{name}_contour_um" for name in names]

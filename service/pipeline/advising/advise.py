@@ -306,6 +306,7 @@ class _Job:
                 AdvisedFeature(
                     name=names[f] if f >= 0 else "unnamed",
                     accel_mm_s2=bound.at_least if bound else None,
+                    exact=f in choice.visible,
                     bound_um=None if limit is None or np.isinf(limit) else limit,
                     within_bound=limit is None or error.rms_um <= _TOLERANCE * limit,
                     before_um=was[f].rms_um,
@@ -339,10 +340,19 @@ class _Job:
             )
         return found + [
             f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
-            f"{feature.bound_um:.1f} um it may have; no acceleration that it may be given would do."
+            f"{feature.bound_um:.1f} um it may have: no acceleration would do. Corners shake the "
+            "machine too (square corner velocity, jerk, junction deviation)."
             for feature in figures.features
-            if not feature.within_bound
+            if not feature.within_bound and feature.exact
         ]
+
+    @staticmethod
+    def _beyond(figures: AdviceFigures) -> list[str]:
+        """Say what is not seen and errs more than the budget: it is not made slower for that."""
+        names = [f.name for f in figures.features if not f.within_bound and not f.exact]
+        if not names:
+            return []
+        return [f"Beyond its bound, and no slower than the file has it: {', '.join(names)}."]
 
     def _result(
         self,
@@ -395,7 +405,7 @@ class _Job:
                 *self._warnings(figures, writer),
                 *advised.warnings(),
             ],
-            notes=[*self._notes, _UNDO],
+            notes=[*self._notes, *self._beyond(figures), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,
             track=advised.track(),

@@ -64,6 +64,9 @@ class Choice:
         Features that may be made slower than the file has them.
     own_mm_s2 : dict
         Feature id to the highest acceleration that the file gives it.
+    helpless : set of int
+        Features of these that no acceleration brings within their bounds, in the samples: they
+        get the quickest of those with about the least error, and no slower.
     shapers : list of (layer, Shaping)
     """
 
@@ -71,6 +74,7 @@ class Choice:
     rung: dict[int, int | None]
     visible: set[int]
     own_mm_s2: dict[int, float]
+    helpless: set[int] = field(default_factory=set)
     shapers: list[tuple[int, Shaping]] = field(default_factory=list)
 
     def bounds(self) -> dict[int, Bound]:
@@ -96,6 +100,8 @@ class Choice:
         return bool(sum([self._slower(f, 1.0 / ratio) for f, ratio in over.items()]))
 
     def _slower(self, feature: int, ratio: float) -> bool:
+        if feature in self.helpless:
+            return False
         now = self.rung.get(feature)
         own = self.own_mm_s2.get(feature, 0.0)
         if now is None and feature not in self.visible:
@@ -173,12 +179,15 @@ def choose(
         missed = sum(at[f][0][f] > limit[f] * 1.001 for f in features)
         seconds = sum(at[f][1].get(f, 0.0) for f in features)
         error = max(at[f][0][f] / limit[f] for f in features)
-        ranked.append((missed, seconds, error, number, rung))
+        helpless = {
+            f for f in visible if all(e.get(f, math.inf) > limit[f] * 1.001 for e, _ in one)
+        }
+        ranked.append((missed, seconds, error, number, rung, helpless))
     least = min(r[0] for r in ranked)
     fair = [r for r in ranked if r[0] == least]
     quickest = min(r[1] for r in fair)
     close = [r for r in fair if r[1] <= quickest * (1.0 + _SAME_TIME)]
-    _, _, _, number, choice.rung = min(close, key=lambda r: (r[2], r[3]))
+    _, _, _, number, choice.rung, choice.helpless = min(close, key=lambda r: (r[2], r[3]))
     choice.shapers = candidates[number].table(levels)
     for _ in range(_MENDING_ROUNDS):
         trial = Trial(samples, choice.bounds(), machine, adviser, DT_S, members)

@@ -28,6 +28,7 @@ export function reportSections(job, report, signal) {
     spectra(report, channels, labels, signal),
     features(report, channels, labels),
     budget(report),
+    advice(report),
     putBack(report, channels),
     trajectories(job, signal),
     written(report),
@@ -95,14 +96,27 @@ function budget(report) {
   const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
     : `, and ${saved(found.saved_share_against_shaper)} less than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
   return section("Speed budget",
-    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every class of moves) the print takes ${saved(found.saved_share)} less time than the file as it came${shaper}.`),
+    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the file as it came${shaper}.`),
     longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
       feature(c.name), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
 }
 
+/** @param {any} report */
+function advice(report) {
+  const found = report.advice;
+  if (!found) return null;
+  const shapers = found.shapers.map((/** @type {any} */ s) => `${s.layer > 0 ? `from layer ${s.layer} on ` : ""}${s.label}`).join("; ");
+  return section("Advice",
+    h("p", null, `All moves are those of the file. ${grouped(found.lines)} lines were added; without them (they hold “; stillpath advise”) the file is as it came.`),
+    h("p", null, shapers ? `Shaper: ${shapers}.` : `The firmware's shaper stays: ${found.before_shaper}.`),
+    longTable("Advice by feature", [{ title: "Feature", text: true }, { title: "Acceleration, mm/s²" }, { title: "Contour, rms of the worst plant, µm", wide: true }, { title: "May have" }, { title: "Time", wide: true }], found.features, (f) => [
+      feature(f.name), f.accel_mm_s2 === null ? "as sliced" : `${f.exact ? "" : "≥ "}${grouped(Math.round(f.accel_mm_s2))}`, `${um(f.before_um)} → ${um(f.after_um)}`,
+      f.bound_um === null ? "–" : um(f.bound_um), `${duration(f.before_s)} → ${duration(f.after_s)}`], 20));
+}
+
 /** @param {any} report @param {any[]} channels */
 function putBack(report, channels) {
-  if (!channels.some((c) => c.name === "after")) return null;
+  if (report.advice || !channels.some((c) => c.name === "after")) return null;
   const pieces = report.put_back;
   if (pieces.length === 0) return section("Put back as it came", h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`));
   return section("Put back as it came",
