@@ -85,7 +85,7 @@ class StillpathPlugin(
         return dict(DEFAULTS)
 
     def get_settings_restricted_paths(self) -> dict[str, list[list[str]]]:
-        """Show the key to nobody but administrators."""
+        """Show the key to nobody but those who may change it."""
         return {"admin": [["key"], ["server"], ["command"]]}
 
     # Files
