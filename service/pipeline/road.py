@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
@@ -59,6 +59,8 @@ from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
 __all__ = ["compensate_file", "plan_file", "simulate_file"]
+
+T = TypeVar("T", bound=Passage)
 
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
@@ -281,7 +283,7 @@ class _Job:
                 yield from self._timed(self._splitter.flush())
                 return
 
-    def _timed(self, items: Iterator[Piece | Passage]) -> Iterator[Piece | Passage]:
+    def _timed(self, items: Iterator[T]) -> Iterator[T]:
         while True:
             with self._clock.stage("plan"):
                 item = next(items, None)
@@ -300,9 +302,7 @@ class _Job:
             # Homed, say: the machine did not come here along the path.
             self._work.compensator.reset(piece.phases.start_mm[0, :2])
             self._sum.jumped = False
-        # Where nothing can follow the raised speeds the file's own are tried.
-        quick = self._quickened(piece)
-        for paced in [piece] if quick is piece else [quick, piece]:
+        for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
             try:
                 made, executed, gap, text = self._attempt(piece, paced)
                 break
@@ -321,12 +321,6 @@ class _Job:
             self._measure_piece(piece, part_of(samples, 0, last))
         late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
         self._emit(text, piece, np.append(delay_s + late_s, self.delay_s))
-
-    def _quickened(self, piece: Piece) -> Piece:
-        if self._budget is None:
-            return piece
-        with self._clock.stage("plan"):
-            return self._budget.quickened(piece)
 
     def _attempt(
         self, piece: Piece, paced: Piece
