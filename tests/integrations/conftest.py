@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.integrations.moonraker import NO_MOONRAKER
 from tests.integrations.octoprint import NO_OCTOPRINT
 from tests.integrations.running import Running
 from tests.integrations.slicers import NOT_HERE
@@ -34,6 +35,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for missing, needed in (
         (NOT_HERE, "a slicer (tests/integrations/get-slicers)"),
         (NO_OCTOPRINT, "OctoPrint (tests/get-tools)"),
+        (NO_MOONRAKER, "Moonraker (tests/get-tools)"),
     ):
         skipped = [
             report

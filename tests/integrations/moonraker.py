@@ -1,5 +1,7 @@
 """Stand-ins for what Moonraker gives its components; and the real one, where it is installed.
 
+`MOONRAKER_PYTHON` names a Python that has Moonraker; `tests/get-tools` makes one.
+
 The contract is Moonraker 0.11's: server.py, confighelper.py, components/file_manager (metadata:
 `run_gcode_processors`, `file_manager:metadata_processed`), klippy_apis.py.
 """
@@ -9,13 +11,30 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import inspect
+import os
 import re
-from collections.abc import Callable
+import socket
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-__all__ = ["COMPONENT", "Config", "Server", "ServerError", "component_module"]
+import httpx2
+import pytest
+
+from tests.service.test_server import until
+
+__all__ = [
+    "COMPONENT",
+    "NO_MOONRAKER",
+    "Config",
+    "RealMoonraker",
+    "Server",
+    "ServerError",
+    "component_module",
+]
 
 COMPONENT = Path(__file__).resolve().parents[2] / "integrations" / "moonraker" / "stillpath.py"
 
@@ -192,3 +211,78 @@ class Server:
             assert asyncio.get_running_loop().time() < deadline, self.console
             await asyncio.sleep(0.02)
         return found
+
+
+NO_MOONRAKER = "Moonraker not here"
+
+
+def moonraker_python() -> Path:
+    """Return the Python that has Moonraker; without one the test is skipped."""
+    found = os.environ.get("MOONRAKER_PYTHON")
+    if not found:
+        pytest.skip(f"{NO_MOONRAKER}: MOONRAKER_PYTHON names a Python that has it")
+    return Path(found)
+
+
+class RealMoonraker:
+    """Moonraker from PyPI with our component, without a Klipper, as a process of its own.
+
+    Parameters
+    ----------
+    folder : Path
+        For its files; kept between starts.
+    settings : dict
+        Options of ``[stillpath]``.
+    """
+
+    def __init__(self, folder: Path, **settings: str) -> None:
+        self._python = moonraker_python()
+        self.data = folder / "printer_data"
+        self.gcodes = self.data / "gcodes"
+        for name in ("config", "gcodes", "logs"):
+            (self.data / name).mkdir(parents=True)
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{port}"
+        own = "".join(f"{name}: {value}\n" for name, value in settings.items())
+        (self.data / "config" / "moonraker.conf").write_text(
+            f"[server]\nhost: 127.0.0.1\nport: {port}\n"
+            f"klippy_uds_address: {folder / 'klippy.sock'}\n"
+            "[machine]\nprovider: none\nvalidate_service: False\nvalidate_config: False\n"
+            "[authorization]\ntrusted_clients:\n  127.0.0.1\n"
+            f"[stillpath]\n{own}"
+        )
+
+    @contextmanager
+    def running(self) -> Iterator[httpx2.Client]:
+        """Run it during the `with` block, and speak to it."""
+        # Its folder of components is searched first; ours is another one behind it.
+        start = (
+            "import moonraker.components as c; "
+            f"c.__path__.append({str(COMPONENT.parent)!r}); "
+            "from moonraker.server import main; main()"
+        )
+        command = [str(self._python), "-c", start, "-d", str(self.data), "-n"]
+        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+        with (self.data / "logs" / "said").open("ab") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
+        try:
+            with httpx2.Client(base_url=self.url, timeout=180, trust_env=False) as client:
+                until(lambda: process.poll() is not None or self._answers(client))
+                assert process.poll() is None, (self.data / "logs" / "said").read_text()
+                yield client
+        finally:
+            process.terminate()
+            try:
+                process.wait(timeout=60)
+            except subprocess.TimeoutExpired:  # as it may while it reads metadata
+                process.kill()
+                process.wait()
+                raise
+
+    @staticmethod
+    def _answers(client: httpx2.Client) -> bool:
+        try:
+            return client.get("/server/info").status_code == 200
+        except httpx2.TransportError:
+            return False
