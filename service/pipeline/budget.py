@@ -38,6 +38,7 @@ _SLOWEST = 0.05
 _AIM = 0.95
 """Part of the budget that the samples may use."""
 _MENDING_ROUNDS = 4
+_NO_WORSE = 1.02
 _LANDING = 2.0
 """So many budgets may what is extruded right behind a travel have; its feature has one for all."""
 _STRIDE, _STRIDE_WRITTEN = 8, 24
@@ -271,31 +272,39 @@ def _search(trial: Trial, least: Factors, most: Factors, limit_um: float) -> Pac
         return float(least[one] * (most[one] / least[one]) ** (rung / _STEPS))
 
     def tried(rungs: dict[int, int]) -> dict[int, float]:
-        """Return the errors over the limit by class; more than 1 must be slower."""
+        """Return the errors over the limit by class; more than 1 is too much."""
         errors, unfit = trial({one: factor(one, rung) for one, rung in rungs.items()})
-        found = {one: error.rms_um / (limit_um * _allowed(one)) for one, error in errors.items()}
-        return {one: math.inf if one in unfit else found.get(one, 0.0) for one in rungs}
+        over = {one: error.rms_um / (limit_um * _allowed(one)) for one, error in errors.items()}
+        return {one: math.inf if one in unfit else over.get(one, 0.0) for one in rungs}
 
     rungs = {one: 0 for one in most if most[one] > least[one]}
+    if not rungs:
+        return PaceChoice({}, reached=True)
+    # What exceeds the limit even so may at least not become worse.
+    limit = {one: max(1.0, _NO_WORSE * ratio) for one, ratio in tried(rungs).items()}
     step = _STEPS // 2
-    # The uppermost rung is one more than bisection reaches.
-    while step and rungs:
+    while step:
         higher = {one: rung + step for one, rung in rungs.items()}
         for one, ratio in tried(higher).items():
-            if ratio <= 1.0:
+            if ratio <= limit[one]:
                 rungs[one] = higher[one]
         step //= 2
+    # The uppermost rung is one more than bisection reaches.
     rungs = {one: rung + 1 if rung == _STEPS - 1 else rung for one, rung in rungs.items()}
     for _ in range(_MENDING_ROUNDS):
-        over = tried(rungs)
-        worse = [one for one, ratio in over.items() if ratio > 1.0 and rungs[one] > 0]
-        if not worse:
+        over = {one: ratio / limit[one] for one, ratio in tried(rungs).items()}
+        worse = {one: ratio for one, ratio in over.items() if ratio > 1.0}
+        # A class that cannot be slower suffers from what comes before it: travel.
+        stuck = [ratio for one, ratio in worse.items() if rungs[one] == 0]
+        if stuck and TRAVEL in rungs:
+            worse[TRAVEL] = max(worse.get(TRAVEL, 0.0), *stuck) ** 2
+        lower = {one: ratio for one, ratio in worse.items() if rungs[one] > 0}
+        if not lower:
             break
-        for one in worse:
-            down = 2 if math.isinf(over[one]) else _rungs_down(over[one], most[one] / least[one])
-            rungs[one] = max(0, rungs[one] - down)
-    over = tried(rungs)
-    reached = all(ratio <= 1.0 / _AIM for ratio in over.values())
+        for one, ratio in lower.items():
+            span = most[one] / least[one]
+            rungs[one] = max(0, rungs[one] - (2 if math.isinf(ratio) else _rungs_down(ratio, span)))
+    reached = all(ratio <= 1.0 / _AIM for ratio in tried(rungs).values())
     return PaceChoice({one: factor(one, rung) for one, rung in rungs.items()}, reached)
 
 
