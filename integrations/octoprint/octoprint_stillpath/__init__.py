@@ -51,12 +51,10 @@ class StillpathPlugin(
 ):
     """Takes uploads, lets the worker compensate them, and shows how it goes."""
 
-    _worker: Worker | None = None
-
     # Life
 
-    def on_after_startup(self) -> None:
-        """Go on with what was interrupted."""
+    def initialize(self) -> None:
+        """Read what an earlier run has left; files may come before all of OctoPrint is there."""
         folder = Path(self.get_plugin_data_folder())
         self._ledger = Ledger(folder / "files.json")
         self._reports = Reports(folder / "reports")
@@ -66,17 +64,19 @@ class StillpathPlugin(
         for entry in self._ledger.open():
             self._logger.info("%s is taken up again", entry.path)
             self._ledger.disarm(entry, "OctoPrint was started anew meanwhile")
+        self._worker = Worker(self._ledger, self._host, folder / "work", self._logger)
+
+    def on_after_startup(self) -> None:
+        """Go on with what was interrupted."""
         try:
             self._host.sweep()
         except Exception:  # old pages are no reason not to work
             self._logger.exception("reports cannot be tidied up")
-        self._worker = Worker(self._ledger, self._host, folder / "work", self._logger)
         self._worker.start()
 
     def on_shutdown(self) -> None:
         """Leave what is under way to the next start."""
-        if self._worker is not None:
-            self._worker.stop()
+        self._worker.stop()
 
     # Settings
 
@@ -92,8 +92,6 @@ class StillpathPlugin(
 
     def on_event(self, event: str, payload: dict[str, Any]) -> None:
         """Take what is uploaded; stop what is deleted; do not print onto a print."""
-        if self._worker is None:
-            return
         if event == Events.PRINT_STARTED:
             for entry in self._ledger.open():
                 self._ledger.disarm(entry, "another print began meanwhile")
@@ -197,15 +195,13 @@ class StillpathPlugin(
     def on_api_get(self, request: Any) -> Any:  # noqa: ARG002
         """Return the list of files."""
         _require(Permissions.FILES_LIST)
-        return flask.jsonify(entries=self._views() if self._worker else [])
+        return flask.jsonify(entries=self._views())
 
     def on_api_command(self, command: str, data: dict[str, Any]) -> Any:
         """Do what a page or a script asks for."""
         if command == "machines":
             return self._list_machines(data)
         _require(Permissions.FILES_UPLOAD)
-        if self._worker is None:
-            flask.abort(503, description="OctoPrint is not ready yet")
         if command == "process":
             return flask.jsonify(entry=_view(self._process(str(data["path"]))))
         if command == "cancel":
@@ -255,7 +251,7 @@ class StillpathPlugin(
     def report(self, report_id: str) -> Any:
         """Return the page of a report."""
         _require(Permissions.FILES_DOWNLOAD)
-        path = self._reports.path(report_id) if self._worker else None
+        path = self._reports.path(report_id)
         if path is None:
             flask.abort(404)
         answer = flask.send_file(str(path), mimetype="text/html")

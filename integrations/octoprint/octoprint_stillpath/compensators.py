@@ -188,23 +188,17 @@ class OnServer(Service):
         """Return the job that the server makes of a file, and whether it is a new one."""
         parameters = {"machine": self._entry.machine, **self._entry.options, "name": name[-255:]}
         query = urlencode(parameters, errors="replace")
-        statuses: list[int] = []
-
-        def take(answer: Any) -> bytes:
-            statuses.append(answer.status)
-            return _read(answer)
-
         deadline = time.monotonic() + self._timeout_s
         while True:
             with source.open("rb") as file:
                 size = source.stat().st_size
                 body = _Told(file, size, lambda share: self._tell("sending", share))
                 try:
-                    answer = self._ask("POST", f"/v1/jobs?{query}", 0.0, body, take)
-                    return self._document(answer), statuses[-1] == 202
-                except Failure as failure:
-                    if failure.code == 2 or time.monotonic() > deadline:
-                        raise
+                    with self._open("POST", f"/v1/jobs?{query}", body) as answer:
+                        return self._document(_read(answer)), answer.status == 202
+                except _Broken as error:
+                    if time.monotonic() > deadline:
+                        raise Failure(f"no answer from {self._address}: {error}", 1) from None
             self._tell("the server does not answer; trying again", None)
             time.sleep(self._LONGEST_PAUSE_S)
 

@@ -73,11 +73,6 @@ class OctoPrintHost(Host):
     ) -> OnServer | ByCommand:
         """Return a server or the program, as it was set when the file came."""
         get = self._settings.get
-        if not entry.machine:
-            raise Failure(
-                "no machine is set for this printer profile; choose one in the settings of "
-                "Stillpath"
-            )
         if entry.where == "command":
             return ByCommand(entry, str(get(["command"]) or "").strip(), tell)
         timeout_s = timeout_of({"timeout_s": get(["timeout_s"])})

@@ -93,7 +93,8 @@ class Worker:
         """Stop between two steps; what is under way stays in the ledger."""
         self._stopping.set()
         self._ledger.wake()
-        self._thread.join(within_s)
+        if self._thread.is_alive():
+            self._thread.join(within_s)
 
     def _run(self) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -125,6 +126,7 @@ class Worker:
             reason = f"{type(error).__name__}: {error}"
             change(entry, state="failed", stage="", progress=None, message=reason)
         else:
+            self._logger.info("%s: %s", entry.path, entry.message)
             change(entry, state="done", stage="", progress=None)
         self._host.show(entry)
 
