@@ -32,7 +32,7 @@ def test_damage_is_the_seed_s() -> None:
 def test_damaged_files_are_read_and_planned_or_refused(kind: str) -> None:
     machine = machine_of(kind)
     files = [path.read_bytes() for path in EXAMPLES]
-    for data in excerpts(files, 60_000, random.Random(KINDS.index(kind)), size=3000):
+    for data in excerpts(files, 24_000, random.Random(KINDS.index(kind)), size=3000):
         read_through(data, machine)
 
 
