@@ -137,7 +137,7 @@ def _exchange(
         trust_env=False,
         follow_redirects=False,
         verify=ssl.create_default_context() if target.scheme == "https" else False,
-        timeout=httpx2.Timeout(timeout_s, connect=_CONNECT_S),
+        timeout=httpx2.Timeout(timeout_s, connect=min(timeout_s, _CONNECT_S)),
         headers={"User-Agent": f"stillpath/{__version__}", "Accept-Encoding": "identity"},
     ) as client:
         for address in addresses:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import configparser
 import copy
+import functools
 import json
 import re
 import shlex
@@ -126,10 +127,9 @@ class Klipper:
         }
         if "input_shaper" in self.settings:
             self._commands["SET_INPUT_SHAPER"] = self._shape
-        environment = jinja2.Environment("{%", "%}", "{", "}")
         for section, options in self.sections:
             if section.startswith("gcode_macro "):
-                self._load(section, options, environment)
+                self._load(section, options)
         for macro in self._macros.values():
             if macro.renames is not None:
                 self._rename(macro)
@@ -177,7 +177,7 @@ class Klipper:
 
     # Configuration
 
-    def _load(self, section: str, options: dict[str, str], environment: jinja2.Environment) -> None:
+    def _load(self, section: str, options: dict[str, str]) -> None:
         name = section.split()[1]
         alias, renames = name.upper(), options.get("rename_existing")
         variables = {}
@@ -186,7 +186,7 @@ class Klipper:
                 literal = ast.literal_eval(text)
                 json.dumps(literal)
                 variables[option.removeprefix("variable_")] = literal
-        template = environment.from_string(options["gcode"])
+        template = _template(options["gcode"])
         description = options.get("description", "G-Code macro")
         macro = _Macro(name, template, description, renames, variables)
         if renames is not None and bool(_TRADITIONAL.match(alias)) != bool(
@@ -284,6 +284,11 @@ class Klipper:
         literal = ast.literal_eval(given["VALUE"])
         json.dumps(literal)
         macro.variables[given["VARIABLE"]] = literal
+
+
+@functools.cache
+def _template(text: str) -> jinja2.Template:
+    return jinja2.Environment("{%", "%}", "{", "}").from_string(text)
 
 
 def _parameters(line: str, name: str) -> dict[str, str]:

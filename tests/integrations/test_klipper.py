@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gcode.firmware.klipper.kit import KlipperKit
 from models.store import load_machine
@@ -148,6 +150,43 @@ def test_a_change_of_filament_that_broke_spoils_no_later_pause():
     printer.run("PAUSE")
     printer.run("RESUME")
     assert printer.toolhead["max_accel"] == 1234
+
+
+_MACROS = macros_of(USERS, CHANGES, OURS, M600)
+_OWN_MOVES = ("G1 Z5 F900", "G1 E-50 F1000", "G1 X0 Y0 F9000")
+_COMMANDS = ("PAUSE", "RESUME", "M600", "CANCEL_PRINT", "stretch", "end of stretch", "file")
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.sampled_from(_COMMANDS), max_size=12))
+def test_ones_own_moves_never_run_under_raised_limits(commands: list[str]):
+    """And what a pause found is in force again when the print goes on."""
+    printer = Klipper(_MACROS, extra={"virtual_sdcard": {"file_position": 0}})
+    lines = {
+        "stretch": "SET_VELOCITY_LIMIT ACCEL=300000\nSET_INPUT_SHAPER SHAPER_FREQ_X=0",
+        "end of stretch": "SET_VELOCITY_LIMIT ACCEL=2000\nSET_INPUT_SHAPER SHAPER_FREQ_X=57.8",
+        "file": "SET_VELOCITY_LIMIT ACCEL=2500",
+    }
+    found = limits(printer)
+    for command in commands:
+        if command in lines:
+            if printer.is_paused:
+                continue  # the file does not go on
+            printer.extra["virtual_sdcard"]["file_position"] += 100
+        was_paused = printer.is_paused
+        before = limits(printer)
+        printer.sent.clear()
+        printer.run(lines.get(command, command))
+        if not was_paused:
+            found = before
+        for place, line in enumerate(printer.sent):
+            if line in _OWN_MOVES:
+                limit = [each for each in printer.sent[:place] if "ACCEL=" in each][-1:]
+                assert limit == [OWN_LIMITS] or (was_paused and not limit)
+        if command == "RESUME" and was_paused:
+            assert limits(printer) == found
+        if printer.is_paused:
+            assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
 
 
 def test_the_second_file_needs_a_macro():
