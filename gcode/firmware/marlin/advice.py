@@ -7,7 +7,7 @@ from typing import cast
 
 from gcode.dialect import Dialect
 from gcode.firmware.marlin.limits import MarlinLimits
-from gcode.lexer import split_line
+from gcode.lexer import Command, split_line
 from gcode.types import Limits
 from models.firmware import Marlin
 from models.shaping import OFF, AxisShaper, Shaping
@@ -96,8 +96,14 @@ class MarlinAdviser:
             given = {k: float(v) for k, v in command.words.items() if k in (hertz, zeta) and v}
             axes = []
             for axis, s in (("X", now.x), ("Y", now.y)):
-                if both or axis in command.words:
-                    s = AxisShaper("zv", given.get("F", s.f_hz), given.get("D", s.damping))
-                axes.append(s)
+                if not both and axis not in command.words:
+                    axes.append(s)
+                    continue
+                kind = self._type(command, s.type) if self._fixed_time else "zv"
+                axes.append(AxisShaper(kind, given.get(hertz, s.f_hz), given.get(zeta, s.damping)))
             now = Shaping(*axes)
         return now
+
+    def _type(self, command: Command, now: str) -> str:
+        mode = command.words.get("C", "")
+        return _MODELLED.get(mode, f"M493 C{mode}") if mode else now

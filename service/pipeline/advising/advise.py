@@ -182,7 +182,10 @@ class _Job:
             layers.finish(names)
         self._say("done", 1.0)
         figures = self._figures(choice, names, was, now, writer.lines)
-        return self._result(name, facts, asked, written, original, advised, figures, writer)
+        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
+        return self._result(
+            name, facts, asked, written, original, advised, figures, writer, helpless
+        )
 
     def _settled(
         self, choice: Choice, was: dict[int, ClassError], first_layer: int
@@ -322,7 +325,9 @@ class _Job:
             lines=lines,
         )
 
-    def _warnings(self, figures: AdviceFigures, writer: AdviceWriter) -> list[str]:
+    def _warnings(
+        self, figures: AdviceFigures, writer: AdviceWriter, helpless: Sequence[str]
+    ) -> list[str]:
         found = [
             f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
             "as it came are those without it."
@@ -340,8 +345,13 @@ class _Job:
             )
         return found + [
             f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
-            f"{feature.bound_um:.1f} um it may have: no acceleration would do. Corners shake the "
-            "machine too (square corner velocity, jerk, junction deviation)."
+            f"{feature.bound_um:.1f} um it may have"
+            + (
+                ": no acceleration would do. Corners shake the machine too (square corner "
+                "velocity, jerk, junction deviation)."
+                if feature.name in helpless
+                else "; a larger budget is needed."
+            )
             for feature in figures.features
             if not feature.within_bound and feature.exact
         ]
@@ -364,6 +374,7 @@ class _Job:
         advised: Measurement,
         figures: AdviceFigures,
         writer: AdviceWriter,
+        helpless: Sequence[str],
     ) -> Result:
         machine, names = self._machine, asked.reader.feature_names
         before, shaper = original.channels()
@@ -402,7 +413,7 @@ class _Job:
             warnings=[
                 *self._doubts,
                 *asked.warnings,
-                *self._warnings(figures, writer),
+                *self._warnings(figures, writer, helpless),
                 *advised.warnings(),
             ],
             notes=[*self._notes, *self._beyond(figures), _UNDO],

@@ -1,0 +1,172 @@
+"""Lines of advice among any lines, and the shaper that they set: by themselves, without a road."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from compensation.shapers import shape, shaper_pulses
+from gcode.firmware.registry import kit
+from gcode.interpreter import Interpreter
+from gcode.types import EventKind, Limits, Moves
+from models.firmware import Klipper, Marlin, RepRapFirmware
+from models.machine import Machine
+from models.schedule import EMPTY
+from models.shaping import AxisShaper, Shaping
+from models.store import load_machine
+from service.pipeline.advising.advice import Advice, Bound
+from service.pipeline.advising.inserting import MARK, AdviceWriter
+from service.pipeline.measure import MotionSamples
+from service.pipeline.shaping import ShapedMotion
+
+OURS = Shaping(AxisShaper("zv", 41.0), AxisShaper("zv", 31.0))
+ADVICE = Advice(
+    {0: Bound(2400.0, 2400.0), 1: Bound(3100.0)},
+    [(-1, OURS), (2, Shaping(AxisShaper("zv", 41.0), AxisShaper("zv", 30.0)))],
+)
+
+LINES = st.sampled_from(
+    [
+        ";TYPE:External perimeter",
+        ";TYPE:Perimeter",
+        ";TYPE:Bridge infill",
+        ";LAYER_CHANGE",
+        "M204 S900",
+        "SET_VELOCITY_LIMIT ACCEL=5200",
+        "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=7",
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=50",
+        "MACRO",
+        "G4 P10",
+        "G92 E0",
+        "; a remark",
+        "",
+        "G1 X10 Y10 E1 F3000",
+        "G1 X20 Y15 E1",
+        "G1 X15 E1",
+        "G1 X50 Y50 F9000",
+        "G1 Z.6",
+        "G1 E-.8",
+    ]
+)
+
+
+def klipper() -> Machine:
+    """A Klipper machine that knows no shaper of its own."""
+    return load_machine("ender3")
+
+
+def written(data: bytes, machine: Machine, advice: Advice) -> bytes:
+    reader, firmware = Interpreter(machine), kit(machine)
+    adviser = firmware.adviser(reader.dialect)
+    writer = AdviceWriter(adviser, advice, reader.feature_names, firmware.initial_limits(), "test")
+    out = writer.header() + b"".join(writer.block(b) for b in reader.push(data))
+    rest = reader.flush()
+    return out + writer.end() + b"".join(b.text for b in rest)
+
+
+def printed(data: bytes, machine: Machine) -> list[tuple[str, int, Limits, Shaping]]:
+    """Feature, layer, limits and shaper of every move that prints, as the firmware reads it."""
+    reader = Interpreter(machine)
+    adviser = kit(machine).adviser(reader.dialect)
+    shaping, found = Shaping(), []
+    for block in [*reader.push(data), *reader.flush()]:
+        rows: list[tuple[int, bool, int]] = []
+        events, moves = block.events, block.moves
+        rows += [(int(b), False, k) for k, b in enumerate(events.byte_start)]
+        rows += [(int(b), True, k) for k, b in enumerate(moves.byte_start)]
+        for start, is_move, k in sorted(rows):
+            if is_move:
+                way = moves.end_mm[k] - moves.start_mm[k]
+                if np.any(way[:2] != 0.0) and way[3] > 0.0:
+                    name = reader.feature_names[moves.feature[k]] if moves.feature[k] >= 0 else ""
+                    limits = block.limits[moves.limits_id[k]]
+                    found.append((name, int(moves.layer[k]), limits, shaping))
+            elif events.kind[k] == EventKind.SHAPER:
+                at = start - block.text_offset
+                line = block.text[at : int(events.byte_end[k]) - block.text_offset].decode()
+                shaping = adviser.read_shaper(line, shaping)
+    return found
+
+
+@settings(max_examples=25, deadline=None)
+@given(lines=st.lists(LINES, max_size=40), ends=st.sampled_from(["", "\n", "\r\n"]))
+def test_any_file(lines: list[str], ends: str) -> None:
+    machine = klipper()
+    data = ("\n".join(["G28", "M83", "G1 X5 Y5 E1 F600", *lines]) + ends).encode()
+    out = written(data, machine, ADVICE)
+    assert b"".join(x for x in out.splitlines(keepends=True) if MARK not in x) == data
+    before, after = printed(data, machine), printed(out, machine)
+    assert len(before) == len(after)
+    # What stands in a line without an end cannot have ours behind it; it is the last one.
+    whole = len(after) if ends else len(after) - 1
+    reader = Interpreter(machine)
+    reader.push(data)
+    reader.flush()
+    names = reader.feature_names
+    for own, ours in zip(before[:whole], after[:whole], strict=True):
+        name, layer, limits, _ = own
+        bound = ADVICE.bounds.get(names.index(name)) if name and layer >= 1 else None
+        wanted = bound.of(limits.accel_mm_s2) if bound else limits.accel_mm_s2
+        assert ours[2].accel_mm_s2 == wanted
+        assert ours[2].square_corner_velocity_mm_s == limits.square_corner_velocity_mm_s
+        assert ours[3] == OURS or (layer >= 2 and ours[3] in [s for _, s in ADVICE.shapers])
+
+
+def test_every_firmwares_words_are_read_as_they_are_written() -> None:
+    base = klipper()
+    found = {}
+    for firmware in (Klipper(), Marlin(ft_motion=True), Marlin(), RepRapFirmware()):
+        machine = base.model_copy(update={"firmware": firmware})
+        firmware_kit = kit(machine)
+        adviser = firmware_kit.adviser(Interpreter(machine).dialect)
+        for kind in adviser.shapers:
+            x = AxisShaper(kind, 41.5)
+            wanted = Shaping(x, x if adviser.same_for_both else AxisShaper(kind, 30.2, 0.05))
+            read = Shaping()
+            for line in adviser.shaper_lines(wanted):
+                read = adviser.read_shaper(line.decode() + " ; stillpath advise", read)
+            assert read == wanted
+        lines = adviser.accel_lines(2345.0)
+        assert any(adviser.sets_accel(line.decode()) for line in lines)
+        limits = firmware_kit.initial_limits()
+        block = Interpreter(machine).push(b"\n".join([*lines, b"G1 X10 F600", b""]))[-1]
+        now = block.limits[block.moves.limits_id[-1]]
+        assert now == adviser.with_accel(limits, 2345.0)
+        found[firmware.kind, adviser.shapers] = True
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize("kind", ["zv", "ei", "3hump_ei"])
+def test_twin_of_the_shapers_stream(kind: str) -> None:
+    rng = np.random.default_rng(3)
+    steps = np.zeros((2, 3000))
+    steps[:, 300:2500] = rng.normal(size=(2, 2200))
+    path = np.cumsum(steps, axis=1)
+    shaping = Shaping(AxisShaper(kind, 44.4), AxisShaper("mzv", 31.3))
+    stream, found = ShapedMotion(1e-3), []
+    for first, last in ((0, 1), (1, 700), (700, 2000), (2000, 3000)):
+        found += [s for s, _ in stream.push(motion(path[:, first:last]), shaping, EMPTY)]
+    found += [s for s, _ in stream.flush()]
+    command = np.concatenate([s.executed_mm for s in found], axis=1)
+    wanted = [
+        shape(row, 1e-3, shaper_pulses(s.type, s.f_hz, s.damping))
+        for row, s in zip(path, (shaping.x, shaping.y), strict=True)
+    ]
+    np.testing.assert_allclose(command, wanted, atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate([s.path_mm for s in found], axis=1), path)
+
+
+def test_without_a_shaper_the_command_is_the_path() -> None:
+    path = np.random.default_rng(1).normal(size=(2, 500))
+    stream = ShapedMotion(1e-3)
+    parts = [*stream.push(motion(path), Shaping(), EMPTY), *stream.flush()]
+    np.testing.assert_array_equal(np.concatenate([s.executed_mm for s, _ in parts], axis=1), path)
+
+
+def motion(path: np.ndarray) -> MotionSamples:
+    n = path.shape[1]
+    none = np.zeros(0)
+    moves = Moves(*[none] * len(Moves.__dataclass_fields__))
+    return MotionSamples(path, path, np.zeros(n), np.zeros(n, bool), np.zeros(n, np.int64), moves)
