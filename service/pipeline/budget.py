@@ -38,7 +38,7 @@ _SLOWEST = 0.05
 _AIM = 0.95
 """Part of the budget that the samples may use."""
 _MENDING_ROUNDS = 4
-_NO_WORSE = 1.02
+_NO_WORSE = 1.1
 _LANDING = 2.0
 """So many budgets may what is extruded right behind a travel have; its feature has one for all."""
 _STRIDE, _STRIDE_WRITTEN = 8, 24
@@ -280,7 +280,7 @@ def _search(trial: Trial, least: Factors, most: Factors, limit_um: float) -> Pac
     rungs = {one: 0 for one in most if most[one] > least[one]}
     if not rungs:
         return PaceChoice({}, reached=True)
-    # What exceeds the limit even so may at least not become worse.
+    # What exceeds the limit even so may at least not become much worse.
     limit = {one: max(1.0, _NO_WORSE * ratio) for one, ratio in tried(rungs).items()}
     step = _STEPS // 2
     while step:
@@ -297,7 +297,7 @@ def _search(trial: Trial, least: Factors, most: Factors, limit_um: float) -> Pac
         # A class that cannot be slower suffers from what comes before it: travel.
         stuck = [ratio for one, ratio in worse.items() if rungs[one] == 0]
         if stuck and TRAVEL in rungs:
-            worse[TRAVEL] = max(worse.get(TRAVEL, 0.0), *stuck) ** 2
+            worse[TRAVEL] = max(worse.get(TRAVEL, 0.0), *stuck)
         lower = {one: ratio for one, ratio in worse.items() if rungs[one] > 0}
         if not lower:
             break
