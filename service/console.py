@@ -60,8 +60,12 @@ def print_result(result: Result, console: Console | None = None) -> None:
         change = 100 * (result.time_s / result.original_time_s - 1) if result.original_time_s else 0
         console.print(
             f"print time {result.original_time_s:.1f} -> {result.time_s:.1f} s ({change:+.2f} %), "
-            f"size {result.original_bytes / 1e6:.2f} -> {result.written_bytes / 1e6:.2f} MB, "
-            f"{result.segments_per_s:.0f} segments/s (peak {result.peak_segments_per_s:.0f})"
+            f"size {result.original_bytes / 1e6:.2f} -> {result.written_bytes / 1e6:.2f} MB"
+            + (
+                f", {result.segments_per_s:.0f} segments/s (peak {result.peak_segments_per_s:.0f})"
+                if result.advice is None
+                else ""
+            )
         )
         if result.budget is not None:
             console.print(budget_line(result.budget))

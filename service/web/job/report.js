@@ -131,10 +131,10 @@ function written(report) {
     ["Print time", `${duration(report.original_time_s)} → ${duration(report.time_s)}`],
     report.slicer_time_s ? ["By the slicer's estimate", `${duration(report.slicer_time_s)}${report.slicer ? ` (${report.slicer})` : ""}`] : null,
     ["Size", `${bytes(report.original_bytes)} → ${bytes(report.written_bytes)}`],
-    ["Compensated", `${duration(report.compensated_s)} of the print; ${duration(report.extruding_s)} extrude`],
+    report.advice ? null : ["Compensated", `${duration(report.compensated_s)} of the print; ${duration(report.extruding_s)} extrude`],
     report.segments ? ["Segments", `${grouped(report.segments)}, ${Math.round(report.segments_per_s)} per second, at most ${grouped(Math.round(report.peak_segments_per_s))}`] : null,
-    ["Command", `at most ${Math.round(report.peak_velocity_mm_s)} mm/s and ${grouped(Math.round(report.peak_accel_mm_s2))} mm/s²`],
-    ["Written motion against the command", `${um(report.emission_rms_um)} µm rms, ${um(report.emission_max_um)} µm max`],
+    report.advice ? null : ["Command", `at most ${Math.round(report.peak_velocity_mm_s)} mm/s and ${grouped(Math.round(report.peak_accel_mm_s2))} mm/s²`],
+    report.advice ? null : ["Written motion against the command", `${um(report.emission_rms_um)} µm rms, ${um(report.emission_max_um)} µm max`],
     ["Best shaper of this machine", report.best_shaper],
     ["Stillpath", report.version],
   ].filter((fact) => fact !== null);
