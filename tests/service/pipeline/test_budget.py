@@ -50,6 +50,7 @@ def compensated(
     return result, target.read_bytes()
 
 
+@pytest.mark.slow
 def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced: bytes) -> None:
     plain, _ = compensated(sliced, tmp_path, cache)
     assert plain.budget is None
@@ -80,6 +81,7 @@ def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced:
     assert again.budget == found
 
 
+@pytest.mark.slow
 def test_a_small_budget_changes_no_speed(tmp_path: Path, cache: Path, sliced: bytes) -> None:
     _, plain = compensated(sliced, tmp_path, cache)
     result, written = compensated(sliced, tmp_path, cache, budget_um=0.5)
@@ -96,12 +98,21 @@ def test_a_small_budget_changes_no_speed(tmp_path: Path, cache: Path, sliced: by
         assert strip[0] == strip[1]
 
 
-@pytest.mark.parametrize("method", ["shaper:zv", pytest.param("zpetc", marks=pytest.mark.slow)])
-def test_other_methods_have_budgets_too(
-    tmp_path: Path, cache: Path, sliced: bytes, method: str
-) -> None:
-    result, _ = compensated(sliced, tmp_path, cache, method=method, budget_um=40)
+def test_shapers_have_budgets_too(tmp_path: Path, cache: Path, sliced: bytes) -> None:
+    result, written = compensated(sliced, tmp_path, cache, method="shaper:zv", budget_um=40)
     assert result.budget is not None
+    assert result.budget.saved_share > 0.05
+    assert result.time_s < result.original_time_s
+    assert all(one.contour_rms_um <= 2 * 40 for one in result.budget.classes)
+    check_file(sliced, written, load_machine("ender3"))
+
+
+@pytest.mark.slow
+def test_what_no_command_follows_is_slower(tmp_path: Path, cache: Path, sliced: bytes) -> None:
+    # An inverse asks for more acceleration than the machine allows where the plan is quickest.
+    result, _ = compensated(sliced, tmp_path, cache, method="zpetc", budget_um=40)
+    assert result.put_back == []
+    assert any("slower than the budget allows" in warning for warning in result.warnings)
     assert result.time_s < result.original_time_s
 
 
