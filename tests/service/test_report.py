@@ -37,9 +37,8 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
         "report.html",
         "report.json",
     ]
-    read = Result.model_validate_json(
-        (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
-    )
+    text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
+    read = Result.model_validate(json.loads(text) | {"budget": None, "advice": None})
     assert read.channels == result.channels
     assert read.put_back == result.put_back
 
