@@ -10,7 +10,8 @@ import os
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,8 @@ import httpx2
 import pytest
 
 from tests.integrations.posting import ROOT
-from tests.service.test_server import until
 
-__all__ = ["NO_OCTOPRINT", "PLUGIN", "OctoPrint", "install", "octoprint_program"]
+__all__ = ["NO_OCTOPRINT", "PLUGIN", "OctoPrint", "install", "octoprint_program", "until"]
 
 NO_OCTOPRINT = "OctoPrint not here"
 PLUGIN = ROOT / "integrations" / "octoprint"
@@ -33,6 +33,15 @@ _LEFT_OUT = [
     *("firmware_check", "gcodeviewer", "health_check", "pi_support", "pluginmanager"),
     *("softwareupdate", "tracking", "upload_manager"),
 ]
+
+
+def until(wanted: Callable[[], Any], seconds: float = 300.0) -> Any:
+    """Wait for something and return it; OctoPrint is asked less often than our own server."""
+    deadline = time.monotonic() + seconds
+    while not (found := wanted()):
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.3)
+    return found
 
 
 def octoprint_program() -> Path:
@@ -170,6 +179,8 @@ class OctoPrint:
 
     def connect_printer(self) -> None:
         """Connect OctoPrint's own virtual printer."""
+        if self.is_ready():
+            return
         answer = self.client.post("/api/connection", json={"command": "connect", "port": "VIRTUAL"})
         assert answer.status_code == 204, answer.text
         until(self.is_ready)
@@ -178,6 +189,10 @@ class OctoPrint:
         """Return whether the printer waits for work."""
         answer = self.client.get("/api/printer?exclude=temperature,sd")
         return answer.status_code == 200 and answer.json()["state"]["flags"]["ready"]
+
+    def job(self) -> dict[str, Any]:
+        """Return what is printed."""
+        return self.client.get("/api/job").json()
 
     def _set(self, **settings: Any) -> None:
         answer = self.client.post("/api/settings", json=settings)

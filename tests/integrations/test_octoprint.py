@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 
-from tests.integrations.octoprint import OctoPrint, install, octoprint_program
+from tests.integrations.octoprint import OctoPrint, install, octoprint_program, until
 from tests.integrations.posting import ROOT
 from tests.integrations.running import Running
-from tests.service.test_server import until
 
 pytestmark = pytest.mark.slow
 
@@ -166,6 +165,23 @@ def test_printed_afterwards_but_never_onto_another_print(octoprint: OctoPrint):
     ended = octoprint.ended("next.gcode")
     assert (ended["state"], ended["not_printed"]) == ("done", "another print began meanwhile")
     assert not octoprint.about("next.sp.gcode").get("prints")
+
+
+def test_what_is_printed_is_not_replaced(octoprint: OctoPrint):
+    octoprint.connect_printer()
+    octoprint.set(print_after=True)
+    octoprint.upload("twice.gcode", "G1 X1\nG4 S6\nG1 X2\n")
+    first = octoprint.ended("twice.gcode")
+    until(lambda: octoprint.job()["job"]["file"]["path"] == first["result"])
+    octoprint.upload("twice.gcode", "G1 X9\n")
+    until(lambda: "until twice.sp.gcode is printed" in octoprint.entry("twice.gcode")["stage"])
+    result = octoprint.uploads / "twice.sp.gcode"
+    assert "G4 S6" in result.read_text()
+    ended = octoprint.ended("twice.gcode")
+    assert ended["state"] == "done", ended
+    assert ended["not_printed"] == "the printer was not ready when the file came"
+    assert result.read_text() == "; compensated\nG1 X9\n"
+    until(octoprint.is_ready)
 
 
 def test_the_program_on_this_computer(octoprint: OctoPrint, tmp_path: Path):

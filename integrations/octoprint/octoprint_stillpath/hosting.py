@@ -127,7 +127,8 @@ class OctoPrintHost(Host):
         there = self.disk_path(target)
         if there is None or is_stamped(there):
             return
-        ours = self._files.get_additional_metadata(_LOCAL, target, METADATA) or {}
+        # OctoPrint's get_additional_metadata returns nothing (1.11.8, filemanager/__init__.py).
+        ours = (self._files.get_metadata(_LOCAL, target) or {}).get(METADATA) or {}
         if "source" not in ours:
             raise Failure(f"{target} is there and was not made by Stillpath; rename it")
 
@@ -146,7 +147,7 @@ class OctoPrintHost(Host):
         for known in (files.get_metadata(_LOCAL, added) or {}).get("links") or []:
             if known.get("rel") == "web":
                 files.remove_link(_LOCAL, added, "web", {"href": known.get("href")})
-        note = f"Compensated by Stillpath from {entry.path}: {made.sentence}."
+        note = f"Compensated by Stillpath from {entry.path}: {made.sentence.rstrip('.')}."
         if made.page:
             files.add_link(_LOCAL, added, "web", {"href": link})
             note += f" Report: {link}"
