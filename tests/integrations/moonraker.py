@@ -15,6 +15,7 @@ import os
 import re
 import socket
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -225,7 +226,7 @@ def moonraker_python() -> Path:
 
 
 class RealMoonraker:
-    """Moonraker from PyPI with our component, without a Klipper, as a process of its own.
+    """Moonraker from PyPI with our component, as a process of its own.
 
     Parameters
     ----------
@@ -233,12 +234,19 @@ class RealMoonraker:
         For its files; kept between starts.
     settings : dict
         Options of ``[stillpath]``.
+
+    Attributes
+    ----------
+    klippy : Path
+        Socket at which it looks for a Klipper.
     """
 
     def __init__(self, folder: Path, **settings: str) -> None:
         self._python = moonraker_python()
         self.data = folder / "printer_data"
         self.gcodes = self.data / "gcodes"
+        self._short = tempfile.TemporaryDirectory()  # names of sockets are short
+        self.klippy = Path(self._short.name) / "klippy"
         for name in ("config", "gcodes", "logs"):
             (self.data / name).mkdir(parents=True)
         with socket.create_server(("127.0.0.1", 0)) as free:
@@ -247,7 +255,7 @@ class RealMoonraker:
         own = "".join(f"{name}: {value}\n" for name, value in settings.items())
         (self.data / "config" / "moonraker.conf").write_text(
             f"[server]\nhost: 127.0.0.1\nport: {port}\n"
-            f"klippy_uds_address: {folder / 'klippy.sock'}\n"
+            f"klippy_uds_address: {self.klippy}\n"
             "[machine]\nprovider: none\nvalidate_service: False\nvalidate_config: False\n"
             "[authorization]\ntrusted_clients:\n  127.0.0.1\n"
             f"[stillpath]\n{own}"
@@ -279,6 +287,10 @@ class RealMoonraker:
                 process.kill()
                 process.wait()
                 raise
+
+    def close(self) -> None:
+        """Delete what does not lie in the folder."""
+        self._short.cleanup()
 
     @staticmethod
     def _answers(client: httpx2.Client) -> bool:

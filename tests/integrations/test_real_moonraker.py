@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,23 @@ from models.store import load_machine
 from service.deliveries.checking import Checker, PrinterUnknown
 from service.deliveries.printers import Printer
 from service.machines.documents import DocumentFolder
+from tests.integrations.klippy import klippy
 from tests.integrations.moonraker import RealMoonraker
 from tests.integrations.running import Running
+from tests.service.deliveries.recorded_printer import status_of
 from tests.service.test_server import until
 
 pytestmark = pytest.mark.slow
 
 PART = "nap 1 stamp\nG28\nG1 X10 Y10 F6000\n"
+
+
+@pytest.fixture
+def printer(tmp_path: Path, running: Running) -> Iterator[RealMoonraker]:
+    settings = {"server": running.address, "machine": "ender3"}
+    made = RealMoonraker(tmp_path, **settings, print_after="True")
+    yield made
+    made.close()
 
 
 def upload(client: httpx2.Client, name: str, text: str) -> None:
@@ -45,8 +56,7 @@ def metadata(client: httpx2.Client, name: str) -> dict[str, Any] | None:
     return answer.json()["result"] if answer.status_code == 200 else None
 
 
-def test_from_an_upload_to_two_files_with_metadata(tmp_path: Path, running: Running):
-    printer = RealMoonraker(tmp_path, server=running.address, machine="ender3")
+def test_from_an_upload_to_two_files_with_metadata(tmp_path: Path, printer: RealMoonraker):
     with printer.running() as client:
         info = client.get("/server/info").json()["result"]
         assert (info["failed_components"], info["warnings"]) == ([], [])
@@ -79,8 +89,7 @@ def test_from_an_upload_to_two_files_with_metadata(tmp_path: Path, running: Runn
     assert (printer.gcodes / "größe 1.sp.gcode").read_text().endswith("; compensated\n" + PART)
 
 
-def test_a_restart_in_between(tmp_path: Path, running: Running):
-    printer = RealMoonraker(tmp_path, server=running.address, machine="ender3")
+def test_a_restart_in_between(printer: RealMoonraker, running: Running):
     with printer.running() as client:
         upload(client, "a.gcode", "nap 4 stamp\n")
         running.running_job()
@@ -90,3 +99,27 @@ def test_a_restart_in_between(tmp_path: Path, running: Running):
         # Moonraker may hang if it is stopped while it reads metadata.
         until(lambda: metadata(client, "a.sp.gcode"))
     assert running.job_ids() == []
+
+
+def test_with_a_klipper_it_is_compared_and_the_result_printed(
+    tmp_path: Path, printer: RealMoonraker
+):
+    machine = load_machine("ender3")
+    status = status_of(machine)
+    status |= {name: {} for name in ("virtual_sdcard", "display_status", "pause_resume")}
+    status["webhooks"] = {"state": "ready", "state_message": "Printer is ready"}
+    left = Printer(name="left", kind="moonraker", url=printer.url, machine="ender3")
+    checker = Checker(DocumentFolder(tmp_path / "memory"))
+    with klippy(printer.klippy, status) as scripts, printer.running() as client:
+        until(lambda: client.get("/server/info").json()["result"]["klippy_state"] == "ready", 90)
+        found = checker.check(left, machine)
+        assert (found.findings, found.software) == ([], "v0.13.0-300-g1")
+        status["configfile"]["settings"]["printer"]["kinematics"] = "corexy"
+        status["toolhead"]["max_accel"] = 300_000.0
+        places = [finding.place for finding in checker.check(left, machine).unsafe]
+        assert places == ["[printer] kinematics", "max_accel"]
+        upload(client, "a.gcode", PART)
+        until(lambda: [each for each in scripts if "SDCARD_PRINT_FILE" in each])
+        until(lambda: metadata(client, "a.sp.gcode"))
+    [started] = [each for each in scripts if "SDCARD_PRINT_FILE" in each]
+    assert started == 'SDCARD_PRINT_FILE FILENAME="a.sp.gcode"'
