@@ -31,6 +31,15 @@ def address(running: Running) -> str:
     return running.address
 
 
+@pytest.fixture(autouse=True)
+def alone(request: pytest.FixtureRequest) -> None:
+    """Let no test find jobs of those before it on the server that all share."""
+    if "running" in request.fixturenames:
+        running: Running = request.getfixturevalue("running")
+        for job in running.job_ids():
+            running.client.delete(f"/v1/jobs/{job}")
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for missing, needed in (
         (NOT_HERE, "a slicer (tests/integrations/get-slicers)"),
