@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -42,6 +43,32 @@ REPORTS = {
     "gear-ender3-advise": (GEAR, "ender3", ["--method", "advise", "--budget-um", "25"]),
 }
 """Reports of the gallery, by name: file, machine, options."""
+MEASURED = {"x": (52.3, 0.045), "y": (34.6, 0.06)}
+"""Frequency and damping of the printer that the tutorial measures."""
+PRINTER_CFG = """\
+[printer]
+kinematics: cartesian
+max_velocity: 300
+max_accel: 3000
+max_z_velocity: 5
+max_z_accel: 100
+square_corner_velocity: 5.0
+[stepper_x]
+position_max: 235
+[stepper_y]
+position_max: 235
+[stepper_z]
+position_max: 250
+[extruder]
+pressure_advance: 0.04
+nozzle_diameter: 0.400
+filament_diameter: 1.750
+max_extrude_cross_section: 5
+[input_shaper]
+shaper_type: mzv
+shaper_freq_x: 52.0
+shaper_freq_y: 34.2
+"""
 STYLE = (
     "text{fill:#4a5559;font:12px system-ui,'Liberation Sans',sans-serif}"
     "text.small{font-size:10px}text.title{fill:#16262a;font-weight:600}"
@@ -217,6 +244,31 @@ def printers(benchmarks: str) -> str:
     return _svg(width, y + 10, "Contour error on four printers and three files", "".join(out))
 
 
+def tutorial(folder: Path) -> None:
+    """Go the way of docs/tutorials/bed-slinger.md: measurement, machine, model, file."""
+    from models.identification.synthetic import simulate_log, write_raw_data
+    from models.identification.types import Excitation
+    from models.plants import PairsSpec, PolePair
+
+    folder.mkdir(exist_ok=True)
+    (folder / "printer.cfg").write_text(PRINTER_CFG)
+    plants = {
+        axis: PairsSpec(poles=(PolePair(f_hz=f_hz, zeta=zeta),))
+        for axis, (f_hz, zeta) in MEASURED.items()
+    }
+    for k, (axis, direction) in enumerate({"x": (1.0, 0.0), "y": (0.0, 1.0)}.items()):
+        if not list(folder.glob(f"raw_data_{axis}_*")):
+            log = simulate_log(plants, Excitation(direction), rng=np.random.default_rng(k))
+            write_raw_data(log, folder, f"20261120_18{10 + 5 * k}00")
+    logs = sorted(folder.glob("raw_data_*"))
+    fit, report, data = (folder / name for name in ("fit", "report", "data"))
+    _once(data, "machines", "from-config", folder / "printer.cfg", "--name", "mine", data_dir=data)
+    _once(fit, "identify", *logs, "--machine", "mine", "--report", fit, data_dir=data)
+    out = folder / "gear.stillpath.gcode"
+    compensate = ["compensate", GEAR, "-o", out, "-m", "mine", "--report", report]
+    _once(report, *compensate, data_dir=data)
+
+
 def screenshots(work: Path) -> None:
     """Shoot our page and our reports."""
     from playwright.sync_api import sync_playwright
@@ -227,6 +279,7 @@ def screenshots(work: Path) -> None:
         folder = work / name
         out = work / f"{name}.gcode"
         _once(folder, "compensate", source, "-o", out, "-m", machine, "--report", folder, *options)
+    tutorial(work / "tutorial")
     browser_path = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as started:
         browser = started.chromium.launch(
@@ -234,8 +287,12 @@ def screenshots(work: Path) -> None:
             args=["--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
         )
         for name in REPORTS:
-            page = _opened(browser, (work / name / "report.html").as_uri(), height=1500)
+            page = _opened(browser, (work / name / "report.html").as_uri(), height=1780)
             _shoot(page, f"report-{name}.webp")
+        report = work / "tutorial" / "report" / "report.html"
+        _shoot(_opened(browser, report.as_uri(), height=1000), "report-tutorial.webp")
+        fit = work / "tutorial" / "fit" / "identification.html"
+        _shoot(_opened(browser, fit.as_uri(), height=1000), "identification.webp")
         page = _opened(browser, (work / "design" / "design.html").as_uri(), height=1200)
         _shoot(page, "design.webp")
         with running(work / "service") as service:
@@ -274,13 +331,14 @@ def _shoot(page: Page, name: str, part: Any = None) -> None:
     raise SystemExit(f"{name} is larger than {MOST_BYTES} bytes")
 
 
-def _once(made: Path, *arguments: object) -> None:
+def _once(made: Path, *arguments: object, data_dir: Path | None = None) -> None:
     """Run `stillpath` if what it makes is not there yet."""
     if made.exists():
         return
     code = "from service.cli import main; main()"
     command = [sys.executable, "-c", code, *map(str, arguments)]
-    subprocess.run(command, check=True, cwd=ROOT)
+    own = {} if data_dir is None else {"STILLPATH_DATA_DIR": str(data_dir)}
+    subprocess.run(command, check=True, cwd=ROOT, env=os.environ | own)
 
 
 def _um(values: Any) -> Sequence[float]:
