@@ -5,7 +5,7 @@ where an acceleration would help; and without a budget (the first run of each fi
 no longer than the original at no larger an error. `MISS` stands where it is not so.
 
     python benchmarks/advisor.py [NAME ...] [--machines ender3 voron-v24-250] [--budgets 0 25]
-        [--lines N]
+        [--lines N] [--firmware examples/firmware/marlin.json [--facts '{"inch_mode": true}']]
 
 Names are parts of names of the corpus, or paths; without any the whole corpus and the examples are
 taken. A budget of 0 stands for none.
@@ -14,6 +14,7 @@ taken. A budget of 0 stands for none.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -47,18 +48,19 @@ def main() -> int:
             if arguments.lines:
                 data = excerpt(data, arguments.lines, arguments.lines // 5)
             for machine in arguments.machines:
+                made = _machine(machine, arguments)
                 for budget_um in arguments.budgets:
-                    missed += _advised(path.name, data, machine, budget_um, Path(name))
+                    missed += _advised(path.name, data, made, budget_um, Path(name))
     return 1 if missed else 0
 
 
-def _advised(name: str, data: bytes, machine: str, budget_um: float, folder: Path) -> bool:
+def _advised(name: str, data: bytes, machine: Machine, budget_um: float, folder: Path) -> bool:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_bytes(data)
     target.unlink(missing_ok=True)
-    fitted = _known(made_to_fit(_thick(load_machine(machine)), data), machine, folder)
+    fitted = _known(made_to_fit(machine, data), folder)
     options = Options(method="advise", budget_um=budget_um or None)
-    row, began = f"{name[:40]:40} {machine:15} {budget_um:4.0f}", time.process_time()
+    row, began = f"{name[:40]:40} {machine.name:15} {budget_um:4.0f}", time.process_time()
     try:
         result = compensate_file(source, target, fitted, options, cache_dir=folder)
     except GcodeError as error:
@@ -110,16 +112,20 @@ def _files(names: list[str]) -> list[Path]:
     return paths + [p for p in every if any(word in p.name for word in words)]
 
 
-def _thick(machine: Machine) -> Machine:
-    """The machine with a nozzle for files of other printers."""
-    document = machine.model_dump(mode="json")
-    document["firmware"]["extruder"]["max_extrude_cross_section_mm2"] = 10.0
+def _machine(name: str, arguments: argparse.Namespace) -> Machine:
+    """Return a machine with another firmware, or with a nozzle for files of other printers."""
+    document = load_machine(name).model_dump(mode="json")
+    if arguments.firmware:
+        document["firmware"] = json.loads(arguments.firmware.read_text())
+    else:
+        document["firmware"]["extruder"]["max_extrude_cross_section_mm2"] = 10.0
+    document["firmware"] |= json.loads(arguments.facts)
     return Machine.model_validate(document)
 
 
-def _known(machine: Machine, name: str, folder: Path) -> Machine:
+def _known(machine: Machine, folder: Path) -> Machine:
     """Spare a machine whose plants are those of another the tuning of its yardstick."""
-    plain = load_machine(name)
+    plain = load_machine(machine.name)
     cached_shaper(plain, default_cache_dir())
     for path in default_cache_dir().glob(f"shaper-{plain.revision}-*"):
         copied = folder / path.name.replace(plain.revision, machine.revision)
@@ -132,6 +138,8 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("names", nargs="*", help="parts of names, or paths")
     parser.add_argument("--machines", nargs="+", default=["ender3", "voron-v24-250"])
     parser.add_argument("--budgets", nargs="+", type=float, default=[0.0, 25.0])
+    parser.add_argument("--firmware", type=Path, help="JSON of another firmware's section")
+    parser.add_argument("--facts", default="{}", help="JSON of what is different in it")
     parser.add_argument("--lines", type=int, help="only so many lines of each file's start")
     return parser.parse_args()
 

@@ -201,7 +201,12 @@ class _Job:
                 for f in choice.rung
                 if f in now and now[f].rms_um > _TOLERANCE * self._bound_um(f, was)
             }
-            if attempt + 1 == _ROUNDS or not over or not choice.mended(over):
+            if attempt + 1 < _ROUNDS and over and choice.mended(over):
+                continue
+            worse = bool(over) or _rms_um(now) > _TOLERANCE * _rms_um(was)
+            unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
+            # Too little to choose from: what was there is better than any advice.
+            if not (unbudgeted and worse and choice.withdrawn()):
                 break
         return writer, now
 
@@ -425,6 +430,13 @@ class _Job:
             advice=figures,
             stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
         )
+
+
+def _rms_um(errors: dict[int, ClassError]) -> float:
+    """Return the error of all features together."""
+    seconds = sum(one.seconds for one in errors.values())
+    squares = sum(one.seconds * one.rms_um**2 for one in errors.values())
+    return float(np.sqrt(squares / (seconds or 1.0)))
 
 
 def _first_command(text: bytes) -> int:

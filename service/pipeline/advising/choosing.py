@@ -99,6 +99,12 @@ class Choice:
         """
         return bool(sum([self._slower(f, 1.0 / ratio) for f, ratio in over.items()]))
 
+    def withdrawn(self) -> bool:
+        """Leave everything as the file has it; return whether anything was advised."""
+        advised = bool(self.shapers) or any(k is not None for k in self.rung.values())
+        self.shapers, self.rung = [], dict.fromkeys(self.rung)
+        return advised
+
     def _slower(self, feature: int, ratio: float) -> bool:
         if feature in self.helpless:
             return False
