@@ -40,16 +40,12 @@ if TYPE_CHECKING:
     from typing import BinaryIO, NoReturn, TextIO
 
 PROGRAM = "stillpath-post"
-_JOB_OPTIONS = (
-    *("method", "basis", "robust", "along"),
-    *("tolerance_um", "budget_um", "times", "plate"),
-)
+_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "budget_um", "times", "plate")
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")
 _SUFFIXES = (".gcode.3mf", ".gcode", ".bgcode", ".gco", ".g")
-_SHOWN_EVERY_S = 0.1  # on a terminal
-_SAID_EVERY_S = 5.0  # elsewhere
+_SHOWN_EVERY_S, _SAID_EVERY_S = 0.1, 5.0  # on a terminal, elsewhere
 
 
 class Stopped(BaseException):
@@ -244,7 +240,7 @@ class Settings:
         given.on_error = given.on_error or read.get("on_error", "fail")
         if given.on_error not in ("fail", "keep"):
             raise Failure(f"{self.path}: on_error is 'fail' or 'keep', not {given.on_error!r}")
-        chosen = {name: getattr(given, name) for name in _JOB_OPTIONS}
+        chosen = {name: getattr(given, name) for name in _OPTIONS}
         chosen["method"] = chosen["method"] or read.get("method")
         self.job_options = {name: value for name, value in chosen.items() if value is not None}
 
@@ -749,8 +745,8 @@ def _parser() -> _Parser:
     add("--basis", metavar="B")
     add("--robust", metavar="R")
     add("--along", metavar="W", type=float)
-    add("--tolerance-um", metavar="T", type=float)
-    add("--budget-um", metavar="B", type=float)
+    for name in ("--tolerance-um", "--budget-um"):
+        add(name, metavar="UM", type=float)
     add("--times", choices=("new", "kept"), help="kept: the slicer's times stay in the file")
     add("--plate", metavar="N", type=int)
     add("--on-error", choices=("fail", "keep"), help="keep: print what was sliced, exit code 0")
