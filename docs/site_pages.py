@@ -29,6 +29,8 @@ _TAKEN_OVER = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md
 """From a file of the root to its page."""
 _LINK = re.compile(r"(?<!!)\[([^\]\n]*)\]\(([^)\s]+)\)")
 _MADE = "Made from the program when this site was built."
+_PIPE_IN_CODE = re.compile(r"`([^`\n]*\\\|[^`\n]*)`")
+"""In tables GitHub drops the backslash, Python-Markdown does not."""
 _POLICY = (
     "default-src 'none'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data:; connect-src 'self'; worker-src 'self'; font-src 'self'; "
@@ -68,7 +70,11 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
             return text
         return f"[{text}]({posixpath.relpath(target, here)}{mark}{anchor})"
 
-    return _LINK.sub(turned, markdown)
+    return _PIPE_IN_CODE.sub(_unescaped, _LINK.sub(turned, markdown))
+
+
+def _unescaped(code: re.Match[str]) -> str:
+    return _code(code[1].replace("\\|", "|"))
 
 
 def on_post_page(output: str, **_: Any) -> str:

@@ -1,4 +1,4 @@
-"""The documentation site: its nav names every page, it builds, and loads nothing from other hosts."""
+"""The documentation site: its nav names every page, it builds, it loads nothing from elsewhere."""
 
 from __future__ import annotations
 
