@@ -297,8 +297,8 @@ def screenshots(work: Path) -> None:
         _shoot(page, "design.webp")
         with running(work / "service") as service:
             page = _opened(browser, f"{service.url}/#/", height=860)
-            page.locator("h1").wait_for()
-            page.wait_for_timeout(1500)
+            page.get_by_role("button", name="Compensate").wait_for()
+            page.wait_for_timeout(1500)  # what is loaded late settles
             _shoot(page, "page-new-job.webp")
             job = service.finished(service.submit(GEAR.read_bytes(), GEAR.name))
             page = _opened(browser, f"{service.url}/#/jobs/{job['id']}", height=1100)
@@ -307,7 +307,7 @@ def screenshots(work: Path) -> None:
             page.locator(".stage").scroll_into_view_if_needed()
             _shoot(page, "page-layers.webp", page.locator(".stage"))
             page = _opened(browser, f"{service.url}/#/machines/ender3", height=1100)
-            page.locator("h1").wait_for()
+            page.get_by_role("heading", name="Frequency response").wait_for()
             page.wait_for_timeout(3000)
             _shoot(page, "page-machine.webp")
         browser.close()
