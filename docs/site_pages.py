@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
 
-__all__ = ["GENERATED", "on_files", "on_page_markdown", "on_post_page"]
+__all__ = ["GENERATED", "on_files", "on_page_markdown", "on_post_page", "on_post_template"]
 
 ROOT = Path(__file__).resolve().parents[1]
 _TAKEN_OVER = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
@@ -81,6 +81,11 @@ def on_post_page(output: str, **_: Any) -> str:
     """Give every page a content security policy."""
     meta = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
     return output.replace("<head>", f"<head>\n      {meta}", 1)
+
+
+def on_post_template(output: str, **_: Any) -> str:
+    """Give the page for wrong addresses the same; it is made of a template alone."""
+    return on_post_page(output)
 
 
 def commands_page() -> str:
