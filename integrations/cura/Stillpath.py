@@ -113,6 +113,16 @@ _SETTINGS: dict[str, dict[str, Any]] = {
         "minimum_value": "0.5",
         "maximum_value": "50",
     },
+    "budget_um": {
+        "label": "Budget",
+        "description": "Contour error that may become speed, or that advice keeps walls within. "
+        "0: none; the print is as quick as it was sliced.",
+        "unit": "\u00b5m",
+        "type": "float",
+        "default_value": 0.0,
+        "minimum_value": "0",
+        "maximum_value": "1000",
+    },
     "times": {
         "label": "Times",
         "description": "Times in the G-code: of the compensated print, or as Cura wrote them.",
@@ -235,6 +245,8 @@ class Stillpath(Script):
     def _options(self) -> dict[str, Any]:
         names = ("method", "robust", "tolerance_um", "times")
         options = {name: self._value(name) for name in names}
+        if self._value("budget_um"):
+            options["budget_um"] = self._value("budget_um")
         return options if options["method"] == "fbf" else {**options, "robust": "off"}
 
     def _value(self, key: str) -> Any:

@@ -136,6 +136,12 @@ def test_settings_that_cura_read_back_are_text(cura: Cura, script: Any):
     assert cura.shown[-1][0] == "POSITIVE", cura.shown
 
 
+def test_a_budget_is_told_only_where_there_is_one(cura: Cura, script: Any):
+    assert "budget_um" not in script._options()
+    script.values["budget_um"] = 12.5
+    assert Options(**script._options()).budget_um == 12.5
+
+
 def test_the_panel(cura: Cura):
     definition = cura.load().definition
     for key, setting in definition.items():
