@@ -138,6 +138,10 @@ class Adviser(Protocol):
         """Types that a file may set, by our names (`models.shaper_pulses`); empty: none."""
 
     @property
+    def shaper_word(self) -> str:
+        """The command that sets it."""
+
+    @property
     def same_for_both(self) -> bool:
         """X and Y share one type and one frequency (RepRapFirmware)."""
 

@@ -24,6 +24,7 @@ class KlipperAdviser:
     """
 
     shapers = SHAPERS
+    shaper_word = "SET_INPUT_SHAPER"
     same_for_both = False
     travel_apart = False
 

@@ -46,6 +46,7 @@ class MarlinAdviser:
         elif firmware.variant == "2.0":
             self.stated = OFF
         self._fixed_time = firmware.ft_motion
+        self.shaper_word = "M493" if self._fixed_time else "M593"
         if self._fixed_time:
             # What M593 states is not what fixed-time motion does.
             self.stated = None
@@ -87,9 +88,8 @@ class MarlinAdviser:
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
         """Return what an M593 or M493 leaves in force."""
-        name = "M493" if self._fixed_time else "M593"
         for command in split_line(text, self._dialect):
-            if command.name != name:
+            if command.name != self.shaper_word:
                 continue
             both = not command.words.keys() & {"X", "Y"}
             hertz, zeta = ("A", "I") if self._fixed_time else ("F", "D")

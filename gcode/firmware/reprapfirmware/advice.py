@@ -29,6 +29,7 @@ class RepRapAdviser:
     """
 
     shapers = tuple(_NAMES)
+    shaper_word = "M593"
     same_for_both = True
     travel_apart = True
 

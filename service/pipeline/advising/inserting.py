@@ -26,7 +26,7 @@ MARK = b"; stillpath advise"
 """Every inserted line holds it, and no line of a file that is advised."""
 
 _VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
-_HEEDED = np.array([EventKind.LIMITS, EventKind.UNKNOWN, EventKind.SHAPER])
+_HEEDED = np.array([EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER])
 
 
 class AdviceWriter:
@@ -64,7 +64,11 @@ class AdviceWriter:
         """The shaper of ours that is in force; None: another, or nobody knows."""
         self._shaped = False
         self._own_shaper: dict[bytes, bytes] = {}
-        """The file's own lines that set a shaper, the last of each form."""
+        """The file's own commands that set a shaper, the last of each form."""
+        # A line may hold others before it and behind.
+        self._sets_shaper = re.compile(
+            rb"\b%s\b(?:(?![GMT]\d)[^;])*" % adviser.shaper_word.encode(), re.IGNORECASE
+        )
         self._rests = True
         self.lines = 0
         self.shaper_left = False
@@ -147,18 +151,22 @@ class AdviceWriter:
             lead = self._give_back()
             self._now, self._shaper, self._rests = None, None, True
         elif kind == EventKind.SHAPER:
-            code = line.split(b";", 1)[0].strip()
-            form = _VALUE.sub(b"", code.upper())
-            self._own_shaper = {k: v for k, v in self._own_shaper.items() if k != form}
-            self._own_shaper[form] = code
-            self._shaper, self._rests = None, True
+            self._rests = True
+            for code in self._sets_shaper.findall(line.split(b";", 1)[0]):
+                form = _VALUE.sub(b"", code.upper())
+                self._own_shaper = {k: v for k, v in self._own_shaper.items() if k != form}
+                self._own_shaper[form] = code.strip()
+                self._shaper = None
         self._file = self._adviser.accel_mm_s2(block.limits[int(events.limits_id[row])])
-        if kind == EventKind.LIMITS and self._sets_accel(line):
+        if kind != EventKind.UNKNOWN and self._sets_accel(line):
             self._now = self._file
         return lead
 
     def _move(self, block: ProgramBlock, row: int) -> bytes:
-        wanted, self._file = float(self._wanted[row]), float(self._theirs[row])
+        wanted, theirs = float(self._wanted[row]), float(self._theirs[row])
+        if theirs != self._file:
+            # Set in the line of a move.
+            self._file = self._now = theirs
         self._layer = int(block.moves.layer[row])
         prints = not np.isnan(wanted)
         lead = self._set_shaper(prints)

@@ -170,3 +170,25 @@ def motion(path: np.ndarray) -> MotionSamples:
     none = np.zeros(0)
     moves = Moves(*[none] * len(Moves.__dataclass_fields__))
     return MotionSamples(path, path, np.zeros(n), np.zeros(n, bool), np.zeros(n, np.int64), moves)
+
+
+def test_lines_with_several_commands() -> None:
+    machine = klipper().model_copy(update={"firmware": RepRapFirmware()})
+    ours = Shaping(AxisShaper("mzv", 41.0), AxisShaper("mzv", 41.0))
+    head = b"M83\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:External perimeter\nG1 X5 E1 F600\n"
+    lines = [
+        b"M572 D0 S0.04",
+        b"M204 P500 M572 D0 S0.05",
+        b"M204 P500 M400",
+        b"G1 X20 M204 P700",
+        b"M593 F40 G1 X50",
+    ]
+    data = head + b"".join(line + b"\nG1 X%d E1\n" % k for k, line in enumerate(lines))
+    out = written(data, machine, Advice({0: Bound(2400.0, 2400.0)}, [(-1, ours)]))
+    moves = printed(out, machine)
+    assert len(moves) == 1 + len(lines)
+    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    assert {adviser.accel_mm_s2(limits) for _, _, limits, _ in moves} == {2400.0}
+    # Of what the file sets only the shaper comes back, no move and no pressure advance.
+    behind = [x for x in out.splitlines() if b"own shaper" in x]
+    assert [x.split(b" ;")[0] for x in behind] == [b'M593 P"none"', b"M593 F40"]
