@@ -8,8 +8,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -227,11 +227,14 @@ def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
     _WISHES.append(mine)
     try:
         with _turn(engine):
-            if not mine.is_over:
+            if not mine.over.is_set():
                 _fulfil(engine)
+    except DatabaseAway:
+        if _withdraw(mine):
+            raise
+        mine.over.wait()  # somebody is at it: only then is known what came of it
     finally:
-        with suppress(ValueError):  # taken already
-            _WISHES.remove(mine)
+        _withdraw(mine)
     if mine.error is not None:
         raise mine.error
     return cast("_T", mine.result)
@@ -267,7 +270,7 @@ class _Wish:
 
     engine: Engine
     work: Callable[[Connection], Any]
-    is_over: bool = False
+    over: threading.Event = field(default_factory=threading.Event)
     result: Any = None
     error: BaseException | None = None
 
@@ -277,14 +280,29 @@ class _Wish:
                 self.result = self.work(connection)
         except Exception as error:  # its owner's, not that of whose turn it is
             self.error = error
+            if not _is_open(connection):
+                raise  # SQLite has undone the others' as well
+
+
+def _withdraw(wish: _Wish) -> bool:
+    """Take a wish out of the line; False: somebody has taken it already."""
+    try:
+        _WISHES.remove(wish)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_open(connection: Connection) -> bool:
+    """Return whether SQLite's transaction is; it ends one by itself when the disk is full."""
+    driver: Any = connection.connection.dbapi_connection
+    return bool(driver.in_transaction)
 
 
 def _fulfil(engine: Engine) -> None:
     """Do what all in line want, in one transaction."""
-    wishes = [wish for wish in _WISHES.copy() if wish.engine is engine]
-    for wish in wishes:
-        with suppress(ValueError):  # its owner has given up
-            _WISHES.remove(wish)
+    # Not those that their owners withdraw at this moment.
+    wishes = [wish for wish in _WISHES.copy() if wish.engine is engine and _withdraw(wish)]
     try:
         with _plainly(engine), engine.begin() as connection:
             for wish in wishes:
@@ -296,7 +314,7 @@ def _fulfil(engine: Engine) -> None:
             raise
     finally:
         for wish in wishes:
-            wish.is_over = True
+            wish.over.set()
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from service.database.engine import (
     open_database,
     reading,
     write_together,
+    writing,
 )
 from service.jobs.state import Cancelled, Event, Failed, JobState, Lost
 from service.jobs.store import JobStore, Quota, QuotaExceeded
@@ -258,6 +259,53 @@ def test_what_many_want_at_once_is_written_together(engine: Engine):
     with reading(engine) as connection:
         names = set(connection.execute(select(tables.leases.c.name)).scalars())
     assert names == {f"lease{n}" for n in range(12) if n % 3}
+
+
+def test_who_shares_a_transaction_with_a_full_disk_is_told(tmp_path: Path):
+    """SQLite undoes all of it at once, and not only what did not fit."""
+    engine = make_engine(URL.create("sqlite", database=str(tmp_path / "x.sqlite3")))
+    with writing(engine) as connection:
+        connection.exec_driver_sql("CREATE TABLE t (n INTEGER, text TEXT)")
+
+    def wish(n: int) -> object:
+        def work(connection: Connection) -> int:
+            time.sleep(0.01)  # for others to stand in line
+            pages = 3 if n == 4 else 1_000_000
+            connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+            connection.exec_driver_sql("INSERT INTO t VALUES (?, ?)", (n, "x" * 100_000))
+            return n
+
+        return write_together(engine, work)
+
+    answers = at_once(*(partial(wish, n) for n in range(8)))
+    assert isinstance(answers[4], DatabaseAway)
+    with reading(engine) as connection:
+        kept = set(connection.exec_driver_sql("SELECT n FROM t").scalars())
+    assert {answer for answer in answers if isinstance(answer, int)} == kept
+    engine.dispose()
+
+
+def test_who_loses_patience_hears_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Told that the database is away, nobody finds his wish fulfilled later."""
+    engine = make_engine(URL.create("sqlite", database=str(tmp_path / "x.sqlite3")))
+    with writing(engine) as connection:
+        connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
+    monkeypatch.setattr("service.database.engine._BUSY_TIMEOUT_MS", 60)
+
+    def wish(n: int) -> object:
+        def work(connection: Connection) -> int:
+            time.sleep(0.04)
+            connection.exec_driver_sql("INSERT INTO t VALUES (?)", (n,))
+            return n
+
+        return write_together(engine, work)
+
+    answers = at_once(*(partial(wish, n) for n in range(6)))
+    assert all(isinstance(answer, int | DatabaseAway) for answer in answers)
+    with reading(engine) as connection:
+        kept = set(connection.exec_driver_sql("SELECT n FROM t").scalars())
+    assert {answer for answer in answers if isinstance(answer, int)} == kept
+    engine.dispose()
 
 
 def test_a_database_that_is_away_is_so_for_all_who_wait(tmp_path: Path):
