@@ -102,6 +102,14 @@ def test_a_pause_outside_of_stretches_gives_the_files_limits_back_and_leaves_the
     assert limits(printer) == ((300.0, 2500.0, 3.0, 0.5), 57.8)
 
 
+def test_resume_without_a_pause_brings_nothing_back():
+    printer = in_stretch(USERS, OURS)
+    printer.run("PAUSE")
+    printer.is_paused = False  # CLEAR_PAUSE, as start macros send it; then another print
+    printer.run("RESUME")
+    assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
+
+
 def test_a_pause_among_the_files_own_moves_of_a_stretch():
     """There the file's limits are in force, marked, and the shaper is off."""
     printer = Klipper(macros_of(OURS))
