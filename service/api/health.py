@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import asyncio
 import time
 
 import structlog
@@ -36,7 +36,7 @@ async def readyz(request: Request) -> Health:
     Anybody may ask, as often as he likes: the parts are asked once in two seconds, and why one
     does not answer, which may name other computers, stands in the log.
     """
-    part = await run_in_threadpool(request.app.state.readiness.missing, request)
+    part = await request.app.state.readiness.missing(request)
     if part is not None:
         raise Problem(503, "Not ready", f"{part}: see the log of the service", part=part)
     return Health(status="ok", version=__version__)
@@ -46,15 +46,15 @@ class Readiness:
     """Which part of the service does not answer, as of a moment ago."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = asyncio.Lock()  # those who wait hold no thread: a part may take its time
         self._asked_at = -_FRESH_S
         self._missing: str | None = None
 
-    def missing(self, request: Request) -> str | None:
+    async def missing(self, request: Request) -> str | None:
         """Return `database`, `storage` or `workers`; None: all answer."""
-        with self._lock:
+        async with self._lock:
             if time.monotonic() - self._asked_at >= _FRESH_S:
-                found = _reason(request)
+                found = await run_in_threadpool(_reason, request)
                 if found is not None:
                     part, reason = found
                     structlog.get_logger("api").warning("not ready", part=part, reason=reason)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -76,6 +78,20 @@ def test_how_long_jobs_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def seconds_of(job: dict[str, Any]) -> float:
     started, finished = (datetime.fromisoformat(job[f"{name}_at"]) for name in _ENDS)
     return (finished - started).total_seconds()
+
+
+def test_who_waits_for_a_slow_part_holds_no_thread(tmp_path: Path, monkeypatch):
+    with opened(tmp_path) as client, ThreadPoolExecutor(45) as pool:
+        go = threading.Event()
+
+        def slow() -> None:
+            assert go.wait(30)
+
+        monkeypatch.setattr(client.app.state.storage, "check", slow)
+        waiting = [pool.submit(client.get, "/readyz") for _ in range(45)]
+        assert client.get("/v1/machines").status_code == 200
+        go.set()
+        assert {answer.result().status_code for answer in waiting} == {200}
 
 
 def test_not_ready_says_which_part(tmp_path: Path, monkeypatch):
