@@ -22,15 +22,26 @@ from gcode.pieces import Piece
 from gcode.types import Moves
 from models.machine import CommandLimits, Machine
 
-__all__ = ["AS_SLICED", "SAME", "TRAVEL", "Pace", "move_classes", "quickened", "top_limits"]
+__all__ = [
+    "AS_SLICED",
+    "SAME",
+    "TRAVEL",
+    "FirstLayer",
+    "Pace",
+    "move_classes",
+    "quickened",
+    "top_limits",
+]
 
 Ints = NDArray[np.int32]
+Mask = NDArray[np.bool_]
 
 TRAVEL, AS_SLICED = -2, -3
 """Classes beside the features, whose ids begin at -1 (unnamed)."""
 
 _ACCEL_ROOM, _SPEED_ROOM = 0.7, 0.9
 """Parts of the command's limits that a plan may use: the command itself swings beyond the plan."""
+_SAME_Z_MM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +56,35 @@ class Pace:
 SAME = Pace()
 
 
-def move_classes(moves: Moves, *, first_layer: int = 1) -> Ints:
+@dataclass(frozen=True, slots=True)
+class FirstLayer:
+    """What sticks to the bed, of all objects where they are printed one after another.
+
+    Attributes
+    ----------
+    below : int
+        Layers below are part of it; -1 where the file does not tell its layers.
+    z_mm : float
+        So is what is not higher; minus infinity where nobody knows.
+    """
+
+    below: int = 1
+    z_mm: float = -np.inf
+
+    def has(self, moves: Moves) -> Mask:
+        """Mark the moves that belong to it, shape (n,)."""
+        low = moves.end_mm[:, 2] <= self.z_mm + _SAME_Z_MM
+        return np.asarray((moves.layer < self.below) | low)
+
+
+def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
     """Return the class of every move.
 
     Parameters
     ----------
     moves : Moves
-    first_layer : int
-        Moves of layers below stay as they are; -1 where the file does not tell its layers.
+    first_layer : FirstLayer
+        Its moves stay as they are.
 
     Returns
     -------
@@ -62,7 +94,7 @@ def move_classes(moves: Moves, *, first_layer: int = 1) -> Ints:
     way = moves.end_mm - moves.start_mm
     xy = (way[:, 0] != 0.0) | (way[:, 1] != 0.0)
     classes = np.where(way[:, 3] > 0.0, moves.feature, TRAVEL)
-    kept = ~xy | (way[:, 3] < 0.0) | (moves.layer < first_layer)
+    kept = ~xy | (way[:, 3] < 0.0) | first_layer.has(moves)
     return np.where(kept, AS_SLICED, classes).astype(np.int32)
 
 

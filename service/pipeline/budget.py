@@ -18,7 +18,15 @@ import numpy as np
 
 from compensation.shapers import shape, shaper_pulses
 from gcode.pieces import Piece
-from gcode.quickening import AS_SLICED, TRAVEL, Pace, move_classes, quickened, top_limits
+from gcode.quickening import (
+    AS_SLICED,
+    TRAVEL,
+    FirstLayer,
+    Pace,
+    move_classes,
+    quickened,
+    top_limits,
+)
 from gcode.sampler import sample_phases
 from gcode.types import Moves, Phases
 from models.machine import Machine
@@ -86,7 +94,7 @@ class SpeedBudget:
 
     machine: Machine
     budget_um: float
-    first_layer: int
+    first_layer: FirstLayer
     paces: PaceChoice
     shaper_paces: PaceChoice
     shaper_s: float = 0.0
@@ -122,7 +130,7 @@ class SpeedBudget:
 
         What it would take with the shaper is counted.
         """
-        classes = move_classes(piece.moves, first_layer=self.first_layer)
+        classes = move_classes(piece.moves, self.first_layer)
         with_shaper = quickened(piece, classes, _paces(self.shaper_paces.factors), self.machine)
         self.shaper_s += _duration_s(with_shaper.phases)
         for share in _GENTLER:

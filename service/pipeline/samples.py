@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gcode.dialect import Dialect
 from gcode.interpreter import Interpreter
 from gcode.pieces import Passage, Piece, Splitter, excerpt
-from gcode.quickening import AS_SLICED, move_classes
-from gcode.types import Phases
+from gcode.quickening import AS_SLICED, FirstLayer, move_classes
+from gcode.types import Moves, Phases
 from models.machine import Machine
 from models.schedule import OperatingPoint
 from service.pipeline.operating import Operation
@@ -48,12 +48,11 @@ class FileSamples:
     Attributes
     ----------
     samples : list of Sample
-    first_layer : int
-        As `gcode.quickening.move_classes` takes it: -1 for a file that does not tell its layers.
+    first_layer : FirstLayer
     """
 
     samples: list[Sample]
-    first_layer: int
+    first_layer: FirstLayer
 
 
 @dataclass(slots=True)
@@ -98,19 +97,18 @@ def take_samples(
         Is given the bytes read so far.
     """
     operation = Operation(machine)
-    places: dict[tuple[bool, int], _Places] = {}
-    layered = False
+    places: dict[tuple[int, int], _Places] = {}
+    first_layer = FirstLayer(-1)
     for number, item in enumerate(_items(source, machine, dialect, told)):
-        layered |= bool(np.any(item.moves.layer >= 1))
+        first_layer = _seen(first_layer, item.moves)
         point = operation.at(item.moves)
         operation.passed(item.moves)
         if isinstance(item, Piece):
-            _take(item, number, point, places, machine, layered=layered)
-    # Before the second layer comes, nobody knows whether the file tells its layers.
-    wanted = [one for (above, _), one in sorted(places.items()) if above or not layered]
+            _take(item, number, point, places, machine, first_layer)
+    # Until the second layer comes, nobody knows whether and how the file tells its layers.
+    wanted = [one for (below, _), one in sorted(places.items()) if below == first_layer.below]
     each = int(np.clip(_TOTAL_S / _LASTS_S / max(len(wanted), 1), _FEWEST, _MOST))
     chosen = {entry[:3]: entry[3] for one in wanted for entry in one.some(each)}
-    first_layer = 1 if layered else -1
     return FileSamples([_above(chosen[key], first_layer) for key in sorted(chosen)], first_layer)
 
 
@@ -128,19 +126,28 @@ def _items(
     yield from splitter.flush()
 
 
+def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
+    """Return what is known of the first layer when these moves have come."""
+    below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
+    way = moves.end_mm - moves.start_mm
+    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0) & (moves.layer >= 0)
+    if np.isfinite(known.z_mm) or not np.any(prints):
+        return FirstLayer(below, known.z_mm)
+    return FirstLayer(below, float(moves.end_mm[np.argmax(prints), 2]))
+
+
 def _take(
     piece: Piece,
     number: int,
     point: OperatingPoint,
-    places: dict[tuple[bool, int], _Places],
+    places: dict[tuple[int, int], _Places],
     machine: Machine,
-    *,
-    layered: bool,
+    first_layer: FirstLayer,
 ) -> None:
     """Take the samples of a piece that are due."""
-    classes = move_classes(piece.moves, first_layer=1 if layered else -1)
+    classes = move_classes(piece.moves, first_layer)
     for one in np.unique(classes[classes != AS_SLICED]).tolist():
-        place = places.setdefault((layered, one), _Places())
+        place = places.setdefault((first_layer.below, one), _Places())
         if place.due:
             rows = np.flatnonzero(classes == one)
             row = int(rows[int(len(rows) * (place.seen * _SPREAD % 1.0))])
@@ -171,6 +178,6 @@ def _around(phases: Phases, row: int) -> tuple[int, int]:
     return first, last + 1
 
 
-def _above(sample: Sample, first_layer: int) -> Sample:
-    classes = move_classes(sample.piece.moves, first_layer=first_layer)
+def _above(sample: Sample, first_layer: FirstLayer) -> Sample:
+    classes = move_classes(sample.piece.moves, first_layer)
     return Sample(sample.piece, classes, sample.point)

@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.pieces import Piece, Splitter, excerpt
-from gcode.quickening import AS_SLICED, TRAVEL, Pace, move_classes, quickened, top_limits
+from gcode.quickening import (
+    AS_SLICED,
+    TRAVEL,
+    FirstLayer,
+    Pace,
+    move_classes,
+    quickened,
+    top_limits,
+)
 from models.firmware import Marlin, RepRapFirmware
 from models.machine import Machine
 from models.store import load_machine
@@ -76,9 +84,11 @@ def test_classes_tell_what_stays() -> None:
     assert set(classes[later & (way[:, 3] == 0.0) & ~still]) == {TRAVEL}
     assert len(set(classes[later & (way[:, 3] > 0.0) & ~still])) == 2
     # A file that tells no layers has no first one.
-    assert np.count_nonzero(move_classes(moves, first_layer=-1) == AS_SLICED) < np.count_nonzero(
-        classes == AS_SLICED
-    )
+    untold = move_classes(moves, FirstLayer(-1)) == AS_SLICED
+    assert np.count_nonzero(untold) < np.count_nonzero(classes == AS_SLICED)
+    # Printed one after another, every object has one.
+    z_mm = float(moves.end_mm[later, 2].max())
+    assert np.all(move_classes(moves, FirstLayer(1, z_mm)) == AS_SLICED)
 
 
 @pytest.mark.parametrize("firmware", MACHINES)

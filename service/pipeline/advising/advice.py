@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.firmware.base import Adviser
+from gcode.quickening import FirstLayer
 from gcode.slicers.features import Feature, feature_of
 from gcode.types import KEPT, Limits, Moves
 from models.shaping import Shaping
@@ -54,13 +55,13 @@ class Advice:
     shapers : sequence of (layer, Shaping)
         From which layer on a shaper holds, rising; the first holds from the first line.
         Empty: the firmware's own shaper stays.
-    first_layer : int
-        Layers below keep the file's accelerations.
+    first_layer : FirstLayer
+        It keeps the file's accelerations.
     """
 
     bounds: Mapping[int, Bound] = field(default_factory=dict)
     shapers: Sequence[tuple[int, Shaping]] = ()
-    first_layer: int = 1
+    first_layer: FirstLayer = field(default_factory=FirstLayer)
 
     def shaping(self, layer: int) -> Shaping | None:
         """Return the shaper of a layer."""
@@ -93,7 +94,7 @@ def wanted_accel(
     used, place = np.unique(moves.limits_id, return_inverse=True)
     file = np.array([adviser.accel_mm_s2(limits[k]) for k in used.tolist()])[place.reshape(-1)]
     wanted = np.where(prints, file, np.nan)
-    free = prints & (moves.layer >= advice.first_layer) & ((moves.known & KEPT) == 0)
+    free = prints & ~advice.first_layer.has(moves) & ((moves.known & KEPT) == 0)
     for feature, bound in advice.bounds.items():
         rows = free & (moves.feature == feature)
         wanted[rows] = np.clip(file[rows], bound.at_least, None).clip(None, bound.at_most)

@@ -25,6 +25,7 @@ from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
+from gcode.quickening import FirstLayer
 from gcode.slicers.facts import SlicerFacts
 from gcode.types import EventKind, Moves, ProgramBlock
 from models.machine import Machine
@@ -188,7 +189,7 @@ class _Job:
         )
 
     def _settled(
-        self, choice: Choice, was: dict[int, ClassError], first_layer: int
+        self, choice: Choice, was: dict[int, ClassError], first_layer: FirstLayer
     ) -> tuple[AdviceWriter, dict[int, ClassError]]:
         """Write and measure until every feature is within its bound or at its slowest."""
         for attempt in range(_ROUNDS):
@@ -215,7 +216,7 @@ class _Job:
             return self._options.budget_um
         return max(was[feature].rms_um, 1e-3) if feature in was else np.inf
 
-    def _write(self, choice: Choice, first_layer: int) -> AdviceWriter:
+    def _write(self, choice: Choice, first_layer: FirstLayer) -> AdviceWriter:
         """Write the advised text to the spool."""
         reader = Interpreter(self._machine, dialect=self._dialect)
         writer = AdviceWriter(

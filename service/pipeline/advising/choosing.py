@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gcode.firmware.base import Adviser
+from gcode.quickening import FirstLayer
 from gcode.slicers.features import feature_of
 from models.machine import Machine
 from models.operating import OperatingGrid
@@ -85,7 +86,7 @@ class Choice:
             if k is not None
         }
 
-    def advice(self, first_layer: int) -> Advice:
+    def advice(self, first_layer: FirstLayer) -> Advice:
         """Return what to write."""
         return Advice(self.bounds(), self.shapers, first_layer)
 
@@ -157,7 +158,7 @@ def choose(
     features = [f for f in as_sliced.features if _free(f, names)]
     visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
     was = as_sliced.errors(before)
-    limit = {f: _AIM * (was[f] if budget_um is None else budget_um) for f in features}
+    limit = {f: _AIM * (max(was[f], 1e-3) if budget_um is None else budget_um) for f in features}
     choice = Choice(
         ladder(adviser.highest_mm_s2, machine),
         dict.fromkeys(features),
