@@ -17,6 +17,7 @@ from models.shaping import Shaping
 __all__ = ["KEPT_FEATURES", "Advice", "Bound", "is_visible", "wanted_accel"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 KEPT_FEATURES = frozenset(
     {
@@ -63,6 +64,10 @@ class Advice:
     shapers: Sequence[tuple[int, Shaping]] = ()
     first_layer: FirstLayer = field(default_factory=FirstLayer)
 
+    def keeps(self, moves: Moves) -> Mask:
+        """Mark the moves that stay as the file has them, travel as well."""
+        return np.asarray(self.first_layer.has(moves) | ((moves.known & KEPT) != 0))
+
     def shaping(self, layer: int) -> Shaping | None:
         """Return the shaper of a layer."""
         found = None
@@ -94,7 +99,7 @@ def wanted_accel(
     used, place = np.unique(moves.limits_id, return_inverse=True)
     file = np.array([adviser.accel_mm_s2(limits[k]) for k in used.tolist()])[place.reshape(-1)]
     wanted = np.where(prints, file, np.nan)
-    free = prints & ~advice.first_layer.has(moves) & ((moves.known & KEPT) == 0)
+    free = prints & ~advice.keeps(moves)
     for feature, bound in advice.bounds.items():
         rows = free & (moves.feature == feature)
         wanted[rows] = np.clip(file[rows], bound.at_least, None).clip(None, bound.at_most)

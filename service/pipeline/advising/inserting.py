@@ -127,7 +127,8 @@ class AdviceWriter:
             due = np.zeros(len(moves), dtype=bool)
             due[0] = True
             # NaN is never equal: one of a row of travels is enough.
-            key = np.where(np.isnan(self._wanted), -1.0, self._wanted)
+            self._kept = self._advice.keeps(moves)
+            key = np.where(np.isnan(self._wanted), -1.0 - self._kept, self._wanted)
             due[1:] = (key[1:] != key[:-1]) | (moves.layer[1:] != moves.layer[:-1])
             due[1:] |= moves.limits_id[1:] != moves.limits_id[:-1]
             after = events.move_index[heeded] - block.first_move
@@ -175,8 +176,12 @@ class AdviceWriter:
             unknown_but_theirs = self._now is None and wanted == self._file
             if self._now != wanted and not unknown_but_theirs:
                 lead += self._accel(wanted, self._title(int(block.moves.feature[row])))
-        elif not self._adviser.travel_apart and self._now is not None and self._now < self._file:
-            # Travel is not made slower than the file has it.
+        elif (
+            not self._adviser.travel_apart
+            and self._now is not None
+            and (self._now < self._file or (self._kept[row] and self._now != self._file))
+        ):
+            # Travel is not made slower than the file has it, nor quicker where nothing may change.
             lead += self._accel(self._file, "travel")
         return lead
 

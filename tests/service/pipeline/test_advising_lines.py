@@ -172,6 +172,20 @@ def motion(path: np.ndarray) -> MotionSamples:
     return MotionSamples(path, path, np.zeros(n), np.zeros(n, bool), np.zeros(n, np.int64), moves)
 
 
+def test_nothing_is_quicker_where_the_file_says_off() -> None:
+    head = b"M83\nM204 S900\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:Perimeter\n"
+    off = b"; STILLPATH_OFF\nG1 X50 F9000\n; STILLPATH_ON\n"
+    data = head + b"G1 X5 E1 F600\n" + off + b"G1 X70\nG1 X90 E1\n"
+    out = written(data, klipper(), Advice({0: Bound(2400.0)}))
+    accel, found = 0.0, {}
+    for line in out.split(b"\n"):
+        if b"ACCEL=" in line:
+            accel = float(line.split(b"ACCEL=")[1].split()[0])
+        found[line] = accel
+    assert found[b"G1 X50 F9000"] == 900.0
+    assert found[b"G1 X5 E1 F600"] == found[b"G1 X90 E1"] == 2400.0
+
+
 def test_lines_with_several_commands() -> None:
     machine = klipper().model_copy(update={"firmware": RepRapFirmware()})
     ours = Shaping(AxisShaper("mzv", 41.0), AxisShaper("mzv", 41.0))
