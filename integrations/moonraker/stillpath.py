@@ -30,6 +30,7 @@ _PROGRESS = re.compile(r"stillpath-post: (?P<stage>.*?)(?: (?P<percent>\d+) %)?$
 _OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "budget_um", "times")
 _WAITING = ("queued", "running")
 _IDLE = ("standby", "complete", "cancelled")
+_BUSY = ("printing", "paused")
 _STOP_S = 10.0
 
 
@@ -69,6 +70,7 @@ class Stillpath:
         self._wake = asyncio.Event()
         self._worker: asyncio.Task[None] | None = None
         self._process: asyncio.subprocess.Process | None = None
+        self._taken = (0, 0)  # of the file that is worked on, when it was
         self._register()
 
     def _register(self) -> None:
@@ -85,6 +87,7 @@ class Stillpath:
         self._files.register_directory("stillpath", str(self._folder / "reports"))
         server = self.server
         server.register_event_handler("file_manager:metadata_processed", self._on_metadata)
+        server.register_event_handler("job_state:state_changed", self._on_print)
         server.register_notification("stillpath:changed")
         server.register_endpoint("/server/stillpath/status", ["GET"], self._status)
         server.register_endpoint("/server/stillpath/process", ["POST"], self._asked_to_process)
@@ -96,7 +99,9 @@ class Stillpath:
         """Take up what was left, and begin to work."""
         for entry in self._left():
             with contextlib.suppress(Refused):  # deleted meanwhile
-                self._enqueue(entry["file"], bool(entry.get("print_after")), force=True)
+                job = self._enqueue(entry["file"], False, force=True)
+                if entry.get("print_after"):
+                    job["held"] = "Moonraker was started anew meanwhile"
         self._worker = asyncio.create_task(self._work())
 
     async def close(self) -> None:
@@ -114,6 +119,11 @@ class Stillpath:
             return
         with contextlib.suppress(Refused):  # no print file, or one of ours
             self._enqueue(file, self._print_after)
+
+    def _on_print(self, _: Any, __: dict[str, Any], now: dict[str, Any]) -> None:
+        if now.get("state") in _BUSY:
+            for job in self._jobs.values():
+                self._hold(job, "another print began meanwhile")
 
     async def _status(self, _: Any) -> dict[str, Any]:
         return {"server": self._address, "machine": self._machine, "jobs": self._listed()}
@@ -137,7 +147,7 @@ class Stillpath:
 
     def _ask(self, file: str, print_after: bool) -> dict[str, Any]:
         try:
-            return self._enqueue(file, print_after, force=True)
+            return dict(self._enqueue(file, print_after, force=True))
         except Refused as error:
             self._tell(f"{file}: {error}")
             raise self.server.error(str(error), 400) from None
@@ -147,6 +157,7 @@ class Stillpath:
         if job is None or job["state"] not in _WAITING:
             raise self.server.error(f"{file} is not being compensated", 404)
         running = job["state"] == "running"
+        self._hold(job, "it was cancelled")
         self._change(job, "cancelled", reason="cancelled")
         if running:
             self._stop()
@@ -156,23 +167,41 @@ class Stillpath:
         source, result = self._paths(file)
         known = self._jobs.get(file)
         if known is not None and known["state"] in _WAITING:
-            known["print_after"] = known["print_after"] or print_after
+            # It was uploaded again: what is made of the earlier one will not be kept.
+            known["again"] = known["state"] == "running" and _state_of(source) != self._taken
+            if print_after and (force or not known["held"]):
+                self._arm(known)
             self._save()
-            return dict(known)
+            return known
         if not force and result.is_file() and result.stat().st_mtime >= source.stat().st_mtime:
             raise Refused(f"{result.name} is newer")
         job = {
             "file": file,
             "result": str(result.relative_to(self._root())),
-            "print_after": print_after,
+            "print_after": False,
+            "held": "",
             "stage": "",
             "progress": 0.0,
         }
+        if print_after:
+            self._arm(job)
         self._jobs.pop(file, None)  # to the end of the line
         self._jobs[file] = job
         self._change(job, "queued")
         self._wake.set()
-        return dict(job)
+        return job
+
+    def _arm(self, job: dict[str, Any]) -> None:
+        """Let the result be printed, if the printer is idle when that is asked for."""
+        job.update(print_after=True, held="")
+        state = self.server.lookup_component("job_state").get_last_stats().get("state")
+        if state not in _IDLE:
+            self._hold(job, f"the printer was {state or 'away'} when the file came")
+
+    def _hold(self, job: dict[str, Any], why: str) -> None:
+        """Do not print the result, if that was asked for: what lies on the bed nobody knows."""
+        if job["print_after"] and job.get("state", "queued") in _WAITING:
+            job.update(print_after=False, held=why)
 
     def _root(self) -> Path:
         return Path(self._files.get_directory("gcodes")).resolve()
@@ -213,21 +242,27 @@ class Stillpath:
                 # A worker that ended would never do anything again, and say nothing.
                 reason = f"a bug of Stillpath: {type(error).__name__}: {error}"
                 self._change(job, "failed", reason=reason)
+            if job.get("again") and job["state"] == "failed":
+                with contextlib.suppress(Refused):  # gone
+                    self._enqueue(job["file"], job["print_after"], force=True)
 
     async def _compensate(self, job: dict[str, Any]) -> None:
         loop = asyncio.get_running_loop()
         source, result = self._paths(job["file"])
-        await self._check_free(job["result"])
+        await self._check_free(job["result"], result)
+        self._taken = _state_of(source)
         work = self._folder / "work"
         copy = work / source.name
         try:
-            before = await loop.run_in_executor(None, _copied, source, copy)
+            await loop.run_in_executor(None, _copied, source, copy)
             await self._run(job, copy)
             if not await loop.run_in_executor(None, _is_stamped, copy):
                 raise Refused("what came back is not marked as compensated; it was not kept")
-            if _state_of(source) != before:
+            if _state_of(source) != self._taken:
                 raise Refused("it was changed while it was processed; the result was not kept")
-            await self._check_free(job["result"])
+            await self._check_free(job["result"], result)
+            if job["state"] == "cancelled":
+                raise Refused("cancelled")
             await loop.run_in_executor(None, _placed, copy, result)
         finally:
             await loop.run_in_executor(None, lambda: shutil.rmtree(work, ignore_errors=True))
@@ -300,13 +335,17 @@ class Stillpath:
         found = await apis.query_objects({"print_stats": ["state", "filename"]}, default={})
         return dict(found.get("print_stats", {}))
 
-    async def _check_free(self, result: str) -> None:
+    async def _check_free(self, name: str, result: Path) -> None:
         now = await self._print_state()
-        if now.get("state") in ("printing", "paused") and now.get("filename") == result:
-            raise Refused(f"{result} is being printed; compensate again behind the print")
+        if now.get("state") in _BUSY and now.get("filename") == name:
+            raise Refused(f"{name} is being printed; compensate again behind the print")
+        if result.exists() and not _is_stamped(result):
+            raise Refused(f"{name} is there and was not made by Stillpath; rename it")
 
     async def _after(self, job: dict[str, Any]) -> None:
         """Print the result if that is wanted and the printer is idle."""
+        if job["held"]:
+            self._tell(f"{job['result']} was not started: {job['held']}")
         if not job["print_after"]:
             return
         state = (await self._print_state()).get("state")
@@ -356,8 +395,11 @@ class Stillpath:
             if job["state"] in _WAITING
         ]
         part = self._folder / "queue.json.part"
-        part.write_text(json.dumps(waiting, indent=1), encoding="utf-8")
-        part.replace(self._folder / "queue.json")
+        try:
+            part.write_text(json.dumps(waiting, indent=1), encoding="utf-8")
+            part.replace(self._folder / "queue.json")
+        except OSError as error:  # no reason not to work
+            self._tell(f"a restart will forget the files that wait: {error}")
 
     def _left(self) -> list[dict[str, Any]]:
         try:
@@ -373,16 +415,14 @@ def load_component(config: Any) -> Stillpath:
 
 
 def _state_of(file: Path) -> tuple[int, int]:
+    """Return what tells whether a file is changed later."""
     found = file.stat()
     return found.st_size, found.st_mtime_ns
 
 
-def _copied(source: Path, copy: Path) -> tuple[int, int]:
-    """Copy a file; return what tells whether it is changed later."""
-    before = _state_of(source)
+def _copied(source: Path, copy: Path) -> None:
     copy.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, copy)
-    return before
 
 
 def _is_stamped(file: Path) -> bool:

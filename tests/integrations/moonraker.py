@@ -119,7 +119,7 @@ class Server:
         return {"data_path": str(self.data)}
 
     def lookup_component(self, name: str) -> Any:
-        assert name in ("file_manager", "klippy_apis")
+        assert name in ("file_manager", "klippy_apis", "job_state")
         return self
 
     def register_event_handler(self, event: str, callback: Callable[..., Any]) -> None:
@@ -182,6 +182,14 @@ class Server:
         return path
 
     # Klipper
+
+    def get_last_stats(self) -> dict[str, Any]:
+        return dict(self.print_stats)
+
+    def print(self, file: str, state: str) -> None:
+        """Let a print begin or end; it is told as Moonraker does."""
+        before, self.print_stats = self.print_stats, {"state": state, "filename": file}
+        self._handlers["job_state:state_changed"](state, before, dict(self.print_stats))
 
     async def query_objects(self, objects: dict[str, Any], default: Any) -> Any:
         return {"print_stats": dict(self.print_stats)} if self.print_stats else default

@@ -163,6 +163,92 @@ def test_a_print_is_started_on_an_idle_printer_only(tmp_path: Path, running: Run
     assert server.started == []
 
 
+def test_what_may_not_be_printed_any_more(tmp_path: Path):
+    """Whatever the printer is by then: nobody knows what lies on its bed."""
+
+    def without_server(component: Any, *stuck: str) -> set[str]:
+        held = set(stuck)
+
+        async def made(job: dict[str, Any]) -> None:
+            while job["file"] in held:
+                await asyncio.sleep(0.001)
+
+        component._compensate = made
+        return held
+
+    async def first(server: Server, component: Any) -> None:
+        held = without_server(component, "begun.gcode", "restart.gcode")
+        server.upload("begun.gcode", PART)
+        server.print("other.gcode", "printing")
+        server.upload("busy.gcode", PART)
+        server.print("other.gcode", "complete")
+        server.upload("cancelled.gcode", PART)
+        await server.from_macro("stillpath_cancel", filename="cancelled.gcode")
+        server.upload("good.gcode", PART)
+        held.remove("begun.gcode")
+        await server.until(lambda: server.started)
+        server.upload("restart.gcode", PART)
+
+    async def second(server: Server, component: Any) -> None:
+        without_server(component)
+        assert (await settled(server, "restart.gcode"))["state"] == "done"
+
+    server = with_component(tmp_path, first, print_after="True")
+    assert server.started == ["good.sp.gcode"]
+    told = "\n".join(server.console)
+    assert "begun.sp.gcode was not started: another print began meanwhile" in told
+    assert "busy.sp.gcode was not started: the printer was printing when the file came" in told
+    server = with_component(tmp_path, second, print_after="True")
+    assert server.started == []
+    assert "was not started: Moonraker was started anew" in server.console[-1]
+
+
+def test_a_file_of_ones_own_is_not_written_over(tmp_path: Path):
+    async def scenario(server: Server, _: Any) -> None:
+        (server.gcodes / "a.sp.gcode").write_text("mine\n")
+        await server.call(
+            "POST /server/stillpath/process", filename=server.upload("a.gcode", PART).name
+        )
+        assert "was not made by Stillpath" in (await settled(server, "a.gcode"))["reason"]
+
+    server = with_component(tmp_path, scenario)
+    assert (server.gcodes / "a.sp.gcode").read_text() == "mine\n"
+
+
+def test_what_is_uploaded_again_meanwhile_is_done_again(tmp_path: Path):
+    async def scenario(server: Server, component: Any) -> None:
+        sent = []
+
+        async def run(job: dict[str, Any], copy: Path) -> None:
+            sent.append(copy.read_text())
+            if len(sent) == 1:
+                server.upload("a.gcode", "G28\n")
+            copy.write_text(f"; Processed by stillpath 1\n{sent[-1]}")
+
+        component._run = run
+        server.upload("a.gcode", PART)
+        await server.until(lambda: (server.gcodes / "a.sp.gcode").exists())
+        assert sent == [PART, "G28\n"]
+
+    server = with_component(tmp_path, scenario)
+    assert (server.gcodes / "a.sp.gcode").read_text().endswith("1\nG28\n")
+
+
+def test_a_full_disk_ends_nothing(tmp_path: Path):
+    async def scenario(server: Server, component: Any) -> None:
+        async def made(_: dict[str, Any]) -> None:
+            pass
+
+        component._compensate = made
+        (server.data / "stillpath" / "queue.json.part").mkdir()  # it cannot be written
+        server.upload("a.gcode", PART)
+        assert (await settled(server, "a.gcode"))["state"] == "done"
+        assert not component._worker.done()
+
+    server = with_component(tmp_path, scenario)
+    assert "a restart will forget" in "\n".join(server.console)
+
+
 @pytest.mark.slow
 def test_a_result_that_is_being_printed_stays(tmp_path: Path, running: Running):
     async def scenario(server: Server, _: Any) -> None:
