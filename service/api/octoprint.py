@@ -159,7 +159,7 @@ def _wanted(request: Request, name: str) -> JobQuery:
     printer = request.app.state.printers.get(name)
     given: dict[str, Any] = {"machine": name, "fresh": True}
     if printer is not None:
-        chosen = {"method": printer.method, "tolerance_um": printer.tolerance_um}
+        chosen = printer.model_dump(include={"method", "tolerance_um", "budget_um"})
         given |= {"machine": printer.machine, "printer": name}
         given |= {key: value for key, value in chosen.items() if value is not None}
     try:

@@ -32,6 +32,7 @@ class PrinterView(BaseModel):
     machine: str = Field(description="That files for it are made with.")
     method: str | None
     tolerance_um: float | None
+    budget_um: float | None
     start: bool = Field(description="Whether `print=true` may be asked for.")
 
 
@@ -47,6 +48,7 @@ def list_printers(request: Request, caller: Reader) -> list[PrinterView]:
             machine=printer.machine,
             method=printer.method,
             tolerance_um=printer.tolerance_um,
+            budget_um=printer.budget_um,
             start=printer.start,
         )
         for printer in printers.values()

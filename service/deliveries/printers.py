@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, f
 
 from service.deliveries.posting import Reply, post
 from service.deliveries.targets import TargetRefused, read_url
-from service.pipeline.options import Options
+from service.pipeline.options import BudgetUm, Options
 
 __all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
 
@@ -39,7 +39,7 @@ class Printer(BaseModel):
         That it asks for.
     machine : str
         Of the model that files for this printer are made with.
-    method, tolerance_um : optional
+    method, tolerance_um, budget_um : optional
         Likewise, where the upload does not say.
     start : bool
         Whether an upload may start a print. By default somebody must look at the printer first.
@@ -54,6 +54,7 @@ class Printer(BaseModel):
     machine: Annotated[str, Field(min_length=1, max_length=255)]
     method: Annotated[str, Field(pattern=_METHOD)] | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] | None = None
+    budget_um: BudgetUm | None = None
     start: bool = False
 
     @field_validator("url")

@@ -20,6 +20,7 @@ kind = "octoprint"
 url = "http://127.0.0.1:9"
 machine = "ender3"
 method = "shaper:ei"
+budget_um = 12
 """
 
 

@@ -34,6 +34,7 @@ def test_a_file_for_a_printer(client: TestClient, where: str):
     job = until(client, found["job"], over)
     assert (job["state"], job["printer"], job["print"]) == ("done", "left", False)
     assert job["options"]["method"] == "shaper:ei"
+    assert job["options"]["budget_um"] == 12
 
 
 def test_a_file_for_a_machine(client: TestClient):

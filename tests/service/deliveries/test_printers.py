@@ -182,6 +182,7 @@ def test_a_sender_killed_in_between(tmp_path: Path, prints: bool):
         ("[printer.'a/b']\nkind = 'moonraker'\nurl = 'http://h'\nmachine = 'x'", "name"),
         (printer("a", "moonraker", "http://h", method="magic"), "method"),
         (printer("a", "moonraker", "http://h", tolerance_um=0), "tolerance_um"),
+        (printer("a", "moonraker", "http://h", budget_um=0), "budget_um"),
         (printer("a", "moonraker", "http://h", apikey="sesame"), "apikey"),
         ("printer = 1", "sections"),
         ("[printer]\na = 1", "no section"),
