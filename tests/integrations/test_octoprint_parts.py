@@ -321,6 +321,15 @@ def test_what_was_interrupted_is_taken_up(bench: Callable[..., Bench], running: 
     (again,) = there.book.open()
     assert there.ended(again).state == "done"
     assert again.job == entry.job
+    # The file was replaced while nobody looked: what was made of the old one is not its result.
+    here = bench()
+    stale = ledger.Entry("a.gcode", "ender3", {}, server=here.address, state="working", tries=1)
+    stale.job = again.job
+    (here.files / "a.gcode").write_text("G1 X5\n")
+    here.book.add(stale)
+    assert here.ended(stale).state == "done"
+    assert stale.job != again.job
+    assert "G1 X5" in (here.files / "a.sp.gcode").read_text()
     # The server has forgotten the job: it is sent once more.
     here = bench()
     lost = ledger.Entry("a.gcode", "ender3", {}, server=here.address, state="working", tries=1)

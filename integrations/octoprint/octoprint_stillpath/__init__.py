@@ -230,7 +230,7 @@ class StillpathPlugin(
         return self._take(path)
 
     def _list_machines(self, data: dict[str, Any]) -> Any:
-        """Return the machines of a server, with the key that is stored if none is given."""
+        """Return the machines of a server; the key that is stored is never sent for this."""
         _require(Permissions.SETTINGS)
         server = str(data["server"]).strip()
         key = str(data.get("key") or "").strip()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import re
@@ -123,7 +124,7 @@ class OnServer(Service):
         Failure
             With the server's reason.
         """
-        if not (self._entry.job and self._is_there()):
+        if not (self._entry.job and self._is_there(source)):
             self._submit(source, name)
         path = self._path
         self._wait(path, None)
@@ -156,16 +157,22 @@ class OnServer(Service):
     def _path(self) -> str:
         return f"/v1/jobs/{quote(self._entry.job, safe='')}"
 
-    def _is_there(self) -> bool:
-        """Return whether the job of an interrupted entry still is; raise if nobody answers."""
+    def _is_there(self, source: Path) -> bool:
+        """Return whether the job of an interrupted entry still is, and of the file as it is now.
+
+        Raises if nobody answers.
+        """
         self._tell("asking the server", None)
         try:
-            state = self._document(self._ask("GET", self._path, self._timeout_s)).get("state")
+            job = self._document(self._ask("GET", self._path, self._timeout_s))
         except Failure as failure:
             if failure.code == 2:
                 return False
             raise
-        return state not in ("failed", "cancelled")
+        if job.get("source_sha256") != _sha256(source):
+            self.cancel()  # it was replaced while nobody looked
+            return False
+        return job.get("state") not in ("failed", "cancelled")
 
     def _submit(self, source: Path, name: str) -> None:
         self._tell("asking the server", None)
@@ -275,6 +282,14 @@ class ByCommand:
             lines = said.read_text("utf-8", "replace").strip().splitlines()
             reason = lines[-1] if lines else "it does not say why"
             raise Failure(f"{reason} (exit code {process.returncode})")
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        for chunk in iter(lambda: file.read(1 << 20), b""):
+            digest.update(chunk)
+    return digest.hexdigest()
 
 
 def _progress(said: Path) -> tuple[str, float | None]:

@@ -55,7 +55,10 @@ class OctoPrintHost(Host):
 
     def disk_path(self, path: str) -> Path | None:
         """Return where a file of the storage lies; None: it does not exist."""
-        if not self._files.file_exists(_LOCAL, path):
+        try:
+            if not self._files.file_exists(_LOCAL, path):
+                return None
+        except ValueError:  # it leads out of the storage
             return None
         return Path(self._files.path_on_disk(_LOCAL, path))
 
@@ -160,6 +163,9 @@ class OctoPrintHost(Host):
 
     def _print(self, entry: Entry, added: str) -> None:
         if not entry.print_after:
+            return
+        if self._ledger.is_cancelled(entry):  # or uploaded again, or deleted
+            self._ledger.disarm(entry, "it was cancelled, replaced or deleted meanwhile")
             return
         if not self._printer.is_ready():
             self._ledger.disarm(entry, "the printer is not ready")
