@@ -183,8 +183,25 @@ class Checker:
             asked = ask(printer)
         except (Unreached, Unanswered, TargetRefused, NotReady) as error:
             raise PrinterUnknown(f"{printer.name} cannot be asked: {error}") from error
-        known = self._remember(printer, machine, asked, accept=accept)
-        found = [*findings(machine, asked, method=method), *_changes(known, asked)]
+        found = findings(machine, asked, method=method)
+        now = _Remembered(
+            printer=printer.name,
+            machine=machine.name,
+            machine_revision=machine.revision,
+            when=datetime.now(UTC),
+            sections=relevant(asked),
+        )
+        try:
+            known = self._remember(now, accept=accept)
+        except OSError as error:
+            why = error.strerror or error
+            text = f"the configuration of {printer.name} cannot be remembered: {why}"
+            if accept:
+                raise PrinterUnknown(text) from error
+            known = now
+            text += "; until that is mended nobody notices when it changes"
+            found.append(Finding(place="memory", text=text))
+        found += _changes(known, asked)
         return PrinterCheck(
             printer=printer.name,
             machine=machine.name,
@@ -203,17 +220,8 @@ class Checker:
         except PrinterUnknown as error:
             return [f"printer {error}; its configuration was not compared with the machine"]
 
-    def _remember(
-        self, printer: Printer, machine: Machine, asked: Asked, *, accept: bool
-    ) -> _Remembered:
-        path = f"{printer.name}/{machine.revision}.json"
-        now = _Remembered(
-            printer=printer.name,
-            machine=machine.name,
-            machine_revision=machine.revision,
-            when=datetime.now(UTC),
-            sections=relevant(asked),
-        )
+    def _remember(self, now: _Remembered, *, accept: bool) -> _Remembered:
+        path = f"{now.printer}/{now.machine_revision}.json"
         text = json.dumps(now.model_dump(mode="json"), indent=1) + "\n"
         if accept:
             self._documents.replace(path, text)
@@ -228,7 +236,7 @@ class Checker:
         try:
             return _Remembered.model_validate(from_json(self._documents.read(path)))
         except (ValidationError, ValueError):
-            raise PrinterUnknown(
+            raise OSError(
                 f"{self._documents.place(path)} is damaged; delete it, and the printer's "
                 "configuration as it is then counts"
             ) from None

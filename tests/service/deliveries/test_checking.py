@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -203,8 +204,23 @@ def test_a_damaged_memory_is_named(tmp_path: Path):
     checked(tmp_path, status_of(MACHINE))
     [file] = tmp_path.rglob("*.json")
     file.write_text("{}")
-    with pytest.raises(PrinterUnknown, match=r"left/\w+\.json is damaged"):
-        checked(tmp_path, status_of(MACHINE))
+    status = status_of(MACHINE)
+    _kinematics(status)
+    unsafe, damaged = checked(tmp_path, status).findings
+    assert unsafe.unsafe  # all the same
+    assert re.search(r"left/\w+\.json is damaged; delete it", damaged.text)
+    assert checked(tmp_path, status_of(MACHINE), accept=True).findings == []
+
+
+def test_a_memory_that_cannot_be_written_is_named(tmp_path: Path):
+    (tmp_path / "left").write_text("where its folder would be")
+    status = status_of(MACHINE)
+    _kinematics(status)
+    unsafe, unwritten = checked(tmp_path, status).findings
+    assert unsafe.unsafe
+    assert "left cannot be remembered" in unwritten.text
+    with pytest.raises(PrinterUnknown, match="cannot be remembered"):
+        checked(tmp_path, status, accept=True)
 
 
 @pytest.mark.parametrize(
