@@ -45,6 +45,9 @@ _STORED_AT_ONCE = 12
 """Uploads that are put into the storage beside each other: that may take minutes, and the threads
 are for all requests."""
 
+_ASKED_AT_ONCE = 8
+"""Printers that are asked before an upload."""
+
 
 @dataclass(frozen=True, slots=True)
 class Taken:
@@ -94,6 +97,7 @@ class Intake:
         self._quota = Quota(settings.max_jobs_per_owner, settings.max_bytes_per_owner)
         self._folder = settings.data_dir / "incoming"
         self._turns = CapacityLimiter(_STORED_AT_ONCE)
+        self._printers_asked = CapacityLimiter(_ASKED_AT_ONCE)
 
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
@@ -127,7 +131,9 @@ class Intake:
             413, 422, 429 or 507; nothing of the upload is left then.
         """
         await run_in_threadpool(self._check_targets, wanted)
-        pinned = await run_in_threadpool(self._pinned, wanted)
+        # A printer may take its time: threads are for all requests.
+        limiter = None if wanted.printer is None else self._printers_asked
+        pinned = await to_thread.run_sync(self._pinned, wanted, limiter=limiter)
         await run_in_threadpool(self._check_room, caller)
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
