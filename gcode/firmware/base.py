@@ -150,6 +150,10 @@ class Adviser(Protocol):
         """Travel has an acceleration of its own, which `accel_lines` leaves alone."""
 
     @property
+    def skips_lines(self) -> bool:
+        """Of an object that is left out it passes over all lines, not the moves alone (Bambu)."""
+
+    @property
     def highest_mm_s2(self) -> float:
         """Acceleration of X and Y that the machine is set up for."""
 

@@ -26,6 +26,7 @@ class KlipperAdviser:
     shapers = SHAPERS
     shaper_word = "SET_INPUT_SHAPER"
     same_for_both = False
+    skips_lines = False
     travel_apart = False
 
     def __init__(self, firmware: Klipper, dialect: Dialect) -> None:

@@ -34,6 +34,7 @@ class MarlinAdviser:
 
     def __init__(self, firmware: Marlin, dialect: Dialect) -> None:
         self._dialect = dialect
+        self.skips_lines = firmware.variant == "bambu"
         axes = firmware.planner.max_accel_mm_s2
         self.highest_mm_s2 = min(axes.x, axes.y)
         s = firmware.shaper

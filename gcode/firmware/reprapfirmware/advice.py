@@ -31,6 +31,7 @@ class RepRapAdviser:
     shapers = tuple(_NAMES)
     shaper_word = "M593"
     same_for_both = True
+    skips_lines = False
     travel_apart = True
 
     def __init__(self, firmware: RepRapFirmware, dialect: Dialect) -> None:

@@ -26,7 +26,9 @@ MARK = b"; stillpath advise"
 """Every inserted line holds it, and no line of a file that is advised."""
 
 _VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
-_HEEDED = np.array([EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER])
+_HEEDED = np.array(
+    [EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.OBJECT, EventKind.SHAPER]
+)
 
 
 class AdviceWriter:
@@ -151,6 +153,10 @@ class AdviceWriter:
         if kind == EventKind.UNKNOWN:
             lead = self._give_back()
             self._now, self._shaper, self._rests = None, None, True
+        elif kind == EventKind.OBJECT and self._adviser.skips_lines:
+            # Whoever leaves an object out does not read our lines in it.
+            lead = self._give_back()
+            self._now = None
         elif kind == EventKind.SHAPER:
             self._rests = True
             for code in self._sets_shaper.findall(line.split(b";", 1)[0]):

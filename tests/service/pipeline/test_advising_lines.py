@@ -186,6 +186,19 @@ def test_nothing_is_quicker_where_the_file_says_off() -> None:
     assert found[b"G1 X5 E1 F600"] == found[b"G1 X90 E1"] == 2400.0
 
 
+def test_an_object_may_be_left_out_with_all_its_lines() -> None:
+    machine = klipper().model_copy(update={"firmware": Marlin(variant="bambu")})
+    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    head = "M83\nM204 P900\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:Outer wall\n"
+    data = head + "".join(f"M624 {k}\nG1 X{k} E1 F600\nM625\n" for k in (1, 2, 3))
+    out = written(data.encode(), machine, Advice({0: Bound(2400.0, 2400.0)})).decode()
+    for k in (1, 2, 3):
+        before, rest = out.split(f"M624 {k}\n")
+        skipped = before + rest.split("M625\n", 1)[1]
+        found = printed(skipped.encode(), machine)
+        assert [adviser.accel_mm_s2(limits) for _, _, limits, _ in found] == [2400.0, 2400.0]
+
+
 def test_lines_with_several_commands() -> None:
     machine = klipper().model_copy(update={"firmware": RepRapFirmware()})
     ours = Shaping(AxisShaper("mzv", 41.0), AxisShaper("mzv", 41.0))
