@@ -64,7 +64,7 @@ __all__ = ["advise_file"]
 
 _BLOCK_BYTES = 1 << 17
 _COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
-_ROUNDS = 6
+_ROUNDS = 7
 _TOLERANCE = 1.001
 _UNDO = (
     f"Moves are untouched, and so are the slicer's times in the file; deleting the lines that hold "
@@ -202,7 +202,8 @@ class _Job:
                 for f in choice.rung
                 if f in now and now[f].rms_um > _TOLERANCE * self._bound_um(f, was)
             }
-            if attempt + 1 < _ROUNDS and over and choice.mended(over):
+            # The last round is for a file without advice.
+            if attempt + 2 < _ROUNDS and over and choice.mended(over):
                 continue
             worse = bool(over) or _rms_um(now) > _TOLERANCE * _rms_um(was)
             unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
@@ -341,8 +342,8 @@ class _Job:
         ]
         if not self._adviser.shapers:
             found.append(
-                "No shaper is advised: the machine does not say that its firmware has one "
-                "(firmware.shaper)."
+                "No shaper is advised: this firmware takes none from a file, or the machine does "
+                "not say that it has one (firmware.shaper)."
             )
         if writer.shaper_left:
             found.append(
@@ -357,6 +358,8 @@ class _Job:
                 "velocity, jerk, junction deviation)."
                 if feature.name in helpless
                 else "; a larger budget is needed."
+                if self._options.budget_um is not None
+                else " as sliced."
             )
             for feature in figures.features
             if not feature.within_bound and feature.exact
