@@ -307,9 +307,12 @@ class Stillpath:
             raise Refused(last.replace("stillpath-post: ", "", 1))
         report = copy.with_name(f"{copy.stem}.stillpath.html")
         if report.is_file():
-            kept = self._folder / "reports" / report.name
+            # In the folder of the file: others may have the same name.
+            name = Path(job["result"]).parent / report.name
+            kept = self._folder / "reports" / name
+            kept.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(str(report), str(kept))
-            job["report"] = f"stillpath/{kept.name}"
+            job["report"] = f"stillpath/{name.as_posix()}"
 
     def _stop(self) -> None:
         if self._process is not None and self._process.returncode is None:

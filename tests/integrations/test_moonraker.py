@@ -70,8 +70,9 @@ def test_an_upload_gets_a_second_file(tmp_path: Path, running: Running):
     assert (folder / "größe 1.gcode").read_text() == PART
     assert (folder / "größe 1.sp.gcode").read_text().endswith("; compensated\n" + PART)
     assert sorted(path.name for path in folder.iterdir()) == ["größe 1.gcode", "größe 1.sp.gcode"]
-    assert [p.name for p in Path(server.directories["stillpath"]).iterdir()] == [
-        "größe 1.stillpath.html"
+    reports = Path(server.directories["stillpath"])
+    assert [p for p in reports.rglob("*") if p.is_file()] == [
+        reports / "sub dir" / "größe 1.stillpath.html"
     ]
     assert server.started == []
     assert server.console[-1] == (
