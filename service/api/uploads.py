@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 from collections.abc import AsyncGenerator, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -152,8 +153,10 @@ class _Sink:
         self.file.write(collected)
         self.file.flush()
         if hasattr(os, "posix_fadvise"):
-            # Begins to write it to the disk, so that little is left to wait for at the end.
-            os.posix_fadvise(self.file.fileno(), start, len(collected), os.POSIX_FADV_DONTNEED)
+            # Begins to write it to the disk, so that little is left to wait for at the end. Some
+            # file systems take no advice.
+            with suppress(OSError):
+                os.posix_fadvise(self.file.fileno(), start, len(collected), os.POSIX_FADV_DONTNEED)
 
 
 async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes, None]:
