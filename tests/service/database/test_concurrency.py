@@ -60,6 +60,14 @@ def at_once(*calls: Callable[[], object]) -> list[object]:
     return results
 
 
+def test_many_first_starts_at_once(settings: Settings):
+    engines = at_once(*[lambda: open_database(settings)] * 6)
+    for engine in engines:
+        assert isinstance(engine, Engine), engine
+        assert JobStore(engine).counts()[JobState.QUEUED] == 0
+        engine.dispose()
+
+
 def test_no_job_is_taken_by_two_threads(store: JobStore):
     jobs = [store.add(make_job(owner=f"owner-{n % 3}")) for n in range(24)]
     taken = at_once(*[lambda n=n: take_all(store, f"worker-{n}") for n in range(8)])
