@@ -18,7 +18,7 @@ from gcode.pieces import Passage
 from gcode.slicers.marks import MarkKind, read_mark
 from gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
 
-__all__ = ["Retiming", "retimed"]
+__all__ = ["Retiming", "behind_last_command", "retimed"]
 
 _COPIED_BYTES = 1 << 20
 _COMMENTS = re.compile(rb"(?:\xef\xbb\xbf)?(?:[ \t\r]*(?:;[^\n]*)?\n)*")
@@ -76,7 +76,7 @@ class Retiming:
             end = leading.end() if leading is not None else 0
             if end < len(text):
                 self._head_end = self._size + end
-        if end := _behind_last_command(text):
+        if end := behind_last_command(text):
             self._tail_start = self._size + end
             self._tail_lead = b"" if text[end - 1 : end] == b"\n" else b"\n"
         if item is not None and not self._keeps:
@@ -221,7 +221,7 @@ def _candidates(item: Passage) -> NDArray[np.int64]:
     return np.flatnonzero(comment | progress | (first == ord(" ")) | (first == ord("\t")))
 
 
-def _behind_last_command(text: bytes) -> int:
+def behind_last_command(text: bytes) -> int:
     """Return where the last line ends that is no comment of others; 0 if there is none."""
     end, width = len(text), 128
     while end > 0:

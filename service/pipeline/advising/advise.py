@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import re
 import shutil
 import tempfile
@@ -27,6 +28,7 @@ from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.quickening import FirstLayer
 from gcode.slicers.facts import SlicerFacts
+from gcode.slicers.retiming import behind_last_command
 from gcode.types import EventKind, Moves, ProgramBlock
 from models.machine import Machine
 from models.operating import OperatingGrid
@@ -231,19 +233,22 @@ class _Job:
         out.seek(0)
         out.truncate()
         self._source.seek(0)
-        header = writer.header()
+        header, tail = writer.header(), 0
         while data := self._source.read(_BLOCK_BYTES):
             for block in reader.push(data):
                 text = writer.block(block)
                 at = _first_command(text) if header else -1
                 if at >= 0:
                     text, header = text[:at] + header + text[at:], b""
+                if end := behind_last_command(text):
+                    tail = out.tell() + end
                 out.write(text)
-        rest = reader.flush()
+        rest = b"".join(block.text for block in reader.flush())
         # Behind a line without an end nothing can be added: the end comes before it.
-        out.write(header + writer.end())
-        for block in rest:
-            out.write(block.text)
+        if header or behind_last_command(rest):
+            tail = out.tell()
+        out.write(rest)
+        _insert(out, tail, header + writer.end())
         out.seek(0)
         return writer
 
@@ -447,6 +452,18 @@ def _first_command(text: bytes) -> int:
     """Return where the first line begins that is no comment: what slicers say comes before it."""
     found = _COMMAND.search(text)
     return found.start() if found else -1
+
+
+def _insert(file: BinaryIO, at: int, text: bytes) -> None:
+    """Put text into a file: slicers look for their settings at its very end."""
+    for stop in range(file.seek(0, io.SEEK_END), at, -_BLOCK_BYTES):
+        start = max(stop - _BLOCK_BYTES, at)
+        file.seek(start)
+        behind = file.read(stop - start)
+        file.seek(start + len(text))
+        file.write(behind)
+    file.seek(at)
+    file.write(text)
 
 
 class _Levels:
