@@ -143,7 +143,7 @@ def test_cancelled_replaced_and_switched_off(octoprint: OctoPrint, running: Runn
     assert octoprint.ask("process", path="later.gcode").status_code == 200
     assert octoprint.ended("later.gcode")["state"] == "done"
     assert [e["path"] for e in octoprint.entries()].count("later.gcode") == 1
-    for odd in ("../config.yaml", "nothing.gcode", "config.yaml"):
+    for odd in ("../config.yaml", "../../part.gcode", "nothing.gcode", "config.yaml"):
         assert octoprint.ask("process", path=odd).status_code == 404
 
 
