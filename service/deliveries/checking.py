@@ -257,6 +257,7 @@ def findings(machine: Machine, asked: Asked, *, method: str = "fbf") -> list[Fin
         *_in_force(machine, asked),
         *(_commands(machine, asked) if streams else ()),
         *(_wrappers(asked) if streams else ()),
+        *(_no_shaper(asked) if method == "advise" else ()),
     ]
     return sorted(found, key=lambda finding: not finding.unsafe)
 
@@ -369,6 +370,17 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
         "macros in printer.cfg, then send STILLPATH_CHECK"
     )
     yield Finding(place=names, text=text)
+
+
+def _no_shaper(asked: Asked) -> Iterator[Finding]:
+    """Find that the shaper cannot be set."""
+    if "input_shaper" not in asked.settings:
+        text = (
+            "printer.cfg has no section [input_shaper], without which Klipper does not know "
+            "SET_INPUT_SHAPER: an advised shaper has no effect, but its accelerations have; add "
+            "the section, it may be empty"
+        )
+        yield Finding(place="[input_shaper]", text=text)
 
 
 def _unwrapped(asked: Asked) -> Iterable[str]:

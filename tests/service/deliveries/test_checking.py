@@ -160,7 +160,13 @@ def test_a_file_without_a_stream_needs_no_macros(tmp_path: Path, method: str):
     status = status_of(MACHINE)
     for change in (_not_wrapped, _own_limit_macro, _own_shaper_macro):
         change(status)
-    assert checked(tmp_path, status, method=method).findings == []
+    found = {finding.place for finding in checked(tmp_path, status, method=method).findings}
+    assert found <= {"[input_shaper]"}
+
+
+def test_advice_needs_the_section_of_the_shaper(tmp_path: Path):
+    [finding] = checked(tmp_path, status_of(MACHINE), method="advise").findings
+    assert (finding.place, finding.unsafe) == ("[input_shaper]", False)
 
 
 def test_another_firmware(tmp_path: Path):
