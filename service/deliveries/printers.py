@@ -151,13 +151,12 @@ def upload(
 
 def what_started(printer: Printer, reply: Reply) -> str | None:
     """Return why a printer that was asked to print did not begin, as far as it says so."""
-    if printer.kind != "moonraker":
-        return None
     try:
         told: Any = json.loads(reply.text)
     except ValueError:
         return None
-    if not isinstance(told, dict) or told.get("print_started", True) is True:
+    begun = "print_started" if printer.kind == "moonraker" else "effectivePrint"
+    if not isinstance(told, dict) or told.get(begun, True) is True:
         return None
     if told.get("print_queued"):
         return "uploaded; the printer put it into its queue"

@@ -166,7 +166,7 @@ def uploads(server: Listener) -> list[Seen]:
 
 
 @contextmanager
-def octoprint(*, key: str) -> Iterator[Listener]:
+def octoprint(*, key: str, can_print: bool = True) -> Iterator[Listener]:
     """Serve as OctoPrint does."""
 
     def answer(seen: Seen) -> Answer:
@@ -174,9 +174,11 @@ def octoprint(*, key: str) -> Iterator[Listener]:
             return _told(403, {"error": "You don't have the permission to access this"})
         if (seen.method, seen.path) != ("POST", "/octo/api/files/local"):
             return _told(404, {"error": "Not found"})
-        name, _ = seen.parts()["file"]
+        parts = seen.parts()
+        name, _ = parts["file"]
         files = {"local": {"name": name, "path": name, "origin": "local"}}
-        return _told(201, {"done": True, "files": files})
+        prints = can_print and parts["print"][1] == b"true"
+        return _told(201, {"done": True, "files": files, "effectivePrint": prints})
 
     with Listener(answer) as listener:
         yield listener

@@ -87,10 +87,12 @@ def test_a_wrong_key_is_told_and_not_repeated(tmp_path: Path):
     assert "wrong" not in (delivery.error or "")
 
 
-def test_a_printer_that_does_not_begin_is_told(tmp_path: Path):
+@pytest.mark.parametrize("kind", ["moonraker", "octoprint"])
+def test_a_printer_that_does_not_begin_is_told(tmp_path: Path, kind: str):
+    busy, prefix = (moonraker, "") if kind == "moonraker" else (octoprint, "/octo")
     with (
-        moonraker(can_print=False) as server,
-        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+        busy(key="k", can_print=False) as server,
+        at(tmp_path, printer("m", kind, server.url + prefix, api_key="k", start=True)) as place,
     ):
         job = place.finish(tmp_path, printer="m", print_after=True)
         with place.sending():
