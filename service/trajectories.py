@@ -37,6 +37,9 @@ def trajectories(
     ] = None,
     method: Annotated[str, typer.Option(help="As `compensate` has it; none: as it came.")] = "fbf",
     robust: Annotated[str, typer.Option(help="As `compensate` has it.")] = "off",
+    budget_um: Annotated[
+        float | None, typer.Option("--budget-um", help="As `compensate` has it.")
+    ] = None,
     plate: Annotated[
         int | None,
         typer.Option("--plate", metavar="N", min=1, help="Which plate of several."),
@@ -64,7 +67,13 @@ def trajectories(
 
     try:
         options = Options.model_validate(
-            {"method": method, "robust": robust, "plate": plate, "dialect": dialect}
+            {
+                "method": method,
+                "robust": robust,
+                "budget_um": budget_um,
+                "plate": plate,
+                "dialect": dialect,
+            }
         )
     except ValidationError as error:
         first = error.errors()[0]

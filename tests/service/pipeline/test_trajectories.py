@@ -135,6 +135,7 @@ def test_from_the_command_line(
     assert "200 rows" in capsys.readouterr().out
     assert len(load(target)["t_s"]) == 200
     assert run([*given, "--format", "xlsx"]) == 2
+    assert run([*given, "--budget-um", "0"]) == 2
     assert "csv and npz" in capsys.readouterr().err
     assert run([*given[:-1], str(source)]) == 2
     assert source.read_text() == SMALL
