@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from models.reference_motion import reference_motion
-from models.store import load_machine
+from models.store import builtin_machines, load_machine
 from service.pipeline import yardstick
 from service.pipeline.yardstick import (
     FREQUENCIES_HZ,
@@ -86,7 +86,7 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return BestShaper("mzv", 40.0, 50.0, 0.1, 1.5, 20.0)
 
     monkeypatch.setattr(yardstick, "tune_shaper", tune)
-    machine = load_machine("ender3")
+    machine = load_machine("ender3").model_copy(update={"title": "Mine"})
     folder = tmp_path / "cache"
     first = cached_shaper(machine, folder)
     assert cached_shaper(machine, folder) == first
@@ -98,3 +98,20 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert cached_shaper(machine, folder) == first
     assert len(calls) == 6
     assert json.loads(file.read_text())["fx_hz"] == 40.0
+
+
+@pytest.mark.parametrize("name", builtin_machines())
+def test_that_of_a_built_in_machine_comes_with_the_program(name: str, tmp_path: Path) -> None:
+    """After a change of such a machine: python benchmarks/yardsticks.py --write."""
+    best = cached_shaper(load_machine(name), tmp_path)
+    assert best.contour_rms_um > 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_what_comes_with_the_program_is_what_is_found(tmp_path: Path) -> None:
+    machine = load_machine("voron-v0")
+    shipped = cached_shaper(machine, tmp_path)
+    found = cached_shaper(machine.model_copy(update={"title": "Mine"}), tmp_path)
+    assert (found.type, found.fx_hz, found.fy_hz) == (shipped.type, shipped.fx_hz, shipped.fy_hz)
+    assert found.contour_rms_um == pytest.approx(shipped.contour_rms_um, rel=1e-9)

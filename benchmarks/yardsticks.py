@@ -1,0 +1,52 @@
+"""Tune the firmware's best shaper for every built-in machine, and keep what is found.
+
+    python benchmarks/yardsticks.py [--write]
+
+Prints machine, revision, shaper and error, and whether `service/pipeline/yardsticks.json` says
+the same; exits with 1 if it does not. With `--write` the file is made anew: after a change of a
+built-in machine, of the reference motion or of what the best shaper is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from models.reference_motion import reference_motion
+from models.store import builtin_machines, load_machine
+from service.pipeline import yardstick
+from service.pipeline.files import replacing
+
+FILE = Path(yardstick.__file__).with_name("yardsticks.json")
+DT_S = 1e-3
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true")
+    given = parser.parse_args()
+    motion, extruding = reference_motion(DT_S)
+    known = json.loads(FILE.read_text())["machines"] if FILE.exists() else {}
+    found = {}
+    for name in builtin_machines():
+        machine = load_machine(name)
+        best = yardstick.tune_shaper(machine, motion, DT_S, extruding)
+        found[name] = {"revision": machine.revision, "shaper": asdict(best)}
+        verdict = "" if known.get(name) == found[name] else "MISS"
+        print(
+            f"{name:20} {machine.revision} {best.label:28} {best.contour_rms_um:8.3f} um {verdict}",
+            flush=True,
+        )
+    if given.write:
+        with replacing(FILE) as temporary:
+            document = {"version": yardstick._VERSION, "machines": found}
+            temporary.write_text(json.dumps(document, indent=1) + "\n")
+        return 0
+    return 0 if known == found else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
