@@ -10,14 +10,16 @@ printer gets back what the file has set, and behind them ours again.
 
 from __future__ import annotations
 
+import contextlib
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
 from gcode.firmware.base import Adviser
 from gcode.slicers.features import feature_of
 from gcode.types import EventKind, Limits, ProgramBlock
-from models.shaping import Shaping
+from models.shaping import AxisShaper, Shaping
 from service.pipeline.advising.advice import Advice, wanted_accel
 
 __all__ = ["MARK", "AdviceWriter"]
@@ -26,6 +28,7 @@ MARK = b"; stillpath advise"
 """Every inserted line holds it, and no line of a file that is advised."""
 
 _VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
+_OURS = AxisShaper("ours")
 _HEEDED = np.array(
     [EventKind.LIMITS, EventKind.STOP, EventKind.UNKNOWN, EventKind.OBJECT, EventKind.SHAPER]
 )
@@ -50,7 +53,7 @@ class AdviceWriter:
     lines : int
         Lines of our own.
     shaper_left : bool
-        At the end nobody knew what the printer's shaper was before: ours stays.
+        At the end nobody knew what the printer's shaper was before: ours stays, in part at least.
     """
 
     def __init__(
@@ -104,15 +107,9 @@ class AdviceWriter:
         if not self._shaped:
             return text + self.footer()
         stated = self._adviser.stated
-        if self._own_shaper:
-            lines = tuple(self._own_shaper.values())
-            if stated is not None:
-                lines = (*self._adviser.shaper_lines(stated), *lines)
-        elif stated is not None:
-            lines = self._adviser.shaper_lines(stated)
-        else:
-            self.shaper_left = True
-            lines = ()
+        lines = () if stated is None else self._adviser.shaper_lines(stated)
+        lines = (*lines, *self._own_shaper.values())
+        self.shaper_left = stated is None and not self._sets_all(lines)
         for line in lines:
             text += self._line(line, "the printer's own shaper")
         return text + self.footer()
@@ -200,6 +197,14 @@ class AdviceWriter:
         layer = f" from layer {self._layer} on" if self._layer > 0 else ""
         lines = self._adviser.shaper_lines(wanted)
         return b"".join(self._line(line, f"shaper{layer}") for line in lines)
+
+    def _sets_all(self, lines: Sequence[bytes]) -> bool:
+        """Tell whether nothing of ours is left behind lines: no axis keeps its type."""
+        left = Shaping(_OURS, _OURS)
+        with contextlib.suppress(ValueError):
+            for line in lines:
+                left = self._adviser.read_shaper(line.decode("utf-8", "replace"), left)
+        return _OURS.type not in (left.x.type, left.y.type)
 
     def _give_back(self) -> bytes:
         """Set the acceleration that the file has set."""

@@ -172,6 +172,25 @@ def motion(path: np.ndarray) -> MotionSamples:
     return MotionSamples(path, path, np.zeros(n), np.zeros(n, bool), np.zeros(n, np.int64), moves)
 
 
+@pytest.mark.parametrize(
+    ("own", "left"),
+    [
+        ("", True),
+        ("SET_INPUT_SHAPER SHAPER_TYPE_X=ei SHAPER_FREQ_X=44", True),
+        ("SET_INPUT_SHAPER SHAPER_FREQ_X=44 SHAPER_FREQ_Y=40", True),
+        ("SET_INPUT_SHAPER SHAPER_TYPE=ei SHAPER_FREQ_X=44 SHAPER_FREQ_Y=40", False),
+    ],
+)
+def test_a_shaper_that_nobody_can_put_back(own: str, left: bool) -> None:
+    machine = klipper()
+    reader, firmware = Interpreter(machine), kit(machine)
+    adviser, names = firmware.adviser(reader.dialect), reader.feature_names
+    writer = AdviceWriter(adviser, ADVICE, names, firmware.initial_limits(), "test")
+    for block in reader.push(f"M83\n{own}\nG1 X5 E1 F600\n".encode()):
+        writer.block(block)
+    assert (own.encode() in writer.end(), writer.shaper_left) == (True, left)
+
+
 def test_nothing_is_quicker_where_the_file_says_off() -> None:
     head = b"M83\nM204 S900\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:Perimeter\n"
     off = b"; STILLPATH_OFF\nG1 X50 F9000\n; STILLPATH_ON\n"
