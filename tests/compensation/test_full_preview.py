@@ -167,6 +167,7 @@ def test_nonzero_initial_state() -> None:
     np.testing.assert_allclose(design.coefficients(y_d, free), gamma, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_changing_plant() -> None:
     """A nozzle that moves along a beam: stiffness changes, states are position and velocity."""
     dt = 1e-3

@@ -51,6 +51,7 @@ def contours(machine: Machine, path: np.ndarray, extruding: np.ndarray, **chosen
     return u, np.array([1e3 * np.sqrt(np.mean(e[extruding] ** 2)) for e in errors])
 
 
+@pytest.mark.slow
 def test_sliding_helps_every_summary(machine: Machine, motion) -> None:
     path, extruding = motion
     _, plain = contours(machine, path, extruding, robust="ensemble", along=1.0)

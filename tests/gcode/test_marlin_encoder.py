@@ -199,6 +199,7 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None
     assert last[15:17] == (0.02, 20_000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, None])
 def test_linear_advance_leaves_the_print_as_it_came(tmp_path: Path, stated: bool | None) -> None:
     """Whether the machine says that it has it or only the file does."""
@@ -212,6 +213,7 @@ def test_linear_advance_leaves_the_print_as_it_came(tmp_path: Path, stated: bool
     assert b"M205 B0" not in target.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["M82", "M83"])
 def test_far_from_zero_no_filament_is_lost(tmp_path: Path, mode: str) -> None:
     """Marlin adds up E in single precision: nine metres out a stream would lose a percent."""

@@ -54,6 +54,7 @@ def outcome(data: bytes, machine: Machine, *, plain: bool) -> tuple[list[Program
     return blocks, ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("firmware", [Klipper(), Marlin(), RepRapFirmware()])
 @relaxed
 @given(lines=st.lists(LINES, max_size=30))

@@ -62,6 +62,7 @@ def run(call: list[str], tmp_path: Path, **more: str) -> subprocess.CompletedPro
         return subprocess.CompletedProcess(call, process.wait(60), None, said)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="calls shells")
 @pytest.mark.parametrize("call", [posix_call, superslicer_call])
 @pytest.mark.parametrize("name", NAMES)

@@ -290,6 +290,7 @@ def test_a_report_that_cannot_be_written_stops_nothing(
     assert part.read_bytes() == DONE
 
 
+@pytest.mark.slow
 def test_progress_goes_to_stdout_while_the_server_is_busy(
     running: Running, part: Path, tmp_path: Path, monkeypatch, capsys
 ):

@@ -114,6 +114,7 @@ def test_a_trial_stores_nothing(client: TestClient, data: Path) -> None:
     assert kept(data) == before
 
 
+@pytest.mark.slow
 def test_a_new_machine_from_a_base(client: TestClient) -> None:
     where = "/v1/machines/new/measurements"
     assert_problem(post(client, quick_raw("x"), where=where), 404, "base")
@@ -134,6 +135,7 @@ def test_conditions_follow_the_name(client: TestClient) -> None:
     assert mass.moving_mass_kg == pytest.approx(0.8, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
 def test_broken_files_leave_the_store_as_it_was(what: str, client: TestClient, data: Path) -> None:
     files = broken(what)

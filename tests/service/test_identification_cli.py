@@ -91,6 +91,7 @@ def main_hz(machine: Machine, axis: str) -> float:
     return plant.poles[0].f_hz
 
 
+@pytest.mark.slow
 def test_a_revision_of_ones_own_machine(store: MachineStore, folder: Path, capsys) -> None:
     files = [quick_raw("x"), quick_raw("y")]
     out, report = folder / "machine.json", folder / "report"
@@ -149,6 +150,7 @@ def test_without_a_name_nothing_is_stored(data: Path, folder: Path, capsys) -> N
     assert not data.exists()
 
 
+@pytest.mark.slow
 def test_weights_and_places(store: MachineStore, folder: Path, capsys) -> None:
     factor = 1 / math.sqrt(1 + 0.5 / 0.8)
     heavy = one_mode(35.0 * factor, 0.08 * factor)

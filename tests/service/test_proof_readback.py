@@ -93,6 +93,7 @@ def test_nothing_but_noise_is_another_print(machine, printed, tmp_path):
     assert verify_log(printed, tmp_path / "log.csv", machine).outcome == "another print"
 
 
+@pytest.mark.slow
 def test_a_sensor_on_the_head_of_a_bed_slinger_sees_x_only(machine, printed, tmp_path):
     record(printed, machine, tmp_path / "log.csv", sees=(1.0, 0.0), start_s=300, seed=2)
     report = verify_log(printed, tmp_path / "log.csv", machine)
@@ -101,6 +102,7 @@ def test_a_sensor_on_the_head_of_a_bed_slinger_sees_x_only(machine, printed, tmp
     assert any("no motion of Y" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed, tmp_path):
     record(printed, machine, tmp_path / "log.csv", sees=(0.7, 0.7), start_s=300)
     report = verify_log(printed, tmp_path / "log.csv", machine)
@@ -108,6 +110,7 @@ def test_a_wrong_scale_is_not_taken_for_a_change_of_the_machine(machine, printed
     assert all("reads 0.70 of the predicted" in verdict for verdict in report.verdicts)
 
 
+@pytest.mark.slow
 def test_homing_in_mid_print_is_no_motion(machine, printed, tmp_path):
     twice = tmp_path / "twice.gcode"
     twice.write_text(2 * printed.read_text())

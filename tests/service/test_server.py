@@ -117,6 +117,7 @@ def test_a_killed_server_finishes_its_jobs_after_the_next_start(tmp_path: Path):
         assert result.text == "; compensated\nG1 X2\n"
 
 
+@pytest.mark.slow
 def test_an_interrupted_server_ends_at_once_and_takes_its_worker_along(tmp_path: Path):
     with server(PRETEND, tmp_path) as (client, process):
         running = post(client, b"slow")

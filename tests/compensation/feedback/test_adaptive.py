@@ -45,6 +45,7 @@ def follow(
     return y, targets, seen
 
 
+@pytest.mark.slow
 def test_published_steps() -> None:
     """Paper 000, figures 11 and 12: 500, 1500, 500, 3000, 500 Hz, then silence."""
     parts: list[Tones] = [(500,), (1500,), (500,), (3000,), (500,), ()]

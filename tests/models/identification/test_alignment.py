@@ -34,6 +34,7 @@ def log_of(excitation: Excitation = SHORT, **options: object) -> AccelerationLog
     return simulate_log(PLANTS, excitation, rng=rng, **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excitation", [NEW, LEGACY, NEW_Y])
 @pytest.mark.parametrize(
     "sensor",

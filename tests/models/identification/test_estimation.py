@@ -66,6 +66,7 @@ def errors(
     return np.asarray(np.abs(aligned / truth - 1), np.float64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("excitation", [NEW, LEGACY])
 @pytest.mark.parametrize("plant", [MODES, SHARP])
 @pytest.mark.parametrize(

@@ -50,6 +50,7 @@ def measured(
     return FrequencyResponse(f, h, sd, np.full(len(f), 0.999))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("gains", [(0.75, 0.2, 0.05), (0.6, 0.3, 0.1), (1.2, -0.15, -0.05)])
 def test_modes_of_a_simulated_log(seed: int, gains: tuple[float, ...]) -> None:
@@ -235,6 +236,7 @@ def paired(
     return plant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [-0.016, 0.0, 0.004])
 def test_axis_as_slow_as_the_taz_is_found_whatever_the_start(late_s: float) -> None:
     """Alignment puts the plant's own delay, here 12 ms, into the start of the test."""

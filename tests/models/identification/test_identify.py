@@ -201,6 +201,7 @@ def test_a_response_that_is_not_1_at_low_frequency(gain: float) -> None:
     assert identify([at(response(plant))])["x"].warnings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [-2, -1, 1, 2])
 def test_command_and_measurement_of_different_kinds(power: int) -> None:
     plain = response(one_mode(60.0, 0.05))
@@ -210,6 +211,7 @@ def test_command_and_measurement_of_different_kinds(power: int) -> None:
     assert identify([at(plain)])["x"].warnings == ()
 
 
+@pytest.mark.slow
 def test_command_and_measurement_exchanged() -> None:
     plant = PairsSpec(poles=(PolePair(f_hz=40.0, zeta=0.3), PolePair(f_hz=90.0, zeta=0.3)))
     forward = response(plant)
@@ -243,6 +245,7 @@ def clipped_at(limit_mm_s2: float) -> InputFile:
     return raw_file(replace(log, accel_mm_s2=np.clip(log.accel_mm_s2, -limit_mm_s2, limit_mm_s2)))
 
 
+@pytest.mark.slow
 def test_a_sensor_whose_range_ended() -> None:
     most = float(np.abs(quick_log("x").accel_mm_s2[:, 0]).max())
     found = one(clipped_at(0.7 * most))
@@ -279,6 +282,7 @@ def test_delays_of_responses_are_compared() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_poor_fit_is_told() -> None:
     two = PairsSpec(poles=two_modes(33.0, 55.0).poles)
     (warning, *_) = identify([at(response(two))], max_order=1)["x"].warnings
@@ -484,6 +488,7 @@ def test_same_files_same_plants() -> None:
     assert [a.plants for a in first.values()] == [a.plants for a in again.values()]
 
 
+@pytest.mark.slow
 def test_what_no_model_explains_is_refused() -> None:
     f = np.arange(5.0, 130.0, 0.5)
     rng = np.random.default_rng(5)

@@ -172,6 +172,7 @@ def test_every_real_table(shared_dir: Path) -> None:
     assert np.mean(met) >= 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("file", "f_hz", "peak"),

@@ -52,6 +52,7 @@ def test_figures(tmp_path: Path):
         assert "what-a-caller-wrote" not in answer.text
 
 
+@pytest.mark.slow
 def test_how_long_jobs_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("service.api.metrics._SETTLED_S", 0.0)
     with opened(tmp_path) as client:

@@ -24,6 +24,7 @@ FILES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(FILES))
 @pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
 def test_refused(tmp_path: Path, cache: Path, name: str, road: str) -> None:

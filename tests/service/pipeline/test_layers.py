@@ -166,6 +166,7 @@ def test_sliders_top_is_a_round_number(tmp_path: Path, cache: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_same_bytes_and_no_other_file(tmp_path: Path, cache: Path) -> None:
     machine = load_machine("ender3")
     found, written = [], []

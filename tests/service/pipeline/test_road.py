@@ -291,6 +291,7 @@ def permissive(machine: Machine) -> Machine:
     return wide(machine).model_copy(update={"firmware": firmware})
 
 
+@pytest.mark.slow
 @pytest.mark.shared
 @pytest.mark.parametrize(
     ("name", "machine", "lines"),

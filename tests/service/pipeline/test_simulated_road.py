@@ -14,6 +14,7 @@ from tests.gcode.cutting import HEAD
 LINES = "G1 X20 Y20 F6000\nG1 X100 Y20 E5 F3000\nG1 X100 Y60 E2\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("between", ["G28 X Y\n", "PAUSE\n", "T1\nT0\n", "G4 P300\n", ""])
 def test_where_the_machine_is_lost_nothing_is_measured(tmp_path: Path, between: str) -> None:
     """The nozzle does not jump to where homing leaves it, nor ring from it."""

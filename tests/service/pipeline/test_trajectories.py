@@ -38,6 +38,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
         return dict(found)
 
 
+@pytest.mark.slow
 def test_the_whole_print(source: Path, tmp_path: Path, cache: Path) -> None:
     machine, options = load_machine("ender3"), Options()
     target = tmp_path / "t.npz"
