@@ -65,6 +65,9 @@ class Sender:
         After how long without a word the sender of a delivery counts as dead.
     poll_s : float
         How often the table is looked at.
+    start_within_s : float
+        A print that cannot begin so soon after its job was done is not started later, when nobody
+        may be there to see it begin; its file is uploaded all the same.
     """
 
     def __init__(
@@ -80,6 +83,7 @@ class Sender:
         attempts: int = 10,
         claim_s: float = 60.0,
         poll_s: float = 1.0,
+        start_within_s: float = 3600.0,
     ) -> None:
         self._engine = engine
         self._store = store
@@ -91,6 +95,7 @@ class Sender:
         self._attempts = attempts
         self._claim_s = claim_s
         self._poll_s = poll_s
+        self._start_within_s = start_within_s
         self._log = structlog.get_logger("deliveries")
         self._wake = threading.Event()
         self._stopping = threading.Event()
@@ -226,7 +231,8 @@ class Sender:
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
         warnings, unsafe = self._looked_at(printer, job)
-        starts = job.print_after and not unsafe
+        late = time.time() - (job.finished_at or 0.0) > self._start_within_s
+        starts = job.print_after and not unsafe and not late
         with self._storage.local(f"{job.output}/result/{job.result_name}") as file:
             reply = upload(printer, file, job.result_name, sha256=job.result_sha256, start=starts)
         state, error = _judged(reply)
@@ -234,8 +240,14 @@ class Sender:
             return "failed", _unknown(error or "")
         if state == "done":
             told = what_started(printer, reply) if starts else None
-            if job.print_after and not starts:
+            if job.print_after and unsafe:
                 told = "uploaded, but not started, because it would be unsafe"
+            elif job.print_after and late:
+                told = (
+                    "uploaded, but not started: it was done more than "
+                    f"{self._start_within_s:.0f} s ago, and nobody may be there; start it at the "
+                    "printer"
+                )
             error = "; ".join([*([told] if told else ()), *unsafe, *warnings]) or None
         return state, error
 

@@ -110,6 +110,19 @@ def test_a_printer_that_must_not_be_started_is_not(tmp_path: Path):
     assert "start = true" in (delivery.error or "")
 
 
+def test_a_print_that_comes_late_is_not_started(tmp_path: Path):
+    with (
+        moonraker() as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=True)
+        with place.sending(start_within_s=0.0):
+            delivery = place.settled(job)
+    assert delivery.state == "done"
+    assert "not started" in (delivery.error or "")
+    assert uploads(server)[0].parts()["print"][1] == b"false"
+
+
 def test_a_printer_that_is_off_gets_it_when_it_is_on(tmp_path: Path):
     with Listener() as server:
         port = server.port
