@@ -32,8 +32,9 @@ def address(running: Running) -> str:
 
 
 @pytest.fixture(autouse=True)
-def alone(request: pytest.FixtureRequest) -> None:
-    """Let no test find jobs of those before it on the server that all share."""
+def alone(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Leave no jobs on the server that all share: another test would find them."""
+    yield
     if "running" in request.fixturenames:
         running: Running = request.getfixturevalue("running")
         for job in running.job_ids():
