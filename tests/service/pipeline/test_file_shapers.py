@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -53,16 +54,14 @@ def machine_with(kind: str, **firmware: object) -> Machine:
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("cache")
-    cached_shaper(load_machine("ender3"), folder)
-    return folder
+    return tmp_path_factory.mktemp("cache")
 
 
 def tuned_for(machine: Machine, cache: Path) -> None:
     """Let a machine of the same plants have the same best shaper: tuning takes its seconds."""
-    [made] = cache.glob(f"shaper-{load_machine('ender3').revision}-*")
-    other = made.with_name(made.name.replace(load_machine("ender3").revision, machine.revision))
-    other.write_bytes(made.read_bytes())
+    best = cached_shaper(load_machine("ender3"), cache)
+    name = f"shaper-{machine.revision}-1000us-v1.json"
+    (cache / name).write_text(json.dumps(asdict(best)))
 
 
 def compensated(text: str, machine: Machine, folder: Path, cache: Path) -> tuple[Result, list[str]]:
