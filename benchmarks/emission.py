@@ -106,7 +106,7 @@ class Watched(road._Job):
             # Before the first sample of a stretch the command's E still belongs to the rest.
             own = t_s >= timeline.dt_s * np.ceil(timeline.start_s[k] / timeline.dt_s - 1e-6)
             self.filament.add(1e3 * np.abs(actual[3] - wanted[2])[own], line)
-        taken_s = road._duration_s(executed)
+        taken_s = executed.duration_s
         stretch_s = float(timeline.end_s[-1] - timeline.start_s[-1])
         self.late_s += taken_s - (float(encoded.group_start_s[-1]) + stretch_s - origin_s)
         self.off_grid_s += taken_s - (float(timeline.end_s[-1]) - origin_s)

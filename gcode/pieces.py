@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 
 from gcode.firmware.planning import plan_moves
 from gcode.firmware.registry import kit
-from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, Phases, ProgramBlock
+from gcode.types import (
+    KEPT,
+    EventKind,
+    Events,
+    Limits,
+    ModalState,
+    Moves,
+    Phases,
+    ProgramBlock,
+    rows_of,
+)
 from models.machine import Machine
 
 __all__ = ["Passage", "Piece", "Splitter", "excerpt"]
@@ -235,7 +245,7 @@ class Splitter:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
             limits = self._tables[0]
-            phases = plan_moves(_rows(moves, slice(0, last)), limits, self._machine)
+            phases = plan_moves(rows_of(moves, slice(0, last)), limits, self._machine)
             if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
                 # A move of no length has no plan; leave its neighbourhood as it is.
                 self._raw[:last] |= xy[:last]
@@ -254,9 +264,9 @@ class Splitter:
                 continue
             last, natural = _place_to_cut(moves, phases, self._longest_s)
             if natural and self._kit.extruder_alone_stops:
-                phases = _rows(phases, slice(0, last))
+                phases = rows_of(phases, slice(0, last))
             else:
-                phases = plan_moves(_rows(moves, slice(0, last)), limits, self._machine)
+                phases = plan_moves(rows_of(moves, slice(0, last)), limits, self._machine)
             yield self._piece(last, phases)
 
     def _piece(self, last: int, phases: Phases) -> Piece:
@@ -282,8 +292,8 @@ class Splitter:
             self._limits_id, self._modal_id = int(state.limits_id[row]), int(state.modal_id[row])
         text = self._text[: until - self._text_offset]
         taken = Passage(
-            moves=_rows(moves, slice(0, m)),
-            events=_rows(events, slice(0, e)),
+            moves=rows_of(moves, slice(0, m)),
+            events=rows_of(events, slice(0, e)),
             text=text,
             text_offset=self._text_offset,
             limits=limits,
@@ -299,8 +309,8 @@ class Splitter:
         if m == len(moves) and e == len(events):
             self._moves = self._events = None
         else:
-            self._moves = _rows(moves, slice(m, None))
-            self._events = _shifted(_rows(events, slice(e, None)), -m)
+            self._moves = rows_of(moves, slice(m, None))
+            self._events = _shifted(rows_of(events, slice(e, None)), -m)
         return taken
 
 
@@ -316,7 +326,7 @@ def excerpt(piece: Piece, first: int, last: int, machine: Machine) -> Piece:
     return replace(
         piece,
         moves=moves,
-        events=_rows(piece.events, slice(0, 0)),
+        events=rows_of(piece.events, slice(0, 0)),
         text=b"",
         phases=plan_moves(moves, piece.limits, machine),
     )
@@ -390,12 +400,8 @@ def _shortest_s(moves: Moves) -> float:
 
 
 def _end_s(phases: Phases) -> float:
-    last = _rows(phases, slice(-1, None))
+    last = rows_of(phases, slice(-1, None))
     return float((last.t_s + last.accel_s + last.cruise_s + last.decel_s)[0])
-
-
-def _rows(table: T, rows: slice) -> T:
-    return type(table)(**{f.name: getattr(table, f.name)[rows] for f in fields(table)})
 
 
 def _joined(first: T, second: T) -> T:

@@ -9,12 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Self, cast
+from typing import Self, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KEPT", "EventKind", "Events", "Limits", "ModalState", "Moves", "Phases", "ProgramBlock"]
+__all__ = [
+    "KEPT",
+    "EventKind",
+    "Events",
+    "Limits",
+    "ModalState",
+    "Moves",
+    "Phases",
+    "ProgramBlock",
+    "rows_of",
+]
 
 KEPT = 8
 """Bit of `Moves.known`: the file asks that the move stays as it is."""
@@ -202,3 +212,19 @@ class Phases:
 
     def __len__(self) -> int:
         return len(self.t_s)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first move's start to the last one's end."""
+        if len(self) == 0:
+            return 0.0
+        last_s = self.accel_s[-1] + self.cruise_s[-1] + self.decel_s[-1]
+        return float(self.t_s[-1] + last_s - self.t_s[0])
+
+
+_Table = TypeVar("_Table", Moves, Events, Phases)
+
+
+def rows_of(table: _Table, rows: slice) -> _Table:
+    """Return some rows of a table."""
+    return type(table)(**{f.name: getattr(table, f.name)[rows] for f in fields(table)})

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.missing import tell
 from tests.service.database.postgres import MISSING as _NO_POSTGRESQL
 from tests.service.database.postgres import is_installed, postgres_server, postgres_url
 
@@ -66,17 +67,5 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say it loudly when a part of the evidence was left out."""
-    for missing, need in (
-        (_MISSING, "the shared test data (STILLPATH_SHARED)"),
-        (_NO_POSTGRESQL, "PostgreSQL"),
-    ):
-        skipped = [
-            report
-            for report in terminalreporter.getreports("skipped")
-            if missing in str(report.longrepr)
-        ]
-        if skipped:
-            terminalreporter.write_line(
-                f"NOT CHECKED: {len(skipped)} tests need {need}", yellow=True, bold=True
-            )
+    tell(terminalreporter, _MISSING, "the shared test data (STILLPATH_SHARED)")
+    tell(terminalreporter, _NO_POSTGRESQL, "PostgreSQL")

@@ -28,7 +28,7 @@ from gcode.quickening import (
     top_limits,
 )
 from gcode.sampler import sample_phases
-from gcode.types import Moves, Phases
+from gcode.types import Moves
 from models.machine import Machine
 from service.pipeline.compensating import DT_S, PieceCompensator, Unfit, as_executed
 from service.pipeline.options import Options
@@ -132,14 +132,14 @@ class SpeedBudget:
         """
         classes = move_classes(piece.moves, self.first_layer)
         with_shaper = quickened(piece, classes, _paces(self.shaper_paces.factors), self.machine)
-        self.shaper_s += _duration_s(with_shaper.phases)
+        self.shaper_s += with_shaper.phases.duration_s
         for share in _GENTLER:
             factors = {one: factor**share for one, factor in self.paces.factors.items()}
             quick = quickened(piece, classes, _paces(factors), self.machine)
             if quick is piece:
                 break
             yield quick
-            self.gentler_s += _duration_s(piece.phases) if share == 1.0 else 0.0
+            self.gentler_s += piece.phases.duration_s if share == 1.0 else 0.0
         yield piece
 
     def passed(self, seconds: float) -> None:
@@ -259,7 +259,7 @@ class _Shaped:
         for sample in self._samples:
             piece = quickened(sample.piece, sample.classes, _paces(factors), self._machine)
             phases = piece.phases
-            count = max(round(_duration_s(phases) / DT_S), 1)
+            count = max(round(phases.duration_s / DT_S), 1)
             position, row = sample_phases(phases, (0.0, DT_S, count))
             path = np.pad(position[:2], ((0, 0), (pad, pad)), mode="edge")
             command = [shape(p, DT_S, pulses) for p, pulses in zip(path, self._pulses, strict=True)]
@@ -347,8 +347,3 @@ def _name(one: int, names: Sequence[str]) -> str:
     if one == TRAVEL:
         return "travel"
     return names[one] if one >= 0 else "unnamed"
-
-
-def _duration_s(phases: Phases) -> float:
-    last = phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
-    return float(phases.t_s[-1] + last - phases.t_s[0])

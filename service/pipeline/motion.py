@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
@@ -21,7 +21,7 @@ from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.sampler import Sampler, Samples
 from gcode.slicers.facts import SlicerFacts
-from gcode.types import EventKind, Moves, Phases, ProgramBlock
+from gcode.types import EventKind, Moves, Phases, ProgramBlock, rows_of
 from models.machine import Machine
 from models.schedule import OperatingPoint
 from models.shaping import OFF, Shaping
@@ -33,7 +33,7 @@ from service.pipeline.layer_files import written_layers
 from service.pipeline.length import LengthGuard
 from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names
 from service.pipeline.operating import Operation
-from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from service.pipeline.result import Result, StageTime
 from service.pipeline.shaping import ShapedMotion
@@ -235,8 +235,7 @@ class MotionPart:
     def own_moves(self) -> Moves:
         """Return the moves in which the samples lie."""
         first, last = self.samples.move_index[[0, -1]] - self.first_move
-        moves = self.moves
-        return Moves(**{f.name: getattr(moves, f.name)[first : last + 1] for f in fields(moves)})
+        return rows_of(self.moves, slice(first, last + 1))
 
     def motion(self) -> MotionSamples:
         """Return the samples with line, layer and feature."""
@@ -439,8 +438,7 @@ class _Motion:
         self._dialect = dialect_for(machine, dialect)
         self._asked = dialect
         self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
-        self._progress = progress
-        self._began = time.monotonic()
+        self._progress, self._teller = progress, Teller(progress)
         self.time_s = 0.0
         self.feature_names: list[str] = []
         self.facts = SlicerFacts()
@@ -458,19 +456,12 @@ class _Motion:
                 self._dialect,
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,
-                told=self._say,
+                told=partial(self._teller.say, "planning"),
             )
             self.feature_names = motion.reader.feature_names
             yield from motion
         self.time_s, self.shapers = motion.time_s, motion.shapers
         self.warnings = [*doubtful, *motion.warnings]
-
-    def _say(self, fraction: float, time_s: float) -> None:
-        if self._progress is None:
-            return
-        elapsed = time.monotonic() - self._began
-        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
-        self._progress(Progress("planning", min(fraction, 1.0), time_s, elapsed, eta))
 
 
 def _joined(parts: list[Moves]) -> Moves:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -12,6 +13,9 @@ from pydantic import (
     model_serializer,
 )
 
+from models.machine import Machine
+from service.version import __version__
+
 __all__ = [
     "DEFAULT_TOLERANCE_UM",
     "BasisName",
@@ -19,6 +23,7 @@ __all__ = [
     "DialectName",
     "Options",
     "RobustMode",
+    "stamp",
 ]
 
 DEFAULT_TOLERANCE_UM = 2.0
@@ -69,3 +74,12 @@ class Options(BaseModel):
         if values.get("budget_um") is None:
             values.pop("budget_um", None)
         return values
+
+
+def stamp(machine: Machine, options: Options) -> str:
+    """Return what a written file says of how it was made; the same stamp, the same bytes."""
+    settings = hashlib.sha256(options.model_dump_json(exclude={"plate"}).encode()).hexdigest()[:8]
+    return (
+        f"{__version__} machine={machine.name} model={machine.revision} "
+        f"method={options.method} settings={settings}"
+    )

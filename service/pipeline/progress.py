@@ -6,7 +6,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Cancelled", "Progress", "ProgressCallback", "telling"]
+__all__ = ["Cancelled", "Progress", "ProgressCallback", "Teller", "telling"]
+
+
+_SURE = 0.02
+"""Share behind which the time still needed can be told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,27 @@ class Cancelled(Exception):
 
 ProgressCallback = Callable[[Progress], None]
 """Called now and then; may raise `Cancelled`."""
+
+
+class Teller:
+    """Tells where a job is, and how long it may still take.
+
+    Parameters
+    ----------
+    callback : callable, optional
+    """
+
+    def __init__(self, callback: ProgressCallback | None) -> None:
+        self._callback = callback
+        self._began = time.monotonic()
+
+    def say(self, stage: str, fraction: float, print_s: float = 0.0) -> None:
+        """Tell the stage, the share of all that is done, and the seconds of printing handled."""
+        if self._callback is None:
+            return
+        elapsed_s = time.monotonic() - self._began
+        eta_s = elapsed_s * (1.0 - fraction) / fraction if fraction > _SURE else None
+        self._callback(Progress(stage, min(fraction, 1.0), print_s, elapsed_s, eta_s))
 
 
 def telling(

@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import hashlib
 import io
 import tempfile
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -30,7 +28,7 @@ from gcode.pieces import Passage, Piece, Splitter
 from gcode.sampler import sample_phases
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import Retiming
-from gcode.types import EventKind, Events, Moves, Phases
+from gcode.types import EventKind, Events, Moves, Phases, rows_of
 from models.errors import ModelError
 from models.machine import Machine
 from service.pipeline.budget import SpeedBudget
@@ -50,8 +48,8 @@ from service.pipeline.length import LengthGuard
 from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names, part_of
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
-from service.pipeline.options import Options
-from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.options import Options, stamp
+from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
@@ -182,8 +180,7 @@ class _Job:
         self._layers = layers
         self._source, self._target = source, target
         self._machine, self._options = machine, options
-        self._progress = progress
-        self._began = time.monotonic()
+        self._teller = Teller(progress)
         self._clock = StageClock()
         self._changes = options.method != "none"
         self._kit = kit(machine)
@@ -217,7 +214,7 @@ class _Job:
                 machine, DT_S, self._shaper, compensated=True, take_layer=take_layer, trace=trace
             )
         if self._changes:
-            self._writer = StreamWriter(self._kit, self._stamp())
+            self._writer = StreamWriter(self._kit, stamp(machine, options))
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum = _Sums()
@@ -295,7 +292,7 @@ class _Job:
         delay_s = self.delay_s
         self._sum.pieces += 1
         self._sum.moves += len(piece.moves)
-        original_s = _duration_s(piece.phases)
+        original_s = piece.phases.duration_s
         self._check_end(piece, original_s)
         self._sum.original_s += original_s
         if self._sum.jumped:
@@ -355,7 +352,7 @@ class _Job:
             self._measurement.add(written)
             return
         phases = piece.phases
-        count = max(round(_duration_s(phases) / DT_S), 1)
+        count = max(round(phases.duration_s / DT_S), 1)
         position, row = sample_phases(phases, (0.0, DT_S, count))
         sliced = self._samples(piece, row, position, position, _feeding(phases)[row])
         self._measurement.add_pair(written, sliced)
@@ -414,7 +411,7 @@ class _Job:
     def _measure_passage(self, passage: Passage, phases: Phases) -> None:
         moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
         duration = phases.accel_s + phases.cruise_s + phases.decel_s
-        motion_s = _duration_s(phases)
+        motion_s = phases.duration_s
         self._sum.original_s += motion_s
         self._sum.time_s += motion_s
         self._sum.extruding_s += float(np.sum(duration[_feeding(phases)]))
@@ -500,21 +497,13 @@ class _Job:
         encoded = made.encoded
         stretch = made.timeline.end_s[-1] - made.timeline.start_s[-1]
         planned_end = encoded.group_start_s[-1] + stretch - made.timeline.start_s[0]
-        late = _duration_s(executed) - float(planned_end)
+        late = executed.duration_s - float(planned_end)
         if abs(late) > _TIME_EXCESS_S:
             raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
         end = executed.start_mm[-1] + executed.direction[-1] * _length_mm(executed)
         wanted = piece.moves.end_mm[-1]
         if np.any(np.abs(end - wanted) > step + _END_MM):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
-
-    def _stamp(self) -> str:
-        options = self._options.model_dump_json(exclude={"plate"})
-        settings = hashlib.sha256(options.encode()).hexdigest()[:8]
-        return (
-            f"{__version__} machine={self._machine.name} model={self._machine.revision} "
-            f"method={self._options.method} settings={settings}"
-        )
 
     def _emit(
         self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
@@ -524,12 +513,7 @@ class _Job:
         self.retiming.push(text, item, delay_s)
 
     def _say(self, stage: str, fraction: float) -> None:
-        if self._progress is None:
-            return
-        elapsed = time.monotonic() - self._began
-        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
-        seconds = self._sum.time_s if hasattr(self, "_sum") else 0.0
-        self._progress(Progress(stage, fraction, seconds, elapsed, eta))
+        self._teller.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
 
     def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
         total, measured = self._sum, self._measurement
@@ -612,7 +596,7 @@ class _Sums:
 
     def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
         timeline, segments = made.timeline, made.segments
-        seconds = _duration_s(executed) + float(timeline.start_s[0])
+        seconds = executed.duration_s + float(timeline.start_s[0])
         self.time_s += seconds
         self.compensated_s += seconds
         self.extruding_s += DT_S * float(np.sum(made.extruding))
@@ -650,7 +634,7 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
     for k in [*stops.tolist(), None]:
         end = len(passage.moves) if k is None else int(events.move_index[k])
         if end > done:
-            rows = _move_rows(passage, done, end)
+            rows = rows_of(passage.moves, slice(done, end))
             phases = plan_moves(rows, passage.limits, machine)
             if len(phases):
                 numbers = phases.move_index - phases.move_index[0] + done
@@ -663,14 +647,7 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
 
 
 def _takes_s(part: Phases | float | None) -> float:
-    return _duration_s(part) if isinstance(part, Phases) else part or 0.0
-
-
-def _duration_s(phases: Phases) -> float:
-    if len(phases) == 0:
-        return 0.0
-    last = phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
-    return float(phases.t_s[-1] + last - phases.t_s[0])
+    return part.duration_s if isinstance(part, Phases) else part or 0.0
 
 
 def _length_mm(phases: Phases) -> float:
@@ -687,8 +664,3 @@ def _feeding(phases: Phases) -> np.ndarray:
     direction = phases.direction
     moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
     return np.asarray(moves_xy & (direction[:, 3] > 0.0))
-
-
-def _move_rows(passage: Passage, first: int, last: int) -> Moves:
-    moves = passage.moves
-    return Moves(**{f.name: getattr(moves, f.name)[first:last] for f in fields(moves)})

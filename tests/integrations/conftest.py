@@ -12,6 +12,7 @@ from tests.integrations.moonraker import NO_MOONRAKER
 from tests.integrations.octoprint import NO_OCTOPRINT
 from tests.integrations.running import Running
 from tests.integrations.slicers import NOT_HERE
+from tests.missing import tell
 from tests.service.test_server import server
 
 _ODD_SERVER = Path(__file__).with_name("odd_server.py")
@@ -42,17 +43,6 @@ def alone(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    for missing, needed in (
-        (NOT_HERE, "a slicer (tests/integrations/get-slicers)"),
-        (NO_OCTOPRINT, "OctoPrint (tests/get-tools)"),
-        (NO_MOONRAKER, "Moonraker (tests/get-tools)"),
-    ):
-        skipped = [
-            report
-            for report in terminalreporter.getreports("skipped")
-            if missing in str(report.longrepr)
-        ]
-        if skipped:
-            terminalreporter.write_line(
-                f"NOT CHECKED: {len(skipped)} tests need {needed}", yellow=True, bold=True
-            )
+    tell(terminalreporter, NOT_HERE, "a slicer (tests/integrations/get-slicers)")
+    tell(terminalreporter, NO_OCTOPRINT, "OctoPrint (tests/get-tools)")
+    tell(terminalreporter, NO_MOONRAKER, "Moonraker (tests/get-tools)")

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
+from tests.missing import tell
 from tests.web.served import GEAR, PATIENCE_MS, Service, running
 from tests.web.visitor import Visitor
 
@@ -28,14 +29,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say it loudly when the page was not looked at."""
-    skipped = [r for r in terminalreporter.getreports("skipped") if _MISSING in str(r.longrepr)]
-    if skipped:
-        terminalreporter.write_line(
-            f"NOT CHECKED: {len(skipped)} tests of the web page need Debian's Chromium",
-            yellow=True,
-            bold=True,
-        )
+    tell(terminalreporter, _MISSING, "Debian's Chromium: the web page was not looked at")
 
 
 @pytest.fixture(scope="session")

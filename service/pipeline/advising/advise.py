@@ -8,17 +8,14 @@ written lines set it. Where a feature exceeds its bound there, it is made slower
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import re
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 
 import numpy as np
 
@@ -29,7 +26,7 @@ from gcode.interpreter import Interpreter
 from gcode.quickening import FirstLayer
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import behind_last_command
-from gcode.types import EventKind, Moves, ProgramBlock
+from gcode.types import EventKind, ProgramBlock, rows_of
 from models.machine import Machine
 from models.operating import OperatingGrid
 from models.schedule import EMPTY, OperatingPoint
@@ -44,8 +41,8 @@ from service.pipeline.layer_files import LayerWriter, written_layers
 from service.pipeline.measure import STRIDE, Measurement, MotionSamples, channel_names
 from service.pipeline.motion import STANDING_S, TextMotion
 from service.pipeline.operating import Operation
-from service.pipeline.options import Options
-from service.pipeline.progress import Progress, ProgressCallback, telling
+from service.pipeline.options import Options, stamp
+from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts
 from service.pipeline.result import (
     AdviceFigures,
@@ -63,6 +60,8 @@ from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
 __all__ = ["advise_file"]
+
+V = TypeVar("V")
 
 _BLOCK_BYTES = 1 << 17
 _COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
@@ -129,7 +128,7 @@ class _Job:
     ) -> None:
         self._source, self._spool = source, spool
         self._machine, self._options = machine, options
-        self._progress, self._began = progress, time.monotonic()
+        self._say = Teller(progress).say
         self._clock = StageClock()
         self._kit = kit(machine)
         self._dialect = dialect_for(machine, options.dialect)
@@ -227,7 +226,7 @@ class _Job:
             choice.advice(first_layer),
             reader.feature_names,
             self._kit.initial_limits(),
-            self._stamp(),
+            stamp(self._machine, self._options),
         )
         out = self._spool
         out.seek(0)
@@ -286,21 +285,6 @@ class _Job:
             sink.finish()
         self._notes = operation.notes()
         return motion
-
-    def _stamp(self) -> str:
-        options = self._options.model_dump_json(exclude={"plate"})
-        settings = hashlib.sha256(options.encode()).hexdigest()[:8]
-        return (
-            f"{__version__} machine={self._machine.name} model={self._machine.revision} "
-            f"method=advise settings={settings}"
-        )
-
-    def _say(self, stage: str, fraction: float, print_s: float = 0.0) -> None:
-        if self._progress is None:
-            return
-        elapsed = time.monotonic() - self._began
-        eta = elapsed * (1.0 - fraction) / fraction if fraction > 0.02 else None
-        self._progress(Progress(stage, min(fraction, 1.0), print_s, elapsed, eta))
 
     def _figures(
         self,
@@ -494,7 +478,7 @@ class _Levels:
             return
         edges = np.flatnonzero(np.diff(block.moves.layer)) + 1
         for first, last in pairwise([0, *edges.tolist(), len(block.moves)]):
-            moves = _rows(block.moves, first, last)
+            moves = rows_of(block.moves, slice(first, last))
             point, layer = self._operation.at(moves), int(moves.layer[0])
             self._operation.passed(moves)
             if layer == self._layer:
@@ -507,10 +491,6 @@ class _Levels:
                 else:
                     self.table.append((layer, point))
             self._layer = layer
-
-
-def _rows(moves: Moves, first: int, last: int) -> Moves:
-    return Moves(**{f.name: getattr(moves, f.name)[first:last] for f in fields(moves)})
 
 
 def _add(
@@ -545,7 +525,7 @@ def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> li
     return out
 
 
-def _in_order(values: dict[str, float]) -> dict[str, float]:
+def _in_order(values: dict[str, V]) -> dict[str, V]:
     return {n: values[n] for n in channel_names(compensated=True) if n in values}
 
 
@@ -554,7 +534,6 @@ def _merged_spectra(
 ) -> list[AxisSpectrum]:
     out = []
     for one, other in zip(before, after, strict=False):
-        values = one.um_per_sqrt_hz | other.um_per_sqrt_hz
-        ordered = {n: values[n] for n in channel_names(compensated=True) if n in values}
+        ordered = _in_order(one.um_per_sqrt_hz | other.um_per_sqrt_hz)
         out.append(one.model_copy(update={"um_per_sqrt_hz": ordered}))
     return out
