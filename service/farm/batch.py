@@ -53,11 +53,11 @@ def run_batch(
     waiting = set(futures)
     while waiting:
         done, waiting = wait(waiting, timeout=_LOOK_S, return_when=FIRST_COMPLETED)
-        check()
         for future in done:
             outcome = future.result()
             outcomes[id(futures[future])] = outcome
             tell(outcome)
+        check()
     return [outcomes[id(item)] for item in items]
 
 
