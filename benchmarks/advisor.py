@@ -5,10 +5,11 @@ where an acceleration would help; and without a budget (the first run of each fi
 no longer than the original at no larger an error. `MISS` stands where it is not so.
 
     python benchmarks/advisor.py [NAME ...] [--machines ender3 voron-v24-250] [--budgets 0 25]
-        [--lines N] [--firmware examples/firmware/marlin.json [--facts '{"inch_mode": true}']]
+        [--lines N] [--log FILE]
+        [--firmware examples/firmware/marlin.json [--facts '{"inch_mode": true}']]
 
 Names are parts of names of the corpus, or paths; without any the whole corpus and the examples are
-taken. A budget of 0 stands for none.
+taken, small files first. A budget of 0 stands for none. With a log what is in it is not run again.
 """
 
 from __future__ import annotations
@@ -33,15 +34,21 @@ from tests.e2e.round_trip import corpus_files, corpus_folder, excerpt, made_to_f
 
 ROOT = Path(__file__).resolve().parent.parent
 _EXAMPLES = ("cura_ender3_gear24.gcode", "ps_ender3_pauses_hept24f.gcode")
+_COLUMNS = (
+    *("file", "machine", "budget, um", "lines", "before, s", "after, s"),
+    *("before, um", "after, um", "walls, um", "CPU, s", "outcome"),
+)
+_HEAD = f"\n| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|"
 _LONGER = 1.0005
 """Rests of a shaper that changes are no misses."""
 
 
 def main() -> int:
     arguments = _arguments()
-    missed = 0
-    head = f"{'file':40} {'machine':15} {'um':>4} {'lines':>6} {'print s':>8} {'advised':>8}"
-    print(f"{head} {'before':>7} {'after':>7} {'walls':>6} {'CPU s':>6}  outcome")
+    log: Path | None = arguments.log
+    known = log.read_text().splitlines() if log and log.exists() else []
+    rows = []
+    print(_HEAD)
     with tempfile.TemporaryDirectory() as name:
         for path in _files(arguments.names):
             data = text_of(path)
@@ -50,61 +57,83 @@ def main() -> int:
             for machine in arguments.machines:
                 made = _machine(machine, arguments)
                 for budget_um in arguments.budgets:
-                    missed += _advised(path.name, data, made, budget_um, Path(name))
-    return 1 if missed else 0
+                    key = _key(path.name, made, budget_um)
+                    row = next((x for x in known if x.startswith(key)), "")
+                    row = row or key + _advised(data, made, budget_um, Path(name))
+                    print(row, flush=True)
+                    rows.append(row)
+                    if log and row not in known:
+                        with log.open("a") as file:
+                            file.write(row + "\n")
+    return 1 if any("MISS" in row for row in rows) else 0
 
 
-def _advised(name: str, data: bytes, machine: Machine, budget_um: float, folder: Path) -> bool:
+def _key(name: str, machine: Machine, budget_um: float) -> str:
+    return f"| {name.removesuffix('.gz')} | {machine.name} | {budget_um or 'none'} | "
+
+
+def _advised(data: bytes, machine: Machine, budget_um: float, folder: Path) -> str:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_bytes(data)
     target.unlink(missing_ok=True)
     fitted = _known(made_to_fit(machine, data), folder)
     options = Options(method="advise", budget_um=budget_um or None)
-    row, began = f"{name[:40]:40} {machine.name:15} {budget_um:4.0f}", time.process_time()
+    began = time.process_time()
     try:
         result = compensate_file(source, target, fitted, options, cache_dir=folder)
     except GcodeError as error:
-        print(f"{row}  refused: {str(error)[:90]}", flush=True)
-        return False
+        return f" | | | | | | | refused: {str(error)[:90]} |"
     cpu_s = time.process_time() - began
     restored = b"".join(x for x in target.read_bytes().splitlines(keepends=True) if MARK not in x)
-    wrong = [] if restored == data else ["removal does not give the input"]
-    wrong += _worse(result, budget_um)
+    outcome = _outcome(result, budget_um)
+    if restored != data:
+        outcome = f"MISS removal does not give the input; {outcome}"
     assert result.advice is not None
     before, after, _ = (channel.extruding.contour_rms_um for channel in result.channels)
-    walls = [f.after_um for f in result.advice.features if f.bound_um is not None]
-    print(
-        f"{row} {result.advice.lines:6} {result.original_time_s:8.1f} {result.time_s:8.1f} "
-        f"{before:7.2f} {after:7.2f} {max(walls, default=0.0):6.2f} {cpu_s:6.1f}  "
-        f"{'MISS ' + '; '.join(wrong) if wrong else 'kept'}",
-        flush=True,
+    walls = [f.after_um for f in result.advice.features if f.bound_um is not None and f.exact]
+    return (
+        f"{result.advice.lines} | {result.original_time_s:.1f} | {result.time_s:.1f} | "
+        f"{before:.2f} | {after:.2f} | {_figure(max(walls, default=None))} | {cpu_s:.1f} | "
+        f"{outcome} |"
     )
-    return bool(wrong)
 
 
-def _worse(result: Result, budget_um: float) -> list[str]:
+def _outcome(result: Result, budget_um: float) -> str:
     assert result.advice is not None
-    wrong = []
+    wrong: list[str] = []
+    beyond: list[str] = []
     for f in result.advice.features:
         if f.within_bound:
             continue
-        # What is not seen is never made slower than the file has it.
-        raised = f.accel_mm_s2 is not None and not f.exact
-        beyond_reach = any("would do" in x and x.startswith(f.name) for x in result.warnings)
-        if raised or (f.exact and not beyond_reach):
-            wrong.append(f"{f.name}: {f.after_um:.1f} um of {f.bound_um:.1f}")
+        figure = f"{f.name} {f.after_um:.1f} of {f.bound_um:.1f} um"
+        if f.exact and any("would do" in x for x in _about(f.name, result)):
+            beyond.append(f"out of reach: {figure}")
+        elif not f.exact and f.accel_mm_s2 is None:
+            beyond.append(f"no slower than sliced: {figure}")
+        else:
+            wrong.append(figure)
     if not budget_um:
         before, after, _ = (channel.extruding.contour_rms_um for channel in result.channels)
         if result.time_s > result.original_time_s * _LONGER:
             wrong.append(f"{result.time_s - result.original_time_s:.1f} s longer")
         if after > before * 1.001:
             wrong.append("a larger error")
-    return wrong
+    return "; ".join([f"MISS {x}" for x in wrong] + beyond) or "kept"
+
+
+def _figure(um: float | None) -> str:
+    return "-" if um is None else f"{um:.2f}"
+
+
+def _about(name: str, result: Result) -> list[str]:
+    return [x for x in result.warnings if x.startswith(f"{name}: ")]
 
 
 def _files(names: list[str]) -> list[Path]:
-    own = [ROOT / "examples" / name for name in _EXAMPLES]
-    every = own + [corpus_folder() / name for name in corpus_files()]
+    every = [corpus_folder() / name for name in corpus_files()]
+    known = {path.name.removesuffix(".gz") for path in every}
+    every += [ROOT / "examples" / name for name in _EXAMPLES if name not in known]
+    every.sort(key=lambda path: (path.stat().st_size, path.name))
     if not names:
         return every
     paths = [Path(name) for name in names if Path(name).is_file()]
@@ -140,6 +169,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--budgets", nargs="+", type=float, default=[0.0, 25.0])
     parser.add_argument("--firmware", type=Path, help="JSON of another firmware's section")
     parser.add_argument("--facts", default="{}", help="JSON of what is different in it")
+    parser.add_argument("--log", type=Path, help="rows are added; those in it are not run again")
     parser.add_argument("--lines", type=int, help="only so many lines of each file's start")
     return parser.parse_args()
 

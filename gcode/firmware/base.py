@@ -173,6 +173,9 @@ class Adviser(Protocol):
     def sets_accel(self, text: str) -> bool:
         """Tell whether a line of a file sets it."""
 
+    def stores(self, text: str) -> bool:
+        """Tell whether a line of a file stores for good what is in force."""
+
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set the shapers of X and Y."""
 

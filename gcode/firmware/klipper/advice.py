@@ -61,6 +61,10 @@ class KlipperAdviser:
             return "ACCEL" in extended_parameters(text, command.name)
         return False
 
+    def stores(self, _text: str) -> bool:
+        """Tell no: SAVE_CONFIG writes what was calibrated, not what a file has set."""
+        return False
+
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the line that sets both shapers."""
         words = ["SET_INPUT_SHAPER"]

@@ -26,7 +26,7 @@ class MarlinAdviser:
     M593 sets a ZV shaper; a build may lack it, so it is only written where the machine states a
     shaper (`firmware.shaper` with a frequency above 0), M493 where it says `ft_motion`. Sources:
     Marlin/src/gcode/feature/input_shaping/M593.cpp and gcode/config/M200-M205.cpp, 2.1.2 (2023-01);
-    gcode/feature/ft_motion/M493.cpp, bugfix-2.1.x (2025).
+    gcode/feature/ft_motion/M493.cpp, bugfix-2.1.x (2025); module/settings.cpp for M500.
     """
 
     same_for_both = False
@@ -74,6 +74,10 @@ class MarlinAdviser:
             c.name == "M204" and bool(c.words.keys() & {"P", "S"})
             for c in split_line(text, self._dialect)
         )
+
+    def stores(self, text: str) -> bool:
+        """Tell whether a line holds M500: it writes accelerations and shaper to the EEPROM."""
+        return any(c.name == "M500" for c in split_line(text, self._dialect))
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set both shapers."""

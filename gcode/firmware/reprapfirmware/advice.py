@@ -61,6 +61,10 @@ class RepRapAdviser:
             for c in split_line(text, self._dialect)
         )
 
+    def stores(self, _text: str) -> bool:
+        """Tell no: M500 writes neither M204 nor M593 to config-override.g."""
+        return False
+
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the line that sets the shaper; that of X counts."""
         s = shaping.x

@@ -8,32 +8,33 @@ written lines set it. Where a feature exceeds its bound there, it is made slower
 from __future__ import annotations
 
 import contextlib
-import io
-import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
-from gcode.errors import GcodeError
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.quickening import FirstLayer
 from gcode.slicers.facts import SlicerFacts
-from gcode.slicers.retiming import behind_last_command
-from gcode.types import EventKind, ProgramBlock, rows_of
+from gcode.types import ProgramBlock
 from models.machine import Machine
-from models.operating import OperatingGrid
-from models.schedule import EMPTY, OperatingPoint
+from models.schedule import OperatingPoint
 from models.shaping import OFF
-from service.pipeline.advising.choosing import LEVEL_STEP, Choice, choose
+from service.pipeline.advising.choosing import Choice, choose
 from service.pipeline.advising.earlier import EarlierErrors
-from service.pipeline.advising.inserting import MARK, AdviceWriter
+from service.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
+from service.pipeline.advising.messages import (
+    beyond_bounds,
+    kept_beyond,
+    shaper_warnings,
+    stored_settings,
+)
+from service.pipeline.advising.reading import FirstReading
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir, replacing
@@ -64,9 +65,9 @@ __all__ = ["advise_file"]
 V = TypeVar("V")
 
 _BLOCK_BYTES = 1 << 17
-_COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
 _ROUNDS = 7
 _TOLERANCE = 1.001
+_ROUNDING_S = 1e-3
 _UNDO = (
     f"Moves are untouched, and so are the slicer's times in the file; deleting the lines that hold "
     f"{MARK.decode()!r} gives back the original."
@@ -146,13 +147,15 @@ class _Job:
         machine, options = self._machine, self._options
         original = Measurement(machine, DT_S, self._shaper, compensated=False, noted=earlier.note)
         before = SetErrors(machine, DT_S, stride=STRIDE)
-        levels = _Levels(machine)
+        reading = FirstReading(machine, self._adviser)
         with self._clock.stage("measure the original"):
             asked = self._go(
-                self._source, [original, before], "measuring the original", (0.0, 0.25), levels.see
+                self._source, [original, before], "measuring the original", (0.0, 0.25), reading.see
             )
         was = before.errors()
         names = asked.reader.feature_names
+        # What is stored for good must be the printer's own shaper.
+        shaped = not reading.stored_lines or self._adviser.stated is not None
         with self._clock.stage("choose"):
             self._source.seek(0)
             samples = take_samples(self._source, machine, self._dialect)
@@ -163,11 +166,12 @@ class _Job:
                 self._adviser,
                 self._before,
                 options.budget_um,
-                levels.table,
+                reading.levels,
                 lambda share: self._say("choosing", 0.3 + 0.3 * share),
+                shaped=shaped,
             )
         with self._clock.stage("verify"):
-            writer, now = self._settled(choice, was, samples.first_layer)
+            writer, now = self._settled(choice, was, asked.time_s, samples.first_layer)
         earlier.rewind()
         advised = Measurement(
             machine,
@@ -186,17 +190,45 @@ class _Job:
         figures = self._figures(choice, names, was, now, writer.lines)
         helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
         return self._result(
-            name, facts, asked, written, original, advised, figures, writer, helpless
+            name,
+            facts,
+            asked,
+            written,
+            original,
+            advised,
+            figures,
+            [
+                *stored_settings(
+                    reading.stored_lines,
+                    shaper=self._before.label if shaped or not self._adviser.shapers else None,
+                ),
+                *shaper_warnings(
+                    self._unmodelled,
+                    none_known=not self._adviser.shapers,
+                    left=writer.shaper_left,
+                ),
+                *beyond_bounds(
+                    figures.features,
+                    choice.rungs[0],
+                    helpless,
+                    has_budget=options.budget_um is not None,
+                ),
+            ],
         )
 
     def _settled(
-        self, choice: Choice, was: dict[int, ClassError], first_layer: FirstLayer
+        self,
+        choice: Choice,
+        was: dict[int, ClassError],
+        was_s: float,
+        first_layer: FirstLayer,
     ) -> tuple[AdviceWriter, dict[int, ClassError]]:
         """Write and measure until every feature is within its bound or at its slowest."""
         for attempt in range(_ROUNDS):
             writer = self._write(choice, first_layer)
             after = SetErrors(self._machine, DT_S, stride=STRIDE)
-            self._go(self._spool, [after], "verifying", (0.6 + 0.03 * attempt, 0.8), lambda _: None)
+            shares = 0.6 + 0.03 * attempt, 0.8
+            written = self._go(self._spool, [after], "verifying", shares, lambda _: None)
             now = after.errors()
             over = {
                 f: now[f].rms_um / self._bound_um(f, was)
@@ -207,6 +239,7 @@ class _Job:
             if attempt + 2 < _ROUNDS and over and choice.mended(over):
                 continue
             worse = bool(over) or _rms_um(now) > _TOLERANCE * _rms_um(was)
+            worse |= written.time_s > was_s + _ROUNDING_S
             unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
             # Too little to choose from: what was there is better than any advice.
             if not (unbudgeted and worse and choice.withdrawn()):
@@ -228,27 +261,7 @@ class _Job:
             self._kit.initial_limits(),
             stamp(self._machine, self._options),
         )
-        out = self._spool
-        out.seek(0)
-        out.truncate()
-        self._source.seek(0)
-        header, tail = writer.header(), 0
-        while data := self._source.read(_BLOCK_BYTES):
-            for block in reader.push(data):
-                text = writer.block(block)
-                at = _first_command(text) if header else -1
-                if at >= 0:
-                    text, header = text[:at] + header + text[at:], b""
-                if end := behind_last_command(text):
-                    tail = out.tell() + end
-                out.write(text)
-        rest = b"".join(block.text for block in reader.flush())
-        # Behind a line without an end nothing can be added: the end comes before it.
-        if header or behind_last_command(rest):
-            tail = out.tell()
-        out.write(rest)
-        _insert(out, tail, header + writer.end())
-        out.seek(0)
+        write_advised(self._source, self._spool, reader, writer)
         return writer
 
     def _go(
@@ -321,47 +334,6 @@ class _Job:
             lines=lines,
         )
 
-    def _warnings(
-        self, figures: AdviceFigures, writer: AdviceWriter, helpless: Sequence[str]
-    ) -> list[str]:
-        found = [
-            f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
-            "as it came are those without it."
-            for kind in self._unmodelled
-        ]
-        if not self._adviser.shapers:
-            found.append(
-                "No shaper is advised: this firmware takes none from a file, or the machine does "
-                "not say that it has one (firmware.shaper)."
-            )
-        if writer.shaper_left:
-            found.append(
-                "The printer's own shaper is not known (firmware.shaper in the machine): the one "
-                "advised stays in force after the print, until the firmware restarts."
-            )
-        return found + [
-            f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
-            f"{feature.bound_um:.1f} um it may have"
-            + (
-                ": no acceleration would do. Corners shake the machine too (square corner "
-                "velocity, jerk, junction deviation)."
-                if feature.name in helpless
-                else "; a larger budget is needed."
-                if self._options.budget_um is not None
-                else " as sliced."
-            )
-            for feature in figures.features
-            if not feature.within_bound and feature.exact
-        ]
-
-    @staticmethod
-    def _beyond(figures: AdviceFigures) -> list[str]:
-        """Say what is not seen and errs more than the budget: it is not made slower for that."""
-        names = [f.name for f in figures.features if not f.within_bound and not f.exact]
-        if not names:
-            return []
-        return [f"Beyond its bound, and no slower than the file has it: {', '.join(names)}."]
-
     def _result(
         self,
         name: str,
@@ -371,8 +343,7 @@ class _Job:
         original: Measurement,
         advised: Measurement,
         figures: AdviceFigures,
-        writer: AdviceWriter,
-        helpless: Sequence[str],
+        warnings: Sequence[str],
     ) -> Result:
         machine, names = self._machine, asked.reader.feature_names
         before, shaper = original.channels()
@@ -411,10 +382,10 @@ class _Job:
             warnings=[
                 *self._doubts,
                 *asked.warnings,
-                *self._warnings(figures, writer, helpless),
+                *warnings,
                 *advised.warnings(),
             ],
-            notes=[*self._notes, *self._beyond(figures), _UNDO],
+            notes=[*self._notes, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,
             track=advised.track(),
@@ -430,67 +401,6 @@ def _rms_um(errors: dict[int, ClassError]) -> float:
     seconds = sum(one.seconds for one in errors.values())
     squares = sum(one.seconds * one.rms_um**2 for one in errors.values())
     return float(np.sqrt(squares / (seconds or 1.0)))
-
-
-def _first_command(text: bytes) -> int:
-    """Return where the first line begins that is no comment: what slicers say comes before it."""
-    found = _COMMAND.search(text)
-    return found.start() if found else -1
-
-
-def _insert(file: BinaryIO, at: int, text: bytes) -> None:
-    """Put text into a file: slicers look for their settings at its very end."""
-    for stop in range(file.seek(0, io.SEEK_END), at, -_BLOCK_BYTES):
-        start = max(stop - _BLOCK_BYTES, at)
-        file.seek(start)
-        behind = file.read(stop - start)
-        file.seek(start + len(text))
-        file.write(behind)
-    file.seek(at)
-    file.write(text)
-
-
-class _Levels:
-    """Where the machine is from which layer on, as far as its plants notice."""
-
-    def __init__(self, machine: Machine) -> None:
-        self._follows = bool(machine.schedules)
-        self._operation = Operation(machine)
-        self._grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
-        self._layer: int | None = None
-        self._level: OperatingPoint | None = None
-        self.table: list[tuple[int, OperatingPoint]] = [(-1, EMPTY)]
-
-    def see(self, block: ProgramBlock) -> None:
-        """Take note of a block; refuse a file that was processed, or could not be restored."""
-        stamps = np.flatnonzero(block.events.kind == EventKind.STAMP)
-        if len(stamps):
-            raise GcodeError(
-                "this file was already processed by stillpath; advise the original",
-                line=int(block.events.line[stamps[0]]),
-            )
-        if MARK in block.text:
-            raise GcodeError(
-                f"the file has lines with {MARK.decode()!r}, so that advice could not be undone; "
-                "take them out (stillpath remove-advice) first"
-            )
-        if not self._follows or len(block.moves) == 0:
-            return
-        edges = np.flatnonzero(np.diff(block.moves.layer)) + 1
-        for first, last in pairwise([0, *edges.tolist(), len(block.moves)]):
-            moves = rows_of(block.moves, slice(first, last))
-            point, layer = self._operation.at(moves), int(moves.layer[0])
-            self._operation.passed(moves)
-            if layer == self._layer:
-                continue
-            level = self._grid.level(point)
-            if level != self._level:
-                self._level = level
-                if self._layer is None:
-                    self.table = [(layer, point)]
-                else:
-                    self.table.append((layer, point))
-            self._layer = layer
 
 
 def _add(

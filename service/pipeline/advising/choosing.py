@@ -36,8 +36,9 @@ from service.pipeline.yardstick import FREQUENCIES_HZ
 __all__ = ["Choice", "choose", "ladder"]
 
 DAMPING = 0.1
-_LOWEST_MM_S2 = 500.0
-_RATIO = 1.2
+_LOW_MM_S2, _RATIO = 500.0, 1.2
+_LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
+"""Below `_LOW_MM_S2` walls go only if nothing else brings them within their bound."""
 _AIM = 0.95
 """Part of a bound that the samples may use."""
 _POINTS, _MEMBERS = 1000, 5
@@ -45,7 +46,7 @@ _POINTS, _MEMBERS = 1000, 5
 _COARSE = 6
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
-_SAME_TIME = 0.002
+_SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
 Told = Callable[[float], None]
@@ -66,8 +67,8 @@ class Choice:
     own_mm_s2 : dict
         Feature id to the highest acceleration that the file gives it.
     helpless : set of int
-        Features of these that no acceleration brings within their bounds, in the samples: they
-        get the quickest of those with about the least error, and no slower.
+        Features of these that no acceleration brings within their bounds: they get the quickest of
+        those with about the least error, and no slower.
     shapers : list of (layer, Shaping)
     """
 
@@ -120,6 +121,7 @@ class Choice:
             self.rung[feature] = found if lower and self.rungs[found] > own else None
             return True
         if self.rungs[found] >= accel:
+            self.helpless.add(feature)
             return False
         self.rung[feature] = found
         return True
@@ -134,6 +136,8 @@ def choose(
     budget_um: float | None,
     levels: Sequence[tuple[int, OperatingPoint]],
     told: Told = lambda _share: None,
+    *,
+    shaped: bool = True,
 ) -> Choice:
     """Choose for a file.
 
@@ -152,13 +156,18 @@ def choose(
         Where the machine is from which layer on; more than one where plants follow a schedule.
     told : callable, optional
         Is given the share that is done.
+    shaped : bool
+        A shaper may be advised.
     """
     members = members_of(machine, DT_S)
     as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
     features = [f for f in as_sliced.features if _free(f, names)]
     visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
-    was = as_sliced.errors(before)
-    limit = {f: _AIM * (max(was[f], 1e-3) if budget_um is None else budget_um) for f in features}
+    was = {f: max(um, 1e-3) for f, um in as_sliced.errors(before).items()}
+    limits = _Limits(
+        {f: _AIM * (was[f] if budget_um is None else budget_um) for f in features},
+        {f: was[f] if budget_um is None else _AIM * budget_um for f in features},
+    )
     choice = Choice(
         ladder(adviser.highest_mm_s2, machine),
         dict.fromkeys(features),
@@ -167,50 +176,105 @@ def choose(
     )
     if not features:
         return choice
-    candidates = _candidates(samples, machine, adviser, before, levels, visible, told)
+    kinds = adviser.shapers if shaped else ()
+    candidates = _candidates(samples, machine, adviser, kinds, before, levels, visible, told)
     points = [sample.point for sample in samples.samples]
     by_point = [_by_point(c, points, levels, machine) for c in candidates]
-    found: list[list[tuple[dict[int, float], dict[int, float]]]] = [[] for _ in candidates]
-    for k, accel in enumerate([None, *choice.rungs]):
+    every = [_Found() for _ in candidates]
+
+    def tried(rung: int | None) -> None:
         trial = as_sliced
-        if accel is not None:
-            bounds = {f: _bound(accel, visible=f in visible) for f in features}
+        if rung is not None:
+            bounds = {f: _bound(choice.rungs[rung], visible=f in visible) for f in features}
             trial = Trial(samples, bounds, machine, adviser, DT_S, members)
-        for one, shapings in zip(found, by_point, strict=True):
-            one.append((trial.errors(shapings), trial.seconds))
-        told(0.5 + 0.5 * k / len(choice.rungs))
-    ranked = []
-    for number, one in enumerate(found):
-        rung = {f: _highest(one, f, limit[f], visible=f in visible) for f in features}
-        at = {f: one[0 if k is None else k + 1] for f, k in rung.items()}
-        missed = sum(at[f][0][f] > limit[f] * 1.001 for f in features)
-        seconds = sum(at[f][1].get(f, 0.0) for f in features)
-        error = max(at[f][0][f] / limit[f] for f in features)
-        helpless = {
-            f for f in visible if all(e.get(f, math.inf) > limit[f] * 1.001 for e, _ in one)
-        }
-        ranked.append((missed, seconds, error, number, rung, helpless))
-    least = min(r[0] for r in ranked)
-    fair = [r for r in ranked if r[0] == least]
-    quickest = min(r[1] for r in fair)
-    close = [r for r in fair if r[1] <= quickest * (1.0 + _SAME_TIME)]
-    _, _, _, number, choice.rung, choice.helpless = min(close, key=lambda r: (r[2], r[3]))
+        for found, shapings in zip(every, by_point, strict=True):
+            found.add(rung, trial.errors(shapings), trial.seconds)
+        told(0.5 + 0.5 * len(every[0].um) / (1 + len(choice.rungs)))
+
+    usual = [k for k, accel in enumerate(choice.rungs) if accel >= _LOW_MM_S2]
+    for rung in (None, *usual):
+        tried(rung)
+    for rung in reversed(range(len(choice.rungs) - len(usual))):
+        if any(all(limits.fair(found, f) for f in visible) for found in every):
+            break
+        tried(rung)
+    number, choice.rung = _best(every, limits, choice)
+    choice.helpless = {f for f in visible if not limits.fair(every[number], f)}
     choice.shapers = candidates[number].table(levels)
     for _ in range(_MENDING_ROUNDS):
         trial = Trial(samples, choice.bounds(), machine, adviser, DT_S, members)
-        errors = trial.errors(by_point[number])
-        over = {f: errors[f] / limit[f] for f in features if errors[f] > limit[f]}
-        if not choice.mended(over):
+        um = trial.errors(by_point[number])
+        over = {f: limits.ratio(um[f], f, k) for f, k in choice.rung.items()}
+        if not choice.mended({f: ratio for f, ratio in over.items() if ratio > 1.0}):
             break
     return choice
 
 
 def ladder(highest_mm_s2: float, machine: Machine) -> list[float]:
     """Return accelerations to choose from, rising to the highest that the machine is set up for."""
-    top = min(highest_mm_s2, machine.command.accel_mm_s2)
-    count = max(math.ceil(math.log(top / _LOWEST_MM_S2) / math.log(_RATIO)), 0) if top > 0 else 0
-    rungs = {10.0 * math.floor(top * _RATIO**-k / 10.0) for k in range(1, count + 1)}
-    return sorted({r for r in rungs if r >= _LOWEST_MM_S2} | {top})
+    rungs = [min(highest_mm_s2, machine.command.accel_mm_s2)]
+    while True:
+        ratio = _RATIO if rungs[-1] >= _LOW_MM_S2 * _RATIO else _LOW_RATIO
+        lower = 10.0 * math.floor(rungs[-1] / ratio / 10.0)
+        if lower < _LOWEST_MM_S2:
+            return rungs[::-1]
+        rungs.append(lower)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What trials with one shaper have shown: by rung (None: as the file has it), by feature."""
+
+    um: dict[int | None, dict[int, float]] = field(default_factory=dict)
+    seconds: dict[int | None, dict[int, float]] = field(default_factory=dict)
+
+    def add(self, rung: int | None, um: dict[int, float], seconds: dict[int, float]) -> None:
+        self.um[rung], self.seconds[rung] = um, seconds
+
+    def error(self, feature: int, rung: int | None) -> float:
+        return self.um[rung].get(feature, math.inf)
+
+    def time_s(self, feature: int, rung: int | None) -> float:
+        return self.seconds[rung].get(feature, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """What features may err in the samples [um]."""
+
+    um: dict[int, float]
+    own_um: dict[int, float]
+    """As the file has them: without a budget no margin is needed there."""
+
+    def ratio(self, error_um: float, feature: int, rung: int | None) -> float:
+        """Return the part of its limit that an error is."""
+        limit = self.own_um if rung is None else self.um
+        return error_um / (_ROUNDING * limit[feature])
+
+    def fair(self, found: _Found, feature: int) -> list[int | None]:
+        """Return the rungs within the limit."""
+        return [k for k in found.um if self.ratio(found.error(feature, k), feature, k) <= 1.0]
+
+
+def _best(
+    every: Sequence[_Found], limits: _Limits, choice: Choice
+) -> tuple[int, dict[int, int | None]]:
+    """Return the number of the best shaper, and the rung of every feature with it."""
+    ranked = []
+    for number, found in enumerate(every):
+        rungs = {
+            f: _quickest(found, f, limits.fair(found, f), choice.rungs, visible=f in choice.visible)
+            for f in choice.rung
+        }
+        ratios = [limits.ratio(found.error(f, k), f, k) for f, k in rungs.items()]
+        missed = sum(ratio > 1.0 for ratio in ratios)
+        seconds = sum(found.time_s(f, k) for f, k in rungs.items())
+        ranked.append((missed, seconds, max(ratios), number, rungs))
+    least = min(r[0] for r in ranked)
+    fair = [r for r in ranked if r[0] == least]
+    quickest = min(r[1] for r in fair)
+    close = [r for r in fair if r[1] <= quickest * (1.0 + _SAME_TIME)]
+    return min(close, key=lambda r: (r[2], r[3]))[3:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,6 +298,7 @@ def _candidates(
     samples: FileSamples,
     machine: Machine,
     adviser: Adviser,
+    kinds: Sequence[str],
     before: Shaping,
     levels: Sequence[tuple[int, OperatingPoint]],
     visible: set[int],
@@ -245,16 +310,16 @@ def _candidates(
     members = members_of(machine, DT_S)
     few = [members[0], *members[1 :: max(1, -(-(len(members) - 1) // _MEMBERS))]]
     tuned = np.unique(np.linspace(0, count - 1, min(count, _TUNED_LEVELS)).round().astype(int))
-    logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in adviser.shapers}
-    for n, level in enumerate(tuned.tolist()):
+    logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}
+    for n, level in enumerate(tuned.tolist() if kinds else []):
         point = levels[level][1] if count > 1 else None
         trial = Trial(samples, {}, machine, adviser, DT_S, few, point=point)
         at = trial.points(_POINTS, sorted(visible))
-        for m, kind in enumerate(adviser.shapers):
+        for m, kind in enumerate(kinds):
             start = logs[kind][-1] if logs[kind] else None
             i, j = _tuned(trial, kind, at, len(few), start, same=adviser.same_for_both)
             logs[kind].append((i, j))
-            told(0.5 * (n + (m + 1) / len(adviser.shapers)) / len(tuned))
+            told(0.5 * (n + (m + 1) / len(kinds)) / len(tuned))
     for kind, found in logs.items():
         axes = []
         for column in (0, 1):
@@ -339,33 +404,30 @@ def _by_point(
     return out
 
 
-def _highest(
-    found: Sequence[tuple[dict[int, float], dict[int, float]]],
+def _quickest(
+    found: _Found,
     feature: int,
-    limit_um: float,
+    fair: Sequence[int | None],
+    rungs: Sequence[float],
     *,
     visible: bool,
 ) -> int | None:
-    """Return the rung with the least time within the limit; with the least error if there is none.
+    """Return the rung with the least time of those within the limit.
 
-    None: the file's own.
+    Where there is none: the file's own, or for what is seen the quickest of those with about the
+    least error that are not low.
     """
-    own_s = found[0][1].get(feature, 0.0)
-    best: tuple[float, int] | None = None
-    for k, (errors, seconds) in enumerate(found):
-        if errors.get(feature, math.inf) <= limit_um:
-            key = (round(seconds.get(feature, own_s), 4), k)
-            best = key if best is None else min(best, key)
-    if best is not None:
-        return best[1] - 1 if best[1] else None
-    if not visible:
+
+    def key(rung: int | None) -> tuple[float, int]:
+        return round(found.time_s(feature, rung), 4), -1 if rung is None else rung
+
+    if not fair and not visible:
         return None
-    least = min(errors.get(feature, math.inf) for errors, _ in found)
-    near = [
-        k for k, (errors, _) in enumerate(found) if errors.get(feature, math.inf) <= 1.05 * least
-    ]
-    k = min(near, key=lambda n: (round(found[n][1].get(feature, own_s), 4), n))
-    return k - 1 if k else None
+    if not fair:
+        usual = [k for k in found.um if k is None or rungs[k] >= _LOW_MM_S2]
+        least = min(found.error(feature, k) for k in usual)
+        fair = [k for k in usual if found.error(feature, k) <= 1.05 * least]
+    return min(fair, key=key)
 
 
 def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:

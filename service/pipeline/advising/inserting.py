@@ -11,22 +11,28 @@ printer gets back what the file has set, and behind them ours again.
 from __future__ import annotations
 
 import contextlib
+import io
 import re
 from collections.abc import Sequence
+from typing import BinaryIO
 
 import numpy as np
 
 from gcode.firmware.base import Adviser
+from gcode.interpreter import Interpreter
 from gcode.slicers.features import feature_of
+from gcode.slicers.retiming import behind_last_command
 from gcode.types import EventKind, Limits, ProgramBlock
 from models.shaping import AxisShaper, Shaping
 from service.pipeline.advising.advice import Advice, wanted_accel
 
-__all__ = ["MARK", "AdviceWriter"]
+__all__ = ["MARK", "AdviceWriter", "write_advised"]
 
 MARK = b"; stillpath advise"
 """Every inserted line holds it, and no line of a file that is advised."""
 
+_BLOCK_BYTES = 1 << 17
+_COMMAND = re.compile(rb"^(?!\xef\xbb\xbf)[^\S\n]*[^;\s]", re.MULTILINE)
 _VALUE = re.compile(rb"(?<=[A-Z=])\s*[-+]?[.\d]+")
 _OURS = AxisShaper("ours")
 _HEEDED = np.array(
@@ -53,7 +59,7 @@ class AdviceWriter:
     lines : int
         Lines of our own.
     shaper_left : bool
-        At the end nobody knew what the printer's shaper was before: ours stays, in part at least.
+        Nobody knew at last what the printer's shaper was before: ours stays, in part at least.
     """
 
     def __init__(
@@ -104,14 +110,8 @@ class AdviceWriter:
     def end(self) -> bytes:
         """Return lines that give the printer back, at the end of the file."""
         text = self._give_back()
-        if not self._shaped:
-            return text + self.footer()
-        stated = self._adviser.stated
-        lines = () if stated is None else self._adviser.shaper_lines(stated)
-        lines = (*lines, *self._own_shaper.values())
-        self.shaper_left = stated is None and not self._sets_all(lines)
-        for line in lines:
-            text += self._line(line, "the printer's own shaper")
+        if self._shaped:
+            text += self._give_shaper_back()
         return text + self.footer()
 
     def _places(self, block: ProgramBlock) -> list[tuple[int, bool, int]]:
@@ -149,6 +149,8 @@ class AdviceWriter:
         lead = b""
         if kind == EventKind.UNKNOWN:
             lead = self._give_back()
+            if self._shaped and self._adviser.stores(line.decode("utf-8", "replace")):
+                lead += self._give_shaper_back()
             self._now, self._shaper, self._rests = None, None, True
         elif kind == EventKind.OBJECT and self._adviser.skips_lines:
             # Whoever leaves an object out does not read our lines in it.
@@ -179,12 +181,12 @@ class AdviceWriter:
             unknown_but_theirs = self._now is None and wanted == self._file
             if self._now != wanted and not unknown_but_theirs:
                 lead += self._accel(wanted, self._title(int(block.moves.feature[row])))
-        elif (
-            not self._adviser.travel_apart
-            and self._now is not None
-            and (self._now < self._file or (self._kept[row] and self._now != self._file))
+        elif self._now is not None and (
+            (self._now < self._file and not self._adviser.travel_apart)
+            or (self._now != self._file and self._kept[row])
         ):
-            # Travel is not made slower than the file has it, nor quicker where nothing may change.
+            # Travel is not made slower than the file has it, nor quicker where nothing may change
+            # (Marlin wipes with the acceleration of moves that print).
             lead += self._accel(self._file, "travel")
         return lead
 
@@ -197,6 +199,14 @@ class AdviceWriter:
         layer = f" from layer {self._layer} on" if self._layer > 0 else ""
         lines = self._adviser.shaper_lines(wanted)
         return b"".join(self._line(line, f"shaper{layer}") for line in lines)
+
+    def _give_shaper_back(self) -> bytes:
+        """Set the shaper that the machine states, and then what the file has set."""
+        stated = self._adviser.stated
+        lines = () if stated is None else self._adviser.shaper_lines(stated)
+        lines = (*lines, *self._own_shaper.values())
+        self.shaper_left = stated is None and not self._sets_all(lines)
+        return b"".join(self._line(line, "the printer's own shaper") for line in lines)
 
     def _sets_all(self, lines: Sequence[bytes]) -> bool:
         """Tell whether nothing of ours is left behind lines: no axis keeps its type."""
@@ -226,3 +236,55 @@ class AdviceWriter:
 
     def _sets_accel(self, line: bytes) -> bool:
         return self._adviser.sets_accel(line.decode("utf-8", "replace"))
+
+
+def write_advised(
+    source: BinaryIO, out: BinaryIO, reader: Interpreter, writer: AdviceWriter
+) -> None:
+    """Write a text with advice; whatever was in the file is lost, and it stands at its start.
+
+    Parameters
+    ----------
+    source, out : binary files
+    reader : Interpreter
+        Fresh, the one whose names of features the writer has.
+    writer : AdviceWriter
+    """
+    out.seek(0)
+    out.truncate()
+    source.seek(0)
+    header, tail = writer.header(), 0
+    while data := source.read(_BLOCK_BYTES):
+        for block in reader.push(data):
+            text = writer.block(block)
+            at = _first_command(text) if header else -1
+            if at >= 0:
+                text, header = text[:at] + header + text[at:], b""
+            if end := behind_last_command(text):
+                tail = out.tell() + end
+            out.write(text)
+    rest = b"".join(block.text for block in reader.flush())
+    # Behind a line without an end nothing can be added: the end comes before it.
+    if header or behind_last_command(rest):
+        tail = out.tell()
+    out.write(rest)
+    _insert(out, tail, header + writer.end())
+    out.seek(0)
+
+
+def _first_command(text: bytes) -> int:
+    """Return where the first line begins that is no comment: what slicers say comes before it."""
+    found = _COMMAND.search(text)
+    return found.start() if found else -1
+
+
+def _insert(file: BinaryIO, at: int, text: bytes) -> None:
+    """Put text into a file: slicers look for their settings at its very end."""
+    for stop in range(file.seek(0, io.SEEK_END), at, -_BLOCK_BYTES):
+        start = max(stop - _BLOCK_BYTES, at)
+        file.seek(start)
+        behind = file.read(stop - start)
+        file.seek(start + len(text))
+        file.write(behind)
+    file.seek(at)
+    file.write(text)

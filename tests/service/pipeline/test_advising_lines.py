@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compensation.shapers import shape, shaper_pulses
+from gcode.errors import GcodeError
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.types import EventKind, Limits, Moves
 from models.firmware import Klipper, Marlin, RepRapFirmware
+from models.firmware.marlin import MarlinShaper
 from models.machine import Machine
 from models.schedule import EMPTY
-from models.shaping import AxisShaper, Shaping
+from models.shaping import OFF, AxisShaper, Shaping
 from models.store import load_machine
 from service.pipeline.advising.advice import Advice, Bound
-from service.pipeline.advising.inserting import MARK, AdviceWriter
+from service.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
+from service.pipeline.advising.removing import remove_advice
 from service.pipeline.measure import MotionSamples
 from service.pipeline.shaping import ShapedMotion
 
@@ -61,9 +66,9 @@ def written(data: bytes, machine: Machine, advice: Advice) -> bytes:
     reader, firmware = Interpreter(machine), kit(machine)
     adviser = firmware.adviser(reader.dialect)
     writer = AdviceWriter(adviser, advice, reader.feature_names, firmware.initial_limits(), "test")
-    out = writer.header() + b"".join(writer.block(b) for b in reader.push(data))
-    rest = reader.flush()
-    return out + writer.end() + b"".join(b.text for b in rest)
+    out = io.BytesIO()
+    write_advised(io.BytesIO(data), out, reader, writer)
+    return out.getvalue()
 
 
 def printed(data: bytes, machine: Machine) -> list[tuple[str, int, Limits, Shaping]]:
@@ -238,3 +243,74 @@ def test_lines_with_several_commands() -> None:
     # Of what the file sets only the shaper comes back, no move and no pressure advance.
     behind = [x for x in out.splitlines() if b"own shaper" in x]
     assert [x.split(b" ;")[0] for x in behind] == [b'M593 P"none"', b"M593 F40"]
+
+
+ENDS = st.sampled_from([b"\n", b"\r\n", b"\n\r\n", b"\r", b""])
+TEXTS = st.one_of(
+    LINES.map(str.encode),
+    st.sampled_from(
+        [
+            b";TYPE:External perimeter \xb5m",
+            b"; stillpath",
+            b"; advised by hand: ; Stillpath Advise",
+            b"M117 50% ; stillpath",
+            b"\xff\xfe\x00",
+            b"\t ",
+            b"N7 G1 X12 E1*99",
+            b"T1",
+            b"M500",
+            b"G1 X30 E1 ; \xe2\x80\xa8 a line separator",
+            b"G1 X31\x0bE1\x0c",
+        ]
+    ),
+    st.binary(max_size=12),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    begun=st.sampled_from([b"", b"\xef\xbb\xbf", b"\r\n", b";FLAVOR:Marlin\r\n"]),
+    parts=st.lists(st.tuples(TEXTS, ENDS), max_size=25),
+    firmware=st.sampled_from(
+        [Klipper(), Marlin(shaper=MarlinShaper(freq_x_hz=40.0)), RepRapFirmware()]
+    ),
+)
+def test_any_bytes_come_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    begun: bytes,
+    parts: list[tuple[bytes, bytes]],
+    firmware: Klipper | Marlin | RepRapFirmware,
+) -> None:
+    data = begun + b"".join(text + end for text, end in [(b"M83", b"\n"), *parts])
+    machine = klipper().model_copy(update={"firmware": firmware})
+    try:
+        out = written(data, machine, ADVICE)
+    except GcodeError:
+        return
+    folder = tmp_path_factory.getbasetemp()
+    source, target = folder / "advised.gcode", folder / "restored.gcode"
+    source.write_bytes(out)
+    assert remove_advice(source, target) == out.count(MARK)
+    assert target.read_bytes() == data
+
+
+@pytest.mark.parametrize("fixed_time", [False, True])
+def test_nothing_of_ours_is_stored_for_good(fixed_time: bool) -> None:
+    stated = MarlinShaper(freq_x_hz=40.0, freq_y_hz=35.0)
+    machine = klipper().model_copy(update={"firmware": Marlin(shaper=stated, ft_motion=fixed_time)})
+    own = "M493 C1 A44 I.1" if fixed_time else "M593 X F44"
+    head = f"M83\nM204 P900\n{own}\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:External perimeter\n"
+    data = head + "G1 X5 E1 F600\nN3 M500*33\nG1 X20 E1\n"
+    out = written(data.encode(), machine, Advice({0: Bound(2400.0, 2400.0)}, [(-1, OURS)])).decode()
+    assert out.count("M500") == 1
+    before, behind = out.split("N3 M500*33\n")
+    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    shaping = adviser.stated or OFF
+    for line in before.splitlines():
+        shaping = adviser.read_shaper(line, shaping)
+    hertz = (44.0, 44.0) if fixed_time else (44.0, 35.0)
+    assert (shaping.x.f_hz, shaping.y.f_hz) == hertz
+    accels = [x.split(" ;")[0] for x in before.splitlines() if x.startswith("M204 P")]
+    assert accels == ["M204 P900", "M204 P2400", "M204 P900"]
+    assert behind.startswith(adviser.shaper_lines(OURS)[0].decode())
+    assert "M204 P2400" in behind
