@@ -66,6 +66,7 @@ class Interpreter:
     -----
     Moves that a line other than G0 to G3 and G5 makes (G10, G11, G61, RESTORE_GCODE_STATE MOVE=1,
     SET_GCODE_OFFSET MOVE=1) have no known axis: such a line does more than move, and must stay.
+    All but G10 and G11 have the bit `OF_STATE`.
     """
 
     def __init__(

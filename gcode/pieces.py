@@ -19,6 +19,7 @@ from gcode.firmware.planning import plan_moves
 from gcode.firmware.registry import kit
 from gcode.types import (
     KEPT,
+    OF_STATE,
     EventKind,
     Events,
     Limits,
@@ -195,7 +196,7 @@ class Splitter:
         return found
 
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
-        """Mark the moves of X or Y that must keep their lines."""
+        """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
         moves = block.moves
         travel = moves.end_mm - moves.start_mm
         xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
@@ -221,7 +222,7 @@ class Splitter:
             starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
             spread = np.maximum.reduceat(raw, starts)
             raw = np.repeat(spread, np.diff(np.append(starts, len(raw)))) & xy
-        return np.asarray(raw)
+        return np.asarray(raw | ((moves.known & OF_STATE) != 0))
 
     def _cut(self, *, final: bool) -> Iterator[Piece | Passage]:
         while self._moves is not None and self._events is not None:

@@ -29,7 +29,7 @@ from gcode._table_kernels import (
 from gcode.dialect import Dialect
 from gcode.errors import GcodeError
 from gcode.lexer import Command, extended_parameters
-from gcode.types import EventKind, Limits
+from gcode.types import OF_STATE, EventKind, Limits
 from models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from models.machine import Machine
 
@@ -190,6 +190,16 @@ class MachineState:
     def travel(self, *, named: int = 0, trusted: bool = False) -> int:
         """Go to F_LAST. Without `trusted` the line is more than a plain move, and stays."""
         return travel(self.f, self.i, named, trusted, self.rows)
+
+    def travel_to_kept(self) -> int:
+        """Go to F_LAST for a line that depends on what the printer keeps, its F for one."""
+        move = int(self.i[at.I_MOVES])
+        status = self.travel()
+        if status == at.DONE:
+            return self.event(EventKind.STATE)
+        self.settle()
+        self.rows.tiny[at.M_KNOWN, move : int(self.i[at.I_MOVES])] |= OF_STATE
+        return status
 
     def moved(self, status: int) -> int:
         """Turn the status of `travel` into that of a line: without a move there is an event."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "KEPT",
+    "OF_STATE",
     "EventKind",
     "Events",
     "Limits",
@@ -28,6 +29,8 @@ __all__ = [
 
 KEPT = 8
 """Bit of `Moves.known`: the file asks that the move stays as it is."""
+OF_STATE = 16
+"""Bit of `Moves.known`: the move's line depends on what the printer keeps (`EventKind.STATE`)."""
 
 
 class EventKind(IntEnum):
@@ -49,6 +52,9 @@ class EventKind(IntEnum):
     """Sets the firmware's own input shaper (stops the motion)."""
     STAMP = 7
     """Our own header or footer line."""
+    STATE = 8
+    """Keeps or brings back modes, F and place (SAVE_GCODE_STATE, G60, M120): the motion goes on,
+    but what the printer keeps must be the file's, not a stream's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +103,8 @@ class Moves:
     limits_id, modal_id : ndarray of int32, shape (n,)
         Rows of `ProgramBlock.limits` and `ProgramBlock.modal` in force for the move.
     known : ndarray of uint8, shape (n,)
-        Bit 0..2 set: the machine's x, y, z are known at both ends of the move; bit `KEPT`.
+        Bit 0..2 set: the machine's x, y, z are known at both ends of the move; bits `KEPT`,
+        `OF_STATE`.
     line, byte_start, byte_end : ndarray of int64, shape (n,)
         Source line; `byte_end` is one past its newline. An arc's pieces share one line.
     layer, feature, object_id : ndarray of int32, shape (n,)

@@ -69,7 +69,7 @@ def save_place(state: MachineState, command: Command) -> int:
     """G60."""
     slot = state.numbers(command, "S").get("S", 0.0)
     state.saved[f"G60 {int(slot)}"] = Saved(state.f.copy(), state.i.copy())
-    return state.event(EventKind.MODE)
+    return state.event(EventKind.STATE)
 
 
 def move_to_saved(state: MachineState, command: Command) -> int:
@@ -92,9 +92,9 @@ def move_to_saved(state: MachineState, command: Command) -> int:
     speed_before = f[at.F_SPEED]
     if given.get("F", 0.0) > 0.0:
         f[at.F_SPEED] = given["F"] * f[at.F_UNIT_MM] * f[at.F_SPEED_FACTOR]
-    status = state.travel()
+    status = state.travel_to_kept()
     f[at.F_SPEED] = speed_before
-    return state.moved(status)
+    return status
 
 
 _NONE = (0.0, 0.0, 0.0)

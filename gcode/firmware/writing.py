@@ -17,7 +17,7 @@ from gcode.firmware._writing_kernels import format_moves
 from gcode.firmware.base import FirmwareKit
 from gcode.firmware.encoding import Encoded
 from gcode.pieces import Passage, Piece
-from gcode.types import EventKind, Limits, ModalState
+from gcode.types import EventKind, Events, Limits, ModalState
 
 __all__ = ["StreamWriter"]
 
@@ -141,10 +141,10 @@ class StreamWriter:
             self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
             self._shaper_off = False
         if len(moves):
-            last_stop = events.move_index[events.kind >= EventKind.STOP]
+            last_stop = events.move_index[_stops(events)]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
             self._at_rest = stands or self._rests(passage, len(moves) - 1)
-        elif np.any((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)):
+        elif np.any(_stops(events)):
             self._at_rest = True
         return lead + passage.text
 
@@ -376,7 +376,7 @@ class StreamWriter:
     def _rests(self, passage: Passage, row: int) -> bool:
         """Whether the machine stands at a move of the passage by itself, before and after it."""
         moves, events = passage.moves, passage.events
-        stops = (events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT)
+        stops = _stops(events)
         if len(moves) == 0:
             return bool(np.any(stops))
         if row == 0 and np.any((events.move_index == 0) & stops):
@@ -417,6 +417,12 @@ class StreamWriter:
             self._shaper_off = True
             return b""
         return (stated or b"") + b"".join(self._shaper_lines.values())
+
+
+def _stops(events: Events) -> NDArray[np.bool_]:
+    """Mark events at which the machine comes to rest by itself."""
+    passed = (EventKind.OBJECT, EventKind.STATE)
+    return np.asarray((events.kind >= EventKind.STOP) & ~np.isin(events.kind, passed))
 
 
 def _held_back(line: bytes) -> bytes:

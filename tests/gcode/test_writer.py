@@ -296,6 +296,26 @@ def test_streams_are_closed_before_foreign_lines(road: Road) -> None:
         assert not (on and line.startswith((b"MY_MACRO", b"PAUSE")))
 
 
+@pytest.mark.parametrize(
+    ("kept", "back"),
+    [
+        ("SAVE_GCODE_STATE NAME=a", "RESTORE_GCODE_STATE NAME=a"),
+        ("SAVE_GCODE_STATE NAME=a", "RESTORE_GCODE_STATE NAME=a MOVE=1"),
+        ("SAVE_GCODE_STATE", "G91\nG1 Z1 F600\nRESTORE_GCODE_STATE MOVE=1 MOVE_SPEED=80"),
+        ("SET_GCODE_OFFSET Z_ADJUST=.05 MOVE=1", "SET_GCODE_OFFSET X_ADJUST=1 MOVE=1"),
+    ],
+)
+def test_what_the_printer_keeps_is_the_file_s(road: Road, kept: str, back: str) -> None:
+    """Modes, F and place: those of a stream brought back would feed wrongly."""
+    text = (
+        HEAD.replace("M83", "M82")
+        + f"G1 X120 Y100 E1 F6000\nG1 Y120 E2\n{kept}\nG1 X100 E3\nG1 Y100 E4\n"
+        + f"{back}\nG1 X90 Y110 E5\nG1 X120 E6\nG1 Y130 E7\n"
+    )
+    assert "M82" in text
+    check(road, text)
+
+
 def test_filament_adds_up(road: Road, machine: Machine) -> None:
     """Rounding of thousands of E words does not gather."""
     body = ROUND + (TURN + "G1 E-1 F2100\nG1 E1\n") * 30

@@ -108,7 +108,7 @@ def save_state(state: MachineState, command: Command) -> int:
     """SAVE_GCODE_STATE."""
     key = state.extended(command).get("NAME", "default")
     state.saved[key] = Saved(state.f.copy(), state.i.copy())
-    return state.event(EventKind.MODE)
+    return state.event(EventKind.STATE)
 
 
 def restore_state(state: MachineState, command: Command) -> int:
@@ -131,7 +131,7 @@ def restore_state(state: MachineState, command: Command) -> int:
     f[at.F_BASE + 3] += f[at.F_LAST + 3] - saved.f[at.F_LAST + 3]
     state.note_modal()
     if not _flag(state, given, command):
-        return state.event(EventKind.MODE)
+        return state.event(EventKind.STATE)
     f[at.F_LAST : at.F_LAST + 3] = saved.f[at.F_LAST : at.F_LAST + 3]
     return _travel_at(state, given, command)
 
@@ -177,9 +177,9 @@ def _travel_at(state: MachineState, given: Mapping[str, str], command: Command) 
         if speed <= 0:
             raise state.problem(f"MOVE_SPEED={given['MOVE_SPEED']} must be above 0", command)
         f[at.F_SPEED] = speed
-    status = state.travel()
+    status = state.travel_to_kept()
     f[at.F_SPEED] = speed_before
-    return state.moved(status)
+    return status
 
 
 def _flag(state: MachineState, given: Mapping[str, str], command: Command) -> bool:

@@ -242,7 +242,7 @@ def push_state(state: MachineState, command: Command) -> int:
         raise state.problem("M120 without M121; the firmware's stack overflows", command)
     state.saved[f"M120 {depth}"] = Saved(state.f.copy(), state.i.copy())
     state.factors["pushed"] = depth + 1.0
-    return state.event(EventKind.HARMLESS)
+    return state.event(EventKind.STATE)
 
 
 def pop_state(state: MachineState, _command: Command) -> int:
@@ -261,4 +261,4 @@ def pop_state(state: MachineState, _command: Command) -> int:
     f[at.F_SPEED] = saved.f[at.F_SPEED] * scale
     f[[at.F_UNIT_MM, at.F_UNIT_E_MM]] = saved.f[np.array([at.F_UNIT_MM, at.F_UNIT_E_MM])]
     state.note_modal()
-    return state.event(EventKind.MODE)
+    return state.event(EventKind.STATE)
