@@ -200,7 +200,7 @@ class _Job:
             [
                 *stored_settings(
                     reading.stored_lines,
-                    shaper=self._before.label if shaped or not self._adviser.shapers else None,
+                    shaper=self._before.label if figures.shapers else "" if shaped else None,
                 ),
                 *shaper_warnings(
                     self._unmodelled,

@@ -46,13 +46,14 @@ def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
     ----------
     lines : sequence of int
     shaper : str, optional
-        What the printer gets back before them; None: nobody knows, so none is advised.
+        What the printer gets back before them; empty: it had it all along; None: nobody knows, so
+        none is advised.
     """
     if not lines:
         return []
     what = "; no shaper is advised, for the printer's is not known (firmware.shaper in the machine)"
     if shaper is not None:
-        what = f" and the shaper ({shaper})"
+        what = f" and the shaper ({shaper})" if shaper else ""
     said = (
         f"Line {lines[0]} stores for good what is in force. Before it the printer gets back the "
         f"acceleration that the file or the machine's document says{what}: see that they are the "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from models.machine import Machine
 from models.plant_specs import ParametricMembers
 from models.schedule import AxisSchedule, MassSchedule
 from models.store import load_machine
+from service.pipeline.advising.choosing import ladder
 from service.pipeline.advising.inserting import MARK
 from service.pipeline.advising.removing import remove_advice
 from service.pipeline.options import Options
@@ -272,6 +274,35 @@ def test_other_firmwares(kind: str, tmp_path: Path, cache: Path) -> None:
     after = next(c for c in result.channels if c.name == "after").extruding.contour_rms_um
     if result.advice.shapers:
         assert found == pytest.approx(after, rel=1e-9)
+
+
+def test_walls_are_slow_where_nothing_else_will_do(tmp_path: Path, cache: Path) -> None:
+    quick = PerAxis(x=4000.0, y=4000.0, z=100.0, e=5000.0)
+    planner = MarlinPlanner(max_accel_mm_s2=quick, accel_mm_s2=800.0, travel_accel_mm_s2=2000.0)
+    data = re.sub(rb"SET_VELOCITY_LIMIT[^\n]*\n|END_PRINT\n", b"", printed(2)) + b"M500\n"
+    machine = machine_of(Marlin(planner=planner, ft_motion=True))
+    result, written = advise(data, tmp_path, machine, cache, budget_um=16.0)
+    assert without(written) == data
+    assert result.advice is not None
+    walls = next(f for f in result.advice.features if f.name == "External perimeter")
+    assert walls.accel_mm_s2 is not None
+    assert walls.accel_mm_s2 < 500.0
+    assert walls.within_bound
+    # What is stored for good is the printer's own; of its shaper nobody knows.
+    assert b"M493" not in written
+    said = next(x for x in result.warnings if "stores for good" in x)
+    assert said.startswith(f"Line {data.count(bytes([10]))} ")
+    assert "no shaper is advised" in said
+
+
+def test_accelerations_to_choose_from() -> None:
+    machine = load_machine("ender3")
+    for top in (80.0, 100.0, 500.0, 599.0, 3000.0, 20_000.0):
+        rungs = ladder(top, machine)
+        assert rungs[-1] == min(top, machine.command.accel_mm_s2)
+        assert rungs == sorted(set(rungs))
+        assert rungs[0] >= min(top, 100.0)
+        assert all(b / a < 1.7 for a, b in pairwise(rungs))
 
 
 def test_a_file_with_the_mark_is_refused(tmp_path: Path, cache: Path) -> None:
