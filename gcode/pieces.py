@@ -178,7 +178,7 @@ class Splitter:
         return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
     def _barriers(self, events: Events) -> NDArray[np.bool_]:
-        """Mark lines that end a piece: stops, G92 of more than E, other limits of a stream."""
+        """Mark lines that end a piece: stops, G92 of more than E, M221, a stream's other limits."""
         found = events.kind >= EventKind.STOP
         stream_limits, limits = self._kit.stream_limits, self._tables[0]
         before = self._limits_id
@@ -190,9 +190,13 @@ class Splitter:
         rows = np.flatnonzero(events.kind == EventKind.MODE)
         firsts = (events.byte_start[rows] - self._text_offset).tolist()
         ends = (events.byte_end[rows] - self._text_offset).tolist()
-        for k, first, end in zip(rows.tolist(), firsts, ends, strict=True):
-            if _shifts_origin(self._text[first:end]):
-                found[k] = True
+        modal, was = self._tables[1], self._tables[1][self._modal_id]
+        ids = events.modal_id[rows].tolist()
+        for k, first, end, now in zip(rows.tolist(), firsts, ends, ids, strict=True):
+            # Where E counts differently from here on, it must be where the file says.
+            found[k] = modal[now].extrude_factor != was.extrude_factor
+            found[k] |= _shifts_origin(self._text[first:end])
+            was = modal[now]
         return found
 
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:

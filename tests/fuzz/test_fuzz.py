@@ -87,6 +87,10 @@ FOUND = {
     ),
 }
 
+FLOW = (
+    "G1 X158.284 Y148.156 F18000\nG1 X159.747 Y147.662\nM221 S90\nG1 X161.243 Y147.662 E0.04643\n"
+    "G1 X160.917 Y149.687 F18000\nG1 F1208\nG1 E0.75000 F1800\n"
+)
 NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
 NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
@@ -99,8 +103,8 @@ NO_TIME = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS])
-def test_moves_and_rests_that_take_no_time(text: str, tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS, FLOW])
+def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
     through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)
 
