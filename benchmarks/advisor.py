@@ -41,6 +41,8 @@ _COLUMNS = (
 _HEAD = f"\n| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|"
 _LONGER = 1.0005
 """Rests of a shaper that changes are no misses."""
+_SHORT_S = 1.0
+"""What may stand in a last line without an end, behind which nothing could be set back."""
 
 
 def main() -> int:
@@ -85,7 +87,7 @@ def _advised(data: bytes, machine: Machine, budget_um: float, folder: Path) -> s
         return f" | | | | | | | refused: {str(error)[:90]} |"
     cpu_s = time.process_time() - began
     restored = b"".join(x for x in target.read_bytes().splitlines(keepends=True) if MARK not in x)
-    outcome = _outcome(result, budget_um)
+    outcome = _outcome(result, budget_um, ends=data.endswith(b"\n"))
     if restored != data:
         outcome = f"MISS removal does not give the input; {outcome}"
     assert result.advice is not None
@@ -98,7 +100,7 @@ def _advised(data: bytes, machine: Machine, budget_um: float, folder: Path) -> s
     )
 
 
-def _outcome(result: Result, budget_um: float) -> str:
+def _outcome(result: Result, budget_um: float, *, ends: bool) -> str:
     assert result.advice is not None
     wrong: list[str] = []
     beyond: list[str] = []
@@ -110,6 +112,8 @@ def _outcome(result: Result, budget_um: float) -> str:
             beyond.append(f"out of reach: {figure}")
         elif not f.exact and f.accel_mm_s2 is None:
             beyond.append(f"no slower than sliced: {figure}")
+        elif not ends and f.after_s < _SHORT_S:
+            beyond.append(f"in a last line without an end: {figure}")
         else:
             wrong.append(figure)
     if not budget_um:
