@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -104,6 +104,35 @@ class AxisCommand:
 
     position_mm: Array
     states: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drive:
+    """What a rung makes of a piece before the plants' states are known.
+
+    Attributes
+    ----------
+    task : AxisTask
+    rung : int
+    path_mm, weight : ndarray, shape (windows * update + window,)
+        Of the task, relative to where the path begins, and beyond its end.
+    targets_mm : ndarray, shape (components, windows * update + window)
+    command : ndarray, shape (windows, update)
+        S y_d of every window.
+    state : ndarray, shape (windows, nz)
+        H y_d.
+    solved : dict
+        Windows solved one by one: z before, and the samples that were committed.
+    """
+
+    task: AxisTask
+    rung: int
+    path_mm: Array
+    targets_mm: Array
+    weight: Array
+    command: Array
+    state: Array
+    solved: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
 
 class Designs:
@@ -210,6 +239,7 @@ class PreviewAxis:
         self.members = len(self._plants)
         self._rest_at_one = np.concatenate([p.rest_state() for p in self._plants])
         self.rung = self.next_rung = 0
+        self._made: _Drive | None = None
         self.last_rung = len(designs.ladder) - 1
         self.reset(0.0)
 
@@ -231,6 +261,7 @@ class PreviewAxis:
         """Take a command as executed."""
         self._origin, self._states = float(command.position_mm[-1]), command.states
         self.rung = self.next_rung
+        self._made = None
 
     def answer(self, member: int, command: Array) -> Array:
         """Return what a member of the set does with the command of a piece."""
@@ -275,18 +306,8 @@ class PreviewAxis:
         self._move_origin(float(path[0]))
         origin = self._origin
         bounds = task.bounds.seen_from(origin)
-        padding = windows * update + window - n
-        padded = np.append(path - origin, np.full(padding, path[-1] - origin))
-        weights = np.append(task.weight, np.full(padding, WEIGHT_REST))
-        driven = _windows(padded, window, update) @ design.path_gain.T
-        targets = self._designs.lifted.target[:, None] * padded
-        if targets_mm is not None:
-            slid = self._designs.lifted.mix @ (targets_mm - path)
-            targets[:, :n] += slid
-            for component, gain in zip(slid, design.target_gain, strict=True):
-                behind = np.append(component, np.zeros(padding))
-                driven += _windows(behind, window, update) @ gain.T
-        state_driven = driven @ design.state_drive.T
+        drive = self._drive(rung, task, targets_mm)
+        padded, targets, weights = drive.path_mm, drive.targets_mm, drive.weight
 
         u = np.empty(windows * update)
         z = np.append(self._states, [0.0, 0.0])
@@ -301,24 +322,28 @@ class PreviewAxis:
             if w == windows - 1:
                 last_states = z[:-2].copy()
             if apart[w]:
-                near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
-                span = slice(start, start + window)
-                committed = solve_window(
-                    resting_design if near.any() else design,
-                    z,
-                    padded[span],
-                    targets[:, span],
-                    weights[span],
-                    stops[near] - start,
-                    bounds,
-                )[:update]
+                solved = drive.solved.get(w)
+                if solved is None or not np.array_equal(solved[0], z):
+                    near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
+                    span = slice(start, start + window)
+                    command = solve_window(
+                        resting_design if near.any() else design,
+                        z,
+                        padded[span],
+                        targets[:, span],
+                        weights[span],
+                        stops[near] - start,
+                        bounds,
+                    )
+                    drive.solved[w] = solved = z.copy(), command[:update]
+                committed = solved[1]
                 u[start : start + update] = committed
                 z = design.advanced(z, committed)
                 w += 1
             else:
                 end = w + int(np.argmax(np.append(apart[w:], True)))
                 gains = (design.command_gain, design.state_gain)
-                run_windows(*gains, driven, state_driven, z, w, end, u)
+                run_windows(*gains, drive.command, drive.state, z, w, end, u)
                 w = end
         # The windows run on past the end of the path, where the command stands.
         last = path[-1] - origin
@@ -328,6 +353,34 @@ class PreviewAxis:
         position = _snapped(u[:n] + origin, task.bounds)
         position[-1] = path[-1]
         return AxisCommand(position, states - self._resting(last))
+
+    def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
+        """Return what a rung makes of a piece; the last one again for the same piece and rung.
+
+        A piece is often asked for again with a few more windows within bounds. Windows that begin
+        as they did before are then not solved again.
+        """
+        made = self._made
+        if made is not None and targets_mm is None and made.task is task and made.rung == rung:
+            return made
+        design, path = self._designs.design(rung), task.path_mm
+        window, update = self.window, self.update
+        padding = -(-len(path) // update) * update + window - len(path)
+        padded = np.append(path - path[0], np.full(padding, path[-1] - path[0]))
+        command = _windows(padded, window, update) @ design.path_gain.T
+        targets = self._designs.lifted.target[:, None] * padded
+        if targets_mm is not None:
+            slid = self._designs.lifted.mix @ (targets_mm - path)
+            targets[:, : len(path)] += slid
+            for component, gain in zip(slid, design.target_gain, strict=True):
+                behind = np.append(component, np.zeros(padding))
+                command += _windows(behind, window, update) @ gain.T
+        weight = np.append(task.weight, np.full(padding, WEIGHT_REST))
+        state = command @ design.state_drive.T
+        made = _Drive(task, rung, padded, targets, weight, command, state)
+        # Targets of the members' own come in an array that changes.
+        self._made = made if targets_mm is None else None
+        return made
 
     def _move_origin(self, origin: float) -> None:
         self._states = self._states + self._resting(self._origin - origin)
