@@ -165,8 +165,8 @@ def choose(
     visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
     was = {f: max(um, 1e-3) for f, um in as_sliced.errors(before).items()}
     limits = _Limits(
-        {f: _AIM * (was[f] if budget_um is None else budget_um) for f in features},
-        {f: was[f] if budget_um is None else _AIM * budget_um for f in features},
+        {f: was[f] if budget_um is None else budget_um for f in features},
+        has_budget=budget_um is not None,
     )
     choice = Choice(
         ladder(adviser.highest_mm_s2, machine),
@@ -199,7 +199,7 @@ def choose(
             break
         tried(rung)
     number, choice.rung = _best(every, limits, choice)
-    choice.helpless = {f for f in visible if not limits.fair(every[number], f)}
+    choice.helpless = {f for f in visible if not limits.reaching(every[number], f)}
     choice.shapers = candidates[number].table(levels)
     for _ in range(_MENDING_ROUNDS):
         trial = Trial(samples, choice.bounds(), machine, adviser, DT_S, members)
@@ -240,16 +240,22 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
-    """What features may err in the samples [um]."""
+    """What features may err in the samples."""
 
-    um: dict[int, float]
-    own_um: dict[int, float]
-    """As the file has them: without a budget no margin is needed there."""
+    bound_um: dict[int, float]
+    has_budget: bool
 
     def ratio(self, error_um: float, feature: int, rung: int | None) -> float:
-        """Return the part of its limit that an error is."""
-        limit = self.own_um if rung is None else self.um
-        return error_um / (_ROUNDING * limit[feature])
+        """Return the part of its limit that an error is: the limit lies a margin below the bound.
+
+        Without a budget none is needed where everything is as the file has it.
+        """
+        margin = _AIM if self.has_budget or rung is not None else 1.0
+        return error_um / (_ROUNDING * margin * self.bound_um[feature])
+
+    def reaching(self, found: _Found, feature: int) -> list[int | None]:
+        """Return the rungs within the bound itself."""
+        return [k for k in found.um if found.error(feature, k) <= self.bound_um[feature]]
 
     def fair(self, found: _Found, feature: int) -> list[int | None]:
         """Return the rungs within the limit."""
@@ -263,7 +269,7 @@ def _best(
     ranked = []
     for number, found in enumerate(every):
         rungs = {
-            f: _quickest(found, f, limits.fair(found, f), choice.rungs, visible=f in choice.visible)
+            f: _quickest(found, f, limits, choice.rungs, visible=f in choice.visible)
             for f in choice.rung
         }
         ratios = [limits.ratio(found.error(f, k), f, k) for f, k in rungs.items()]
@@ -407,7 +413,7 @@ def _by_point(
 def _quickest(
     found: _Found,
     feature: int,
-    fair: Sequence[int | None],
+    limits: _Limits,
     rungs: Sequence[float],
     *,
     visible: bool,
@@ -421,8 +427,10 @@ def _quickest(
     def key(rung: int | None) -> tuple[float, int]:
         return round(found.time_s(feature, rung), 4), -1 if rung is None else rung
 
+    fair = limits.fair(found, feature)
     if not fair and not visible:
         return None
+    fair = fair or limits.reaching(found, feature)
     if not fair:
         usual = [k for k in found.um if k is None or rungs[k] >= _LOW_MM_S2]
         least = min(found.error(feature, k) for k in usual)
