@@ -6,11 +6,10 @@ delays make the vibrations of the copies cancel.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation._shaper_kernels import add_delayed
 from compensation.base import DesignError, Memoryless
 from compensation.holds import stand_still
 from models import shaper_pulses as firmware
@@ -51,14 +50,18 @@ def shape(command_mm: Array, dt_s: float, pulses: Pulses, *, centred: bool = Tru
     """
     weights, delays = pulses
     shift = float(weights @ delays) if centred else 0.0
-    out = np.zeros_like(command_mm)
-    for weight, delay in zip(weights, delays, strict=True):
-        late = (delay - shift) / dt_s
-        whole = math.floor(late)
-        part = late - whole
-        out += (weight * (1 - part)) * _delayed(command_mm, whole)
-        if part > 0:
-            out += (weight * part) * _delayed(command_mm, whole + 1)
+    late = (delays - shift) / dt_s
+    whole = np.floor(late)
+    part = late - whole
+    # What falls between two samples is shared by them.
+    samples = np.stack([whole, whole + 1.0], axis=1).astype(np.int64).ravel()
+    gains = (weights[:, None] * np.stack([1.0 - part, part], axis=1)).ravel()
+    used = gains != 0.0
+    command = np.ascontiguousarray(command_mm, dtype=np.float64)
+    out = np.zeros_like(command)
+    n = command.shape[-1]
+    for row, shaped in zip(command.reshape(-1, n), out.reshape(-1, n), strict=True):
+        add_delayed(row, samples[used], gains[used], shaped)
     return out
 
 
@@ -121,21 +124,3 @@ def dominant_frequency(machine: Machine, axis: str, dt_s: float) -> float:
         return peak
     nearest = float(modes[np.argmin(np.abs(np.log(modes[:, 0] / peak))), 0])
     return nearest if abs(nearest / peak - 1) < 0.2 else peak
-
-
-def _delayed(command: Array, samples: int) -> Array:
-    """Shift by whole samples (negative: earlier), the ends standing still."""
-    n = command.shape[-1]
-    index = np.clip(np.arange(n) - samples, 0, n - 1) if abs(samples) >= n else None
-    if index is not None:
-        return command[..., index]
-    if samples == 0:
-        return command
-    out = np.empty_like(command)
-    if samples > 0:
-        out[..., samples:] = command[..., : n - samples]
-        out[..., :samples] = command[..., :1]
-    else:
-        out[..., :samples] = command[..., -samples:]
-        out[..., samples:] = command[..., -1:]
-    return out

@@ -23,8 +23,9 @@ def modal_form(plant: DiscretePlant) -> Array | None:
     Returns
     -------
     ndarray, shape (m, 4), or None
-        Rows (re lambda, im lambda, re w, im w), m even (padded with zeros). None when poles
-        crowd so much that the partial fractions cancel (condition of the modal matrix > 1e9).
+        Rows (re lambda, im lambda, re w, im w), m a multiple of three (padded with zeros). None
+        when poles crowd so much that the partial fractions cancel (condition of the modal matrix
+        > 1e9).
     """
     if plant.order == 0:
         return np.zeros((0, 4))
@@ -37,4 +38,4 @@ def modal_form(plant: DiscretePlant) -> Array | None:
     rows = np.column_stack(
         [values.real, values.imag, (twice * weights).real, (twice * weights).imag]
     )[keep]
-    return np.vstack([rows, np.zeros((len(rows) % 2, 4))])
+    return np.vstack([rows, np.zeros((-len(rows) % 3, 4))])

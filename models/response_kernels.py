@@ -19,22 +19,25 @@ _TINY = 1e-150
 
 @kernel
 def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array, y: Array) -> None:
-    """Add up first-order complex recurrences, two at a time to hide their latency.
+    """Add up first-order complex recurrences, three at a time to hide their latency.
 
-    `modes` has rows (re, im of the eigenvalue, re, im of the output weight) and an even number
+    `modes` has rows (re, im of the eigenvalue, re, im of the output weight), a multiple of three
     of them; `state` has rows (re, im) and is carried on. y = origin + response of u - origin.
     """
     n = len(u)
     for k in range(n):
         y[k] = origin + d * (u[k] - origin)
-    for m in range(0, len(modes), 2):
+    for m in range(0, len(modes), 3):
         a_re, a_im, a_wr, a_wi = modes[m, 0], modes[m, 1], modes[m, 2], modes[m, 3]
         b_re, b_im, b_wr, b_wi = modes[m + 1, 0], modes[m + 1, 1], modes[m + 1, 2], modes[m + 1, 3]
+        c_re, c_im, c_wr, c_wi = modes[m + 2, 0], modes[m + 2, 1], modes[m + 2, 2], modes[m + 2, 3]
         p, q = state[m, 0], state[m, 1]
         r, s = state[m + 1, 0], state[m + 1, 1]
+        v, w = state[m + 2, 0], state[m + 2, 1]
         for first in range(0, n, _CHUNK):
             for k in range(first, min(first + _CHUNK, n)):
                 y[k] += (a_wr * p - a_wi * q) + (b_wr * r - b_wi * s)
+                y[k] += c_wr * v - c_wi * w
                 drive = u[k] - origin
                 p_next = (a_re * p - a_im * q) + drive
                 q = a_im * p + a_re * q
@@ -42,13 +45,19 @@ def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array
                 r_next = (b_re * r - b_im * s) + drive
                 s = b_im * r + b_re * s
                 r = r_next
+                v_next = (c_re * v - c_im * w) + drive
+                w = c_im * v + c_re * w
+                v = v_next
             # In a long rest the states decay into denormal numbers, which cost a hundredfold.
             if abs(p) + abs(q) < _TINY:
                 p = q = 0.0
             if abs(r) + abs(s) < _TINY:
                 r = s = 0.0
+            if abs(v) + abs(w) < _TINY:
+                v = w = 0.0
         state[m, 0], state[m, 1] = p, q
         state[m + 1, 0], state[m + 1, 1] = r, s
+        state[m + 2, 0], state[m + 2, 1] = v, w
 
 
 @kernel

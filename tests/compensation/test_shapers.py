@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from compensation._shaper_kernels import add_delayed
 from compensation.base import DesignError
 from compensation.registry import COMPENSATORS, compensator
 from compensation.shapers import SHAPERS, ShaperCompensator, shape, shaper_pulses
@@ -75,6 +76,7 @@ def test_exact_shapers_cancel_their_mode(name: str, zeta: float) -> None:
     assert weights.sum() == pytest.approx(1.0)
 
 
+@settings(deadline=None)  # the first call compiles
 @given(
     st.sampled_from(SHAPERS),
     st.floats(20, 200),
@@ -130,3 +132,20 @@ def test_compensator_stands_still_in_rests() -> None:
     assert np.abs(u - y_d).max() < 0.5
     free = made.compensate(y_d, np.ones(y_d.shape[1], bool), NO_RESTS)
     np.testing.assert_allclose(u[:, 50:115], free[:, 50:115], atol=1e-12)
+
+
+@settings(deadline=None)
+@given(
+    n=st.integers(1, 12),
+    shifts=st.lists(st.integers(-20, 20), max_size=4),
+    seed=st.integers(0, 99),
+)
+def test_delayed_commands_add_up(n: int, shifts: list[int], seed: int) -> None:
+    random = np.random.default_rng(seed)
+    command, out = random.normal(size=n), random.normal(size=n)
+    samples, gains = np.array(shifts, np.int64), random.normal(size=len(shifts))
+    expected = out.copy()
+    for late, gain in zip(shifts, gains, strict=True):
+        expected += gain * command[np.clip(np.arange(n) - late, 0, n - 1)]
+    add_delayed(command, samples, gains, out)
+    np.testing.assert_array_equal(out, expected)
