@@ -1,81 +1,46 @@
 """How quick every class of moves may be within a budget of contour error.
 
-The print's own motion is tried on samples from all over the file: as compensated as it will be,
-with the moves planned for the firmware, and judged by the worst plant of the machine's set. Each
-class of moves (features, travel) has a ladder of paces, from the file's own to what the machine's
-command allows; all ladders are searched at once by bisection, so that classes are judged among
-their neighbours. While the file is written its errors are measured in the same way, and a class
-that turns out to exceed the budget becomes slower from there on.
+The paces of classes of moves (features, travel) are chosen on samples from all over the file
+(`pace_search`): as compensated as they will be, with the moves planned for the firmware, and judged
+by the worst plant of the machine's set. While the file is written its errors are measured in the
+same way, and paces follow them, up and down. A file that ends above its budget all the same is
+written once more, with lower paces, and at last with its own.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from compensation.shapers import shape, shaper_pulses
 from gcode.pieces import Piece
-from gcode.quickening import (
-    AS_SLICED,
-    TRAVEL,
-    FirstLayer,
-    Pace,
-    move_classes,
-    quickened,
-    top_limits,
-)
-from gcode.sampler import sample_phases
-from gcode.types import Moves
+from gcode.quickening import AS_SLICED, TRAVEL, FirstLayer, move_classes, quickened, top_limits
 from models.machine import Machine
-from service.pipeline.compensating import DT_S, PieceCompensator, Unfit, as_executed
 from service.pipeline.options import Options
+from service.pipeline.pace_search import PaceChoice, allowed_um, search
+from service.pipeline.pace_trials import Factors, PaceTrials, compensated, paces, shaped
 from service.pipeline.result import BudgetClass, BudgetFigures
 from service.pipeline.samples import FileSamples, Sample
-from service.pipeline.set_errors import ClassError, SetErrors
+from service.pipeline.set_errors import ErrorSum
 from service.pipeline.yardstick import BestShaper
 
-__all__ = ["PaceChoice", "SpeedBudget", "error_classes"]
+__all__ = ["SpeedBudget"]
 
-_STEPS = 32
-"""Rungs of a ladder; a power of 2."""
 _SLOWEST = 0.05
 """Least pace of the shaper, which may have to be slower than the file."""
-_AIM = 0.95
-"""Part of the budget that the samples may use."""
-_MENDING_ROUNDS = 4
-_NO_WORSE = 1.1
-_LANDING = 2.0
-"""So many budgets may what is extruded right behind a travel have; its feature has one for all."""
-_STRIDE, _STRIDE_WRITTEN = 8, 24
-_SHAPER_REACH_S = 0.16
-_SLOWER = 0.9
+_ABOVE, _FULL, _ROOM = 1.001, 0.97, 0.9
+"""Parts of a bound: from where it is exceeded, a class comes down, and may go up."""
+_SLOWER, _FASTER = 0.9, 1.08
+_FURTHEST = 2.0
+"""Paces go up to so many times what the samples said."""
 _GENTLER = (1.0, 0.6, 0.3)
 """Exponents of factors that are tried one after the other where no command can follow."""
 _SURE_S = 5.0
 """Errors of so much extruding time say something of a class."""
-
-Factors = dict[int, float]
-Trial = Callable[[Factors], tuple[dict[int, ClassError], set[int]]]
-"""Errors by class, and the classes in samples for which there is no command."""
-
-
-@dataclass(frozen=True, slots=True)
-class PaceChoice:
-    """Ratios of accelerations by class.
-
-    Attributes
-    ----------
-    factors : dict
-        1: as the file has it.
-    reached : bool
-        No class that could be slower exceeds the budget in the samples.
-    """
-
-    factors: Factors
-    reached: bool
+_ATTEMPTS = 3
+"""How often a file is written at most; the last time at its own paces."""
+_MILDER = 0.9
 
 
 @dataclass(slots=True)
@@ -85,11 +50,13 @@ class SpeedBudget:
     Attributes
     ----------
     paces : PaceChoice
-        Of the file that is written.
+        Of the file that is written, at its beginning.
     shaper_paces : PaceChoice
         With the best firmware shaper instead of the compensation, at the same budget.
-    shaper_s : float
-        How long what was told so far takes with it.
+    tops : dict
+        Highest factor of every class.
+    attempt : int
+        How often the file was written before.
     """
 
     machine: Machine
@@ -97,9 +64,18 @@ class SpeedBudget:
     first_layer: FirstLayer
     paces: PaceChoice
     shaper_paces: PaceChoice
-    shaper_s: float = 0.0
-    gentler_s: float = 0.0
+    tops: Factors
+    attempt: int = 0
+    _factors: Factors = field(init=False)
+    _since: dict[int, ErrorSum] = field(init=False, default_factory=dict)
+    """Errors so far when a class last got another pace."""
+    _shaper_s: float = field(init=False, default=0.0)
+    """How long what was told so far takes with the shaper."""
+    _gentler_s: float = field(init=False, default=0.0)
     """How long the pieces last, as sliced, that no command could follow at their pace."""
+
+    def __post_init__(self) -> None:
+        self._factors = dict(self.paces.factors)
 
     @classmethod
     def chosen(
@@ -113,16 +89,16 @@ class SpeedBudget:
             The method cannot be designed for this machine.
         """
         assert options.budget_um is not None
-        limit_um = _AIM * options.budget_um
         tops = _tops(found.samples, machine)
-        compensated = _Compensated(found.samples, machine, options, shaper)
-        shaped = _Shaped(found.samples, machine, shaper)
+        ours = PaceTrials(found.samples, machine, compensated(machine, options, shaper))
+        theirs = PaceTrials(found.samples, machine, shaped(shaper))
         return cls(
             machine,
             options.budget_um,
             found.first_layer,
-            _search(compensated, dict.fromkeys(tops, 1.0), tops, limit_um),
-            _search(shaped, dict.fromkeys(tops, _SLOWEST), tops, limit_um),
+            search(ours, 1.0, tops, options.budget_um),
+            search(theirs, _SLOWEST, tops, options.budget_um),
+            tops,
         )
 
     def paced(self, piece: Piece) -> Iterator[Piece]:
@@ -131,50 +107,95 @@ class SpeedBudget:
         What it would take with the shaper is counted.
         """
         classes = move_classes(piece.moves, self.first_layer)
-        with_shaper = quickened(piece, classes, _paces(self.shaper_paces.factors), self.machine)
-        self.shaper_s += with_shaper.phases.duration_s
+        if self.shaper_paces.reached:
+            slow = quickened(piece, classes, paces(self.shaper_paces.factors), self.machine)
+            self._shaper_s += slow.phases.duration_s
         for share in _GENTLER:
-            factors = {one: factor**share for one, factor in self.paces.factors.items()}
-            quick = quickened(piece, classes, _paces(factors), self.machine)
+            factors = {one: factor**share for one, factor in self._factors.items()}
+            quick = quickened(piece, classes, paces(factors), self.machine)
             if quick is piece:
                 break
             yield quick
-            self.gentler_s += piece.phases.duration_s if share == 1.0 else 0.0
+            self._gentler_s += piece.phases.duration_s if share == 1.0 else 0.0
         yield piece
 
     def passed(self, seconds: float) -> None:
         """Count what leaves as it came."""
-        self.shaper_s += seconds
+        self._shaper_s += seconds
 
-    def correct(self, errors: Mapping[int, ClassError]) -> None:
-        """Slow down classes whose errors so far exceed the budget."""
-        for one, factor in self.paces.factors.items():
-            error = errors.get(one)
-            if error is None or error.seconds < _SURE_S or factor <= 1.0:
+    def correct(self, sums: Mapping[int, ErrorSum]) -> None:
+        """Let paces follow the errors so far: down near the bound, up where there is room."""
+        used = {one: self._used(one, found) for one, found in sums.items()}
+        roomy = max(used.values(), default=0.0) < _FULL
+        for one, factor in self._factors.items():
+            if one not in sums:
                 continue
-            if error.rms_um > self.budget_um * _allowed(one):
-                self.paces.factors[one] = max(1.0, _SLOWER * factor)
+            new = sums[one] - self._since[one] if one in self._since else sums[one]
+            if new.seconds < _SURE_S:
+                continue
+            lately, wanted = self._used(one, new), factor
+            if min(used[one] / _FULL, lately / _ROOM) > 1.0:
+                wanted = max(1.0, _SLOWER * factor)
+            elif roomy and max(used[one], lately) < _ROOM:
+                most = min(self.tops[one], _FURTHEST * self.paces.factors[one])
+                wanted = max(factor, min(_FASTER * factor, most))
+            if wanted != factor:
+                self._factors[one], self._since[one] = wanted, sums[one]
+
+    def milder(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
+        """Return what the file is to be written with once more; None where it may stay."""
+        over = {one: self._used(one, found) for one, found in sums.items()}
+        over = {one: ratio for one, ratio in over.items() if ratio > _ABOVE}
+        quicker = any(factor > 1.0 for factor in self.paces.factors.values())
+        if not over or not quicker or self.attempt + 1 == _ATTEMPTS:
+            return None
+        factors = dict.fromkeys(self._factors, 1.0)
+        if self.attempt + 2 < _ATTEMPTS:
+            factors = {
+                one: min(factor, self.paces.factors[one]) for one, factor in self._factors.items()
+            }
+            for one in {*over, TRAVEL} & {*factors}:
+                ratio = over.get(one, max(over.values()))
+                factors[one] = max(1.0, _MILDER * factors[one] / ratio)
+        return SpeedBudget(
+            self.machine,
+            self.budget_um,
+            self.first_layer,
+            replace(self.paces, factors=factors),
+            self.shaper_paces,
+            factors,
+            self.attempt + 1,
+        )
+
+    def again(self) -> SpeedBudget:
+        """Return the same as it was before anything was written."""
+        return replace(self)
+
+    def _used(self, one: int, found: ErrorSum) -> float:
+        """Return the part of its bound that an error of a class is."""
+        bound_um = self.paces.bounds_um.get(one, allowed_um(one, self.budget_um))
+        return found.worst.rms_um / bound_um
 
     def figures(
         self,
-        errors: Mapping[int, ClassError],
+        sums: Mapping[int, ErrorSum],
         names: Sequence[str],
         original_s: float,
         time_s: float,
     ) -> BudgetFigures:
         """Return what came of it."""
         classes = []
-        for one, error in sorted(errors.items()):
+        for one, found in sorted(sums.items()):
             classes.append(
                 BudgetClass(
                     name=_name(one, names),
-                    acceleration_factor=round(self.paces.factors.get(one, 1.0), 4),
+                    acceleration_factor=round(self._factors.get(one, 1.0), 4),
                     shaper_acceleration_factor=round(self.shaper_paces.factors.get(one, 1.0), 4),
-                    contour_rms_um=error.rms_um,
-                    seconds=round(error.seconds, 3),
+                    contour_rms_um=found.worst.rms_um,
+                    seconds=round(found.seconds, 3),
                 )
             )
-        shaper_s = self.shaper_s if self.shaper_paces.reached else None
+        shaper_s = self._shaper_s if self.shaper_paces.reached else None
         return BudgetFigures(
             budget_um=self.budget_um,
             saved_share=1.0 - time_s / original_s if original_s else 0.0,
@@ -183,13 +204,14 @@ class SpeedBudget:
             classes=classes,
         )
 
-    def warnings(self, errors: Mapping[int, ClassError], names: Sequence[str]) -> list[str]:
+    def warnings(self, sums: Mapping[int, ErrorSum], names: Sequence[str]) -> list[str]:
         """Return where the budget is not kept, in words."""
         warnings = []
-        for one, error in sorted(errors.items()):
-            if error.rms_um <= self.budget_um * _allowed(one) * (1.0 + 1e-3):
+        for one, found in sorted(sums.items()):
+            error = found.worst
+            if error.rms_um <= _ABOVE * allowed_um(one, self.budget_um):
                 continue
-            raised = self.paces.factors.get(one, 1.0) > 1.0
+            raised = self._factors.get(one, 1.0) > 1.0
             remedy = (
                 "give a smaller budget"
                 if raised
@@ -200,130 +222,13 @@ class SpeedBudget:
                 f"The contour error of {_name(one, names)} is {error.rms_um:.2f} um (rms, worst "
                 f"plant of the set), above the budget of {self.budget_um:g} um; {remedy}."
             )
-        if self.gentler_s > 0.0:
+        if self._gentler_s > 0.0:
             warnings.append(
-                f"Pieces of {self.gentler_s:.0f} s as sliced are slower than the budget allows: no "
-                "command within the machine's limits (command in its document) could follow them."
+                f"Pieces of {self._gentler_s:.0f} s as sliced are slower than the budget allows: "
+                "no command within the machine's limits (command in its document) could follow "
+                "them."
             )
         return warnings
-
-
-def error_classes(moves: Moves) -> np.ndarray:
-    """Return what the errors of each move count for: its feature, or travel."""
-    way = moves.end_mm - moves.start_mm
-    travels = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] <= 0.0)
-    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
-    other = np.where(travels, TRAVEL, AS_SLICED)
-    return np.where(prints, moves.feature, other).astype(np.int32)
-
-
-class _Compensated:
-    """Samples as they will be written."""
-
-    def __init__(
-        self, samples: list[Sample], machine: Machine, options: Options, shaper: BestShaper
-    ) -> None:
-        self._samples, self._machine = samples, machine
-        self._work = PieceCompensator(machine, options, shaper)
-
-    def __call__(self, factors: Factors) -> tuple[dict[int, ClassError], set[int]]:
-        errors = SetErrors(self._machine, DT_S, stride=_STRIDE)
-        unfit: set[int] = set()
-        for sample in self._samples:
-            try:
-                piece = quickened(sample.piece, sample.classes, _paces(factors), self._machine)
-                self._work.compensator.reset(piece.phases.start_mm[0, :2])
-                made = self._work.compensate(piece, sample.point)
-            except (Unfit, ValueError):
-                unfit.update(np.unique(sample.classes).tolist())
-                continue
-            planned, position, row, extruding = as_executed(made, piece.phases, made.encoded.phases)
-            errors.jump()
-            errors.operate_at(sample.point)
-            errors.add(planned[:2], position[:2], extruding, sample.classes[row])
-        errors.finish()
-        return errors.errors(), unfit
-
-
-class _Shaped:
-    """Samples with the best firmware shaper."""
-
-    def __init__(self, samples: list[Sample], machine: Machine, shaper: BestShaper) -> None:
-        self._samples, self._machine = samples, machine
-        frequencies = (shaper.fx_hz, shaper.fy_hz)
-        self._pulses = [shaper_pulses(shaper.type, f_hz, shaper.zeta) for f_hz in frequencies]
-
-    def __call__(self, factors: Factors) -> tuple[dict[int, ClassError], set[int]]:
-        errors = SetErrors(self._machine, DT_S, stride=_STRIDE)
-        pad = round(_SHAPER_REACH_S / DT_S)
-        for sample in self._samples:
-            piece = quickened(sample.piece, sample.classes, _paces(factors), self._machine)
-            phases = piece.phases
-            count = max(round(phases.duration_s / DT_S), 1)
-            position, row = sample_phases(phases, (0.0, DT_S, count))
-            path = np.pad(position[:2], ((0, 0), (pad, pad)), mode="edge")
-            command = [shape(p, DT_S, pulses) for p, pulses in zip(path, self._pulses, strict=True)]
-            direction = phases.direction[row]
-            prints = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
-            classes = np.pad(sample.classes[row], pad, constant_values=AS_SLICED)
-            errors.jump()
-            errors.operate_at(sample.point)
-            errors.add(path, np.stack(command), np.pad(prints, pad), classes)
-        errors.finish()
-        return errors.errors(), set()
-
-
-def _search(trial: Trial, least: Factors, most: Factors, limit_um: float) -> PaceChoice:
-    """Find the highest rung of every class at which its errors keep the limit."""
-
-    def factor(one: int, rung: int) -> float:
-        return float(least[one] * (most[one] / least[one]) ** (rung / _STEPS))
-
-    def tried(rungs: dict[int, int]) -> dict[int, float]:
-        """Return the errors over the limit by class; more than 1 is too much."""
-        errors, unfit = trial({one: factor(one, rung) for one, rung in rungs.items()})
-        over = {one: error.rms_um / (limit_um * _allowed(one)) for one, error in errors.items()}
-        return {one: math.inf if one in unfit else over.get(one, 0.0) for one in rungs}
-
-    rungs = {one: 0 for one in most if most[one] > least[one]}
-    if not rungs:
-        return PaceChoice({}, reached=True)
-    # What exceeds the limit even so may at least not become much worse.
-    limit = {one: max(1.0, _NO_WORSE * ratio) for one, ratio in tried(rungs).items()}
-    step = _STEPS // 2
-    while step:
-        higher = {one: rung + step for one, rung in rungs.items()}
-        for one, ratio in tried(higher).items():
-            if ratio <= limit[one]:
-                rungs[one] = higher[one]
-        step //= 2
-    # The uppermost rung is one more than bisection reaches.
-    rungs = {one: rung + 1 if rung == _STEPS - 1 else rung for one, rung in rungs.items()}
-    for _ in range(_MENDING_ROUNDS):
-        over = {one: ratio / limit[one] for one, ratio in tried(rungs).items()}
-        worse = {one: ratio for one, ratio in over.items() if ratio > 1.0}
-        # A class that cannot be slower suffers from what comes before it: travel.
-        stuck = [ratio for one, ratio in worse.items() if rungs[one] == 0]
-        if stuck and TRAVEL in rungs:
-            worse[TRAVEL] = max(worse.get(TRAVEL, 0.0), *stuck)
-        lower = {one: ratio for one, ratio in worse.items() if rungs[one] > 0}
-        if not lower:
-            break
-        for one, ratio in lower.items():
-            span = most[one] / least[one]
-            rungs[one] = max(0, rungs[one] - (2 if math.isinf(ratio) else _rungs_down(ratio, span)))
-    reached = all(ratio <= 1.0 / _AIM for ratio in tried(rungs).values())
-    return PaceChoice({one: factor(one, rung) for one, rung in rungs.items()}, reached)
-
-
-def _allowed(one: int) -> float:
-    """Return how many budgets the errors of a class may have."""
-    return _LANDING if one == TRAVEL else 1.0
-
-
-def _rungs_down(ratio: float, span: float) -> int:
-    """Rungs that a class above the limit must go down, if errors follow accelerations."""
-    return max(1, math.ceil(_STEPS * math.log(ratio) / math.log(span)))
 
 
 def _tops(samples: list[Sample], machine: Machine) -> Factors:
@@ -337,10 +242,6 @@ def _tops(samples: list[Sample], machine: Machine) -> Factors:
             ratio = most.accel_mm_s2 / float(np.min(phases.accel_mm_s2[rows]))
             tops[one] = max(tops.get(one, 1.0), ratio)
     return tops
-
-
-def _paces(factors: Factors) -> dict[int, Pace]:
-    return {one: Pace(factor, max(factor, 1.0)) for one, factor in factors.items()}
 
 
 def _name(one: int, names: Sequence[str]) -> str:

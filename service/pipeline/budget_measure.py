@@ -10,11 +10,10 @@ from collections.abc import Callable, Sequence
 
 from models.machine import Machine
 from models.schedule import OperatingPoint
-from service.pipeline.budget import error_classes
 from service.pipeline.layers import LayerTile
 from service.pipeline.measure import Measurement, MotionSamples, Trace
 from service.pipeline.result import Channel, GroupFigures
-from service.pipeline.set_errors import ClassError, SetErrors
+from service.pipeline.set_errors import ErrorSum, SetErrors, error_classes
 from service.pipeline.yardstick import BestShaper
 
 __all__ = ["BudgetMeasurement"]
@@ -81,9 +80,9 @@ class BudgetMeasurement(Measurement):
         self._sliced.finish()
         self._set.finish()
 
-    def errors(self) -> dict[int, ClassError]:
-        """Return the errors of the written file's worst plant by class of moves, so far."""
-        return self._set.errors()
+    def sums(self) -> dict[int, ErrorSum]:
+        """Return the errors of the written file by class of moves, so far."""
+        return self._set.sums()
 
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""

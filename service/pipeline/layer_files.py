@@ -96,6 +96,13 @@ class LayerWriter:
         if tile.layer >= 0:
             _widen(self._printed, tile, on)
 
+    def anew(self) -> LayerWriter:
+        """Throw away what is written and return a writer at the beginning."""
+        for file in (self._tiles, self._index):
+            file.seek(0)
+            file.truncate()
+        return LayerWriter(self._tiles, self._index, self._channels)
+
     def finish(self, features: Sequence[str]) -> None:
         """Write what only the whole print tells.
 

@@ -13,6 +13,7 @@ import io
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -20,7 +21,7 @@ import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
-from gcode.firmware.planning import join_phases, plan_moves
+from gcode.firmware.planning import join_phases, plan_moves, stops
 from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
@@ -147,8 +148,21 @@ def compensate_file(
                 writer = files.enter_context(
                     written_layers(layers, channel_names(compensated=True))
                 )
-            job = _Job(container.text, spool, machine, options, cache_dir, progress, writer, trace)
-            result = job.run(source.name, facts)
+            go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
+            # Within a budget a file may be written more than once: only the last time is traced.
+            traced = None if _Job.has_budget(options) else trace
+            budget: SpeedBudget | None = None
+            while True:
+                job = go(writer, traced, budget)
+                result = job.run(source.name, facts)
+                budget = job.milder
+                if budget is None and traced is trace:
+                    break
+                if budget is None:
+                    budget, traced = job.same, trace
+                spool.seek(0)
+                spool.truncate()
+                writer = writer.anew() if writer is not None else None
             spool.seek(0)
             job.retiming.copy(spool, text, job.delay_s)
             if options.times == "new":
@@ -176,6 +190,7 @@ class _Job:
         progress: ProgressCallback | None,
         layers: LayerWriter | None,
         trace: Callable[[Trace], None] | None,
+        budget: SpeedBudget | None,
     ) -> None:
         self._layers = layers
         self._source, self._target = source, target
@@ -203,12 +218,14 @@ class _Job:
         self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
         self._operation = Operation(machine)
-        self._budget: SpeedBudget | None = None
+        self._budget = budget
+        self._pairs: BudgetMeasurement | None = None
         take_layer = layers.add if layers else None
-        if self._changes and options.budget_um is not None:
-            self._measurement: Measurement = BudgetMeasurement(
+        if self.has_budget(options):
+            self._pairs = BudgetMeasurement(
                 machine, DT_S, self._shaper, take_layer=take_layer, trace=trace
             )
+            self._measurement: Measurement = self._pairs
         else:
             self._measurement = Measurement(
                 machine, DT_S, self._shaper, compensated=True, take_layer=take_layer, trace=trace
@@ -222,6 +239,23 @@ class _Job:
         if options.budget_um is not None and not self._changes:
             self._sum.warnings.append("The method none changes nothing: the budget was not used.")
 
+    @staticmethod
+    def has_budget(options: Options) -> bool:
+        """Tell whether paces are chosen."""
+        return options.budget_um is not None and options.method != "none"
+
+    @property
+    def milder(self) -> SpeedBudget | None:
+        """What the file must be written with instead, where it exceeds its budget."""
+        if self._budget is None or self._pairs is None:
+            return None
+        return self._budget.milder(self._pairs.sums())
+
+    @property
+    def same(self) -> SpeedBudget | None:
+        """What the file was written with."""
+        return self._budget.again() if self._budget is not None else None
+
     @property
     def delay_s(self) -> float:
         """How much later than the original the written file is where the road has come to."""
@@ -229,8 +263,8 @@ class _Job:
 
     def run(self, name: str, facts: SlicerFacts) -> Result:
         size = max(self._source.seek(0, io.SEEK_END), 1)
-        if isinstance(self._measurement, BudgetMeasurement):
-            self._choose_paces(size)
+        if self._pairs is not None and self._budget is None:
+            self._budget = self._chosen_paces(size)
         self._source.seek(0)
         for item in self._items():
             self._point = self._operation.at(item.moves)
@@ -248,10 +282,11 @@ class _Job:
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
-        self._say("done", 1.0)
+        if self.milder is None:
+            self._say("done", 1.0)
         return self._result(name, size, facts)
 
-    def _choose_paces(self, size: int) -> None:
+    def _chosen_paces(self, size: int) -> SpeedBudget:
         """Find how quick the print may be."""
         self._source.seek(0)
         with self._clock.stage("budget"):
@@ -261,7 +296,7 @@ class _Job:
                 dialect_for(self._machine, self._options.dialect),
                 lambda read: self._say("choosing speeds", read / size),
             )
-            self._budget = SpeedBudget.chosen(found, self._machine, self._options, self._shaper)
+            return SpeedBudget.chosen(found, self._machine, self._options, self._shaper)
 
     def _items(self) -> Iterator[Piece | Passage]:
         while True:
@@ -348,15 +383,15 @@ class _Job:
         return made, executed, gap, text
 
     def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
-        if self._budget is None or not isinstance(self._measurement, BudgetMeasurement):
+        if self._budget is None or self._pairs is None:
             self._measurement.add(written)
             return
         phases = piece.phases
         count = max(round(phases.duration_s / DT_S), 1)
         position, row = sample_phases(phases, (0.0, DT_S, count))
         sliced = self._samples(piece, row, position, position, _feeding(phases)[row])
-        self._measurement.add_pair(written, sliced)
-        self._budget.correct(self._measurement.errors())
+        self._pairs.add_pair(written, sliced)
+        self._budget.correct(self._pairs.sums())
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece leave as it came."""
@@ -535,11 +570,11 @@ class _Job:
                 f"{longest.reason}"
             )
         shaper, notes, budget = self._shaper, self._operation.notes(), None
-        if self._budget is not None and isinstance(measured, BudgetMeasurement):
-            names, errors = self._reader.feature_names, measured.errors()
-            budget = self._budget.figures(errors, names, total.original_s, total.time_s)
-            warnings += self._budget.warnings(errors, names)
-            notes = [*notes, measured.note]
+        if self._budget is not None and self._pairs is not None:
+            names, sums = self._reader.feature_names, self._pairs.sums()
+            budget = self._budget.figures(sums, names, total.original_s, total.time_s)
+            warnings += self._budget.warnings(sums, names)
+            notes = [*notes, self._pairs.note]
         return Result(
             version=__version__,
             machine=self._machine.name,
@@ -629,9 +664,8 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
         The position becomes unknown here.
     """
     events = passage.events
-    stops = np.flatnonzero((events.kind >= EventKind.STOP) & (events.kind != EventKind.OBJECT))
     done = 0
-    for k in [*stops.tolist(), None]:
+    for k in [*np.flatnonzero(stops(events)).tolist(), None]:
         end = len(passage.moves) if k is None else int(events.move_index[k])
         if end > done:
             rows = rows_of(passage.moves, slice(done, end))

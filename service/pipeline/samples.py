@@ -26,7 +26,7 @@ __all__ = ["FileSamples", "Sample", "take_samples"]
 
 _BLOCK_BYTES = 1 << 17
 _LASTS_S = 4.0
-_TOTAL_S = 200.0
+_TOTAL_S = 120.0
 _FEWEST, _MOST = 3, 12
 _SPREAD = 0.6180339887498949
 """Golden ratio: where in its piece a sample lies shares no rhythm with the file."""

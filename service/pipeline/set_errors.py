@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.quickening import TRAVEL
+from gcode.quickening import AS_SLICED, TRAVEL
+from gcode.types import Moves
 from models.machine import Machine
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
 from simulation.measures import ContourErrors, ContourMeter, GroupTally
 from simulation.scheduled import MachineStream
 
-__all__ = ["LANDING_S", "ClassError", "SetErrors"]
+__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors", "error_classes"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -30,6 +31,44 @@ class ClassError:
 
     rms_um: float
     seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSum:
+    """Errors of one class of moves, added up over time.
+
+    Attributes
+    ----------
+    squares_um2_s : ndarray, shape (plants,)
+        Integral of the squared error of every plant.
+    seconds : float
+    """
+
+    squares_um2_s: Array
+    seconds: float
+
+    def __add__(self, other: ErrorSum) -> ErrorSum:
+        return ErrorSum(self.squares_um2_s + other.squares_um2_s, self.seconds + other.seconds)
+
+    def __sub__(self, other: ErrorSum) -> ErrorSum:
+        return ErrorSum(self.squares_um2_s - other.squares_um2_s, self.seconds - other.seconds)
+
+    @property
+    def worst(self) -> ClassError:
+        """The error of the plant with the largest."""
+        if self.seconds <= 0.0:
+            return ClassError(0.0, 0.0)
+        mean = max(float(np.max(self.squares_um2_s)), 0.0) / self.seconds
+        return ClassError(float(np.sqrt(mean)), self.seconds)
+
+
+def error_classes(moves: Moves) -> Ints:
+    """Return what the errors of each move count for: its feature, or travel."""
+    way = moves.end_mm - moves.start_mm
+    travels = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] <= 0.0)
+    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
+    other = np.where(travels, TRAVEL, AS_SLICED)
+    return np.where(prints, moves.feature, other).astype(np.int32)
 
 
 class SetErrors:
@@ -52,13 +91,17 @@ class SetErrors:
         self._numbers: list[int | None] = [None, *range(members)]
         self._streams: list[MachineStream] = []
         self._point = EMPTY
-        self._meter = ContourMeter(dt_s, stride=stride, channels=len(self._numbers))
-        self._tally = GroupTally(len(self._numbers))
-        self._landed = GroupTally(len(self._numbers))
+        self._never = round(LANDING_S / dt_s) + 1
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget what was measured; the machine stands still when motion goes on."""
+        channels = len(self._numbers)
+        self._meter = ContourMeter(self._dt_s, stride=self._stride, channels=channels)
+        self._tally, self._landed = GroupTally(channels), GroupTally(channels)
         self._waiting: list[tuple[Ints, Mask, Mask]] = []
         self._count = 0
-        self._since = self._never = round(LANDING_S / dt_s) + 1
-        self._fresh = True
+        self.jump()
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Say where the machine is from now on."""
@@ -104,17 +147,19 @@ class SetErrors:
         """Say that the motion has ended."""
         self._note(self._meter.flush())
 
+    def sums(self) -> dict[int, ErrorSum]:
+        """Return the errors by class, as far as they are measured, added up."""
+        step_s = self._stride * self._dt_s
+        found: dict[int, ErrorSum] = {}
+        for tally in (self._tally, self._landed):
+            for at in np.flatnonzero(tally.count).tolist():
+                squares = 1e6 * step_s * tally.square_sum[:, at]
+                found[tally.lowest + at] = ErrorSum(squares, step_s * int(tally.count[at]))
+        return found
+
     def errors(self) -> dict[int, ClassError]:
         """Return the errors by class, as far as they are measured."""
-        found: dict[int, ClassError] = {}
-        for tally in (self._landed, self._tally):
-            for channel in range(len(self._numbers)):
-                for one, values in tally.tallies(channel).items():
-                    known = found.get(one)
-                    if known is None or 1e3 * values.rms > known.rms_um:
-                        seconds = values.count * self._stride * self._dt_s
-                        found[one] = ClassError(1e3 * values.rms, seconds)
-        return found
+        return {one: found.worst for one, found in self.sums().items()}
 
     def _landing(self, travels: Mask) -> Mask:
         """Mark the samples soon behind a travel."""
