@@ -160,7 +160,7 @@ def _set_position(w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> 
             f[F_BASE + k] = f[F_LAST + k]
         i[I_ORIGIN_KNOWN] = i[I_KNOWN]
     if places:
-        settle(f, i, rows)
+        settle(f, i, rows)  # the machine did not come here along a path
     note_modal(f, i, tables)
-    put_event(i, rows, _STOP if places else _MODE)
+    put_event(i, rows, _UNKNOWN if places else _MODE)
     return OK

@@ -45,7 +45,8 @@ class EventKind(IntEnum):
     STOP = 3
     """Stops the motion; the position stays known: G4, M400, waits."""
     UNKNOWN = 4
-    """Leaves position or state unknown: homing, probing, macros, tool change, pause."""
+    """Leaves position or state unknown, or changes the place without motion (RepRapFirmware's G92):
+    homing, probing, macros, tool change, pause."""
     OBJECT = 5
     """Object-exclusion mark: the firmware may jump over what follows."""
     SHAPER = 6

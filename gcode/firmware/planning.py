@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.registry import kit
-from gcode.types import EventKind, Limits, Moves, Phases, ProgramBlock
+from gcode.types import EventKind, Events, Limits, Moves, Phases, ProgramBlock
 from models.machine import Machine
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "empty_phases",
     "join_phases",
     "plan_moves",
+    "stops",
 ]
 
 STOPPING = frozenset({EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER})
@@ -30,6 +32,11 @@ LONGEST_PRINT_S = 3.6e6
 """So is a print that takes longer: a small file must not keep a computer busy for days."""
 
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
+
+
+def stops(events: Events) -> NDArray[np.bool_]:
+    """Mark events at which the motion comes to rest."""
+    return np.isin(events.kind, _STOPPING)
 
 
 def plan_moves(moves: Moves, limits: Sequence[Limits], machine: Machine) -> Phases:
@@ -100,7 +107,7 @@ def between_stops(block: ProgramBlock) -> Iterator[tuple[int, int, float | None]
     """
     events = block.events
     begun = 0
-    for row in np.flatnonzero(np.isin(events.kind, _STOPPING)).tolist():
+    for row in np.flatnonzero(stops(events)).tolist():
         end = int(events.move_index[row]) - block.first_move
         yield begun, end, float(events.dwell_s[row])
         begun = end

@@ -16,8 +16,9 @@ from gcode.errors import GcodeError
 from gcode.firmware._writing_kernels import format_moves
 from gcode.firmware.base import FirmwareKit
 from gcode.firmware.encoding import Encoded
+from gcode.firmware.planning import stops
 from gcode.pieces import Passage, Piece
-from gcode.types import EventKind, Events, Limits, ModalState
+from gcode.types import EventKind, Limits, ModalState
 
 __all__ = ["StreamWriter"]
 
@@ -141,10 +142,10 @@ class StreamWriter:
             self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
             self._shaper_off = False
         if len(moves):
-            last_stop = events.move_index[_stops(events)]
+            last_stop = events.move_index[stops(events)]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
             self._at_rest = stands or self._rests(passage, len(moves) - 1)
-        elif np.any(_stops(events)):
+        elif np.any(stops(events)):
             self._at_rest = True
         return lead + passage.text
 
@@ -159,11 +160,11 @@ class StreamWriter:
 
         kinds = events.kind.tolist()
         rest_rows = np.flatnonzero(rows >= 0)
-        stops: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
-        stops += [(int(i), 1, int(rows[i])) for i in rest_rows]
+        order: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
+        order += [(int(i), 1, int(rows[i])) for i in rest_rows]
         done = 0
         last_line = -1
-        for at, kind, what in sorted(stops):
+        for at, kind, what in sorted(order):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
                 parts += [self._ours(encoded.limits, modes.at(at - 1)), text[done:upto]]
@@ -376,10 +377,10 @@ class StreamWriter:
     def _rests(self, passage: Passage, row: int) -> bool:
         """Whether the machine stands at a move of the passage by itself, before and after it."""
         moves, events = passage.moves, passage.events
-        stops = _stops(events)
+        rests = stops(events)
         if len(moves) == 0:
-            return bool(np.any(stops))
-        if row == 0 and np.any((events.move_index == 0) & stops):
+            return bool(np.any(rests))
+        if row == 0 and np.any((events.move_index == 0) & rests):
             return True
         travel = moves.end_mm[row] - moves.start_mm[row]
         return self._extruder_alone_stops and not np.any(travel[:3])
@@ -417,12 +418,6 @@ class StreamWriter:
             self._shaper_off = True
             return b""
         return (stated or b"") + b"".join(self._shaper_lines.values())
-
-
-def _stops(events: Events) -> NDArray[np.bool_]:
-    """Mark events at which the machine comes to rest by itself."""
-    passed = (EventKind.OBJECT, EventKind.STATE)
-    return np.asarray((events.kind >= EventKind.STOP) & ~np.isin(events.kind, passed))
 
 
 def _held_back(line: bytes) -> bytes:

@@ -393,10 +393,18 @@ CLASSES = {
     "G1 X5 H1": {"reprapfirmware": EventKind.UNKNOWN},
     "M116": {"reprapfirmware": EventKind.STOP, "marlin": EventKind.HARMLESS},
     "G92 E0": {"marlin": EventKind.MODE, "reprapfirmware": EventKind.MODE},
-    "G92 X5": {"marlin": EventKind.MODE, "reprapfirmware": EventKind.STOP},
+    "G92 X5": {"marlin": EventKind.MODE, "reprapfirmware": EventKind.UNKNOWN},
     "M117 G1 X5 ; text": dict.fromkeys(ALL, EventKind.HARMLESS),
     "M106 S255 ; G1": dict.fromkeys(ALL, EventKind.HARMLESS),
 }
+
+
+def test_a_place_that_is_told_is_no_motion(read) -> None:
+    """RepRapFirmware's G92 X: figures must not take it for a jump of the machine."""
+    block, _ = read("G28\nG1 X10 F600\nG92 X50\nG1 X51\n", "reprapfirmware")
+    assert block.events.kind[-1] == EventKind.UNKNOWN
+    assert block.moves.known.tolist() == [7, 7]
+    assert block.moves.start_mm[1, 0] == 50.0
 
 
 @pytest.mark.parametrize("line", CLASSES)
