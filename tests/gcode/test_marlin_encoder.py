@@ -158,6 +158,7 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"variant": "bambu"}, "closed"),
         ({"variant": "prusa"}, "HWLIMIT"),
         ({"variant": "bugfix"}, "2.1.2"),
+        ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
         ({"s_curve": True}, "S_CURVE"),
         ({"min_steps_per_segment": 6}, "MIN_STEPS_PER_SEGMENT 1"),
@@ -169,6 +170,7 @@ def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) ->
     refusal = MarlinKit(with_firmware(firmware), firmware).refusal
     assert refusal is not None
     assert says in refusal
+    assert "--method advise" in refusal
 
 
 def test_a_stock_machine_can() -> None:

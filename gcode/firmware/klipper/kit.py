@@ -50,7 +50,8 @@ class KlipperKit:
             f"(firmware.planner.max_z_accel_mm_s2 = "
             f"{self._firmware.planner.max_z_accel_mm_s2:g}); a stream needs "
             f"{MIN_STREAM_ACCEL_MM_S2:.0f}: level the bed, or raise max_z_accel in printer.cfg and "
-            f"here to {least:.0f}. The firmware's own shaper works as it is."
+            f"here to {least:.0f}. Or use --method advise, which leaves all moves as they are and "
+            "sets the firmware's own shaper."
         )
 
     def initial_limits(self) -> KlipperLimits:

@@ -128,8 +128,8 @@ class MarlinEncoder:
             raise GcodeError(
                 f"linear advance is on (M900 K{own.linear_advance_k_s:g}): Marlin would lower the "
                 "stream's accelerations and send the extruder a burst of steps at each of its "
-                "corners; print with M900 K0, or use the firmware's own shaper (M593). For a "
-                "firmware without it say linear_advance false",
+                "corners; print with M900 K0, or use --method advise, which leaves all moves as "
+                "they are. For a firmware without it say linear_advance false",
                 line=int(piece.moves.line[0]),
             )
         limits = stream_limits(own, self._velocity)

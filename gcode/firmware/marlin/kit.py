@@ -34,7 +34,10 @@ JUNCTION_DEVIATION_MM = (0.01, 0.3)
 
 _ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
 
-_ALTERNATIVE = "use the firmware's own input shaper (`stillpath simulate` names its best setting)"
+_ALTERNATIVE = (
+    "use --method advise, which sets accelerations, and the firmware's own input shaper where the "
+    "machine states one"
+)
 
 
 class MarlinKit:
@@ -56,8 +59,8 @@ class MarlinKit:
         firmware = self._firmware
         if firmware.variant == "bambu":
             return (
-                "Bambu's firmware is closed: how it plans a stream is not known; "
-                "it compensates itself (M975 S1)"
+                "Bambu's firmware is closed: how it plans a stream is not known; it compensates "
+                "itself (M975 S1), and --method advise sets accelerations beside that"
             )
         if firmware.variant == "prusa":
             return (
@@ -74,12 +77,12 @@ class MarlinKit:
             return (
                 "fixed-time motion (ft_motion, M493) has a planner of its own, which would smooth "
                 "a stream; build without FT_MOTION, or switch it off (M493 S0) and say so in "
-                "`ft_motion`, or use --method advise, which sets its shaper"
+                "`ft_motion`, or use --method advise, which sets its shaper (M493)"
             )
         if firmware.board == "avr":
             return (
                 "an 8-bit board computes step rates in 16 bits and takes some hundred segments a "
-                "second at most; print from a 32-bit board, or lower the file's acceleration"
+                "second at most; print from a 32-bit board, or " + _ALTERNATIVE
             )
         if firmware.s_curve:
             return (
@@ -92,7 +95,8 @@ class MarlinKit:
             return (
                 f"M205 J takes {low:g} to {high:g} mm, so the machine's junction deviation of "
                 f"{deviation_mm:g} mm could not be put back behind a stream; build with a "
-                "JUNCTION_DEVIATION_MM in that range and say so in planner.junction_deviation_mm"
+                "JUNCTION_DEVIATION_MM in that range and say so in planner.junction_deviation_mm, "
+                "or " + _ALTERNATIVE
             )
         least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
         if firmware.min_steps_per_segment > 1 and least_mm > LONGEST_LEAST_MM:
@@ -104,7 +108,12 @@ class MarlinKit:
             )
         slope = self._mesh_slope
         if slope > 0.0 and slope * MIN_STREAM_ACCEL_MM_S2 > STREAM_Z_ACCEL_MM_S2:
-            return f"the bed mesh is too steep ({slope:g}): level the bed"
+            return (
+                f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z, which "
+                "follows it, takes part in a stream up to "
+                f"{STREAM_Z_ACCEL_MM_S2 / MIN_STREAM_ACCEL_MM_S2:.2g}: tram the bed, or "
+                + _ALTERNATIVE
+            )
         return None
 
     def initial_limits(self) -> MarlinLimits:

@@ -53,7 +53,8 @@ class RepRapKit:
             return None
         return (
             f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z can follow a "
-            f"stream up to {STEEPEST:g}: tram the bed"
+            f"stream up to {STEEPEST:g}: tram the bed, or use --method advise, which leaves all "
+            "moves as they are and sets shaper and accelerations"
         )
 
     def initial_limits(self) -> RepRapLimits:
