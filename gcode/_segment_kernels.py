@@ -80,7 +80,7 @@ def fit_stretch(
     tolerance = np.array([along, across, tolerance_z, tolerance_e])
     value = np.empty(4)
     slope = np.empty(4)
-    wish = np.empty(2)
+    wish, straight, inner = np.empty(2), np.empty(2), np.empty(2)
     trial = np.empty((2, order), np.complex128)
     origin = begin.copy()
     origin_s = start_s
@@ -89,10 +89,10 @@ def fit_stretch(
     count = 0
     while k <= last:
         cx, cy = direction[0, k], direction[1, k]
-        low[:] = -np.inf
-        high[:] = np.inf
-        wide_low[:] = -np.inf
-        wide_high[:] = np.inf
+        for i in range(4):
+            low[i], high[i] = -np.inf, np.inf
+        for i in range(2):
+            wide_low[i], wide_high[i] = -np.inf, np.inf
         j = k
         while j <= last:
             span = j * dt_s - origin_s
@@ -122,8 +122,9 @@ def fit_stretch(
                     fits = False
             if not fits:
                 break
-            low[:] = new_low
-            high[:] = new_high
+            # Element by element: a slice of four numbers would cost more than the rest.
+            for i in range(4):
+                low[i], high[i] = new_low[i], new_high[i]
             for i in range(2):
                 wide_low[i] = max(wide_low[i], (value[i] - tolerance[i] - loose) * rate)
                 wide_high[i] = min(wide_high[i], (value[i] + tolerance[i] + loose) * rate)
@@ -133,27 +134,31 @@ def fit_stretch(
         span = end * dt_s - origin_s
         shaped = j > k and end < last
         # The answer to the straight line to the sample `end`; any other end adds a ramp to it.
+        weigh = shaped and samples <= longest
         for axis in range(2):
-            wish[axis] = 0.0
-            straight = (position[axis, end] - origin[axis]) / span
-            weigh = shaped and samples <= longest
-            inner = 0.0
+            straight[axis] = (position[axis, end] - origin[axis]) / span
+            inner[axis] = 0.0
             for r in range(order):
                 trial[axis, r] = states[axis, r]
-            for i in range(samples):
-                at = k + i
-                error = origin[axis] + straight * (at * dt_s - origin_s) - position[axis, at]
+        # Both axes side by side: each waits for its own last result only.
+        for i in range(samples):
+            at = k + i
+            since = at * dt_s - origin_s
+            for axis in range(2):
+                error = origin[axis] + straight[axis] * since - position[axis, at]
                 answer = direct[axis] * error
                 for r in range(order):
                     x = trial[axis, r]
                     answer += (weight[axis, r] * x).real
                     trial[axis, r] = pole[axis, r] * x + error
                 if weigh:
-                    inner += answer * ramp[axis, samples, i]
+                    inner[axis] += answer * ramp[axis, samples, i]
+        for axis in range(2):
+            wish[axis] = 0.0
             if weigh:
                 for r in range(order):
-                    inner += (trial[axis, r] * tail[axis, samples, r]).real
-                wish[axis] = -inner / norm[axis, samples]
+                    inner[axis] += (trial[axis, r] * tail[axis, samples, r]).real
+                wish[axis] = -inner[axis] / norm[axis, samples]
         if shaped:
             dx = position[0, end] + wish[0] - origin[0]
             dy = position[1, end] + wish[1] - origin[1]
@@ -185,7 +190,7 @@ def fit_stretch(
                     states[axis, r] += shift * ramp_state[axis, samples, r]
         for i in range(4):
             origin[i] = position[i, last] if end == last else origin[i] + slope[i] * span
-        speed[:] = slope[:2]
+        speed[0], speed[1] = slope[0], slope[1]
         origin_s = end * dt_s
         out_t[count] = origin_s
         for i in range(4):
