@@ -31,6 +31,8 @@ _SLOWEST = 0.05
 """Least pace of the shaper, which may have to be slower than the file."""
 _ABOVE, _FULL, _ROOM = 1.001, 0.97, 0.9
 """Parts of a bound: from where it is exceeded, a class comes down, and may go up."""
+_HELPLESS = 0.99
+"""The same from where others come down for a class that cannot."""
 _SLOWER, _FASTER = 0.9, 1.08
 _FURTHEST = 2.0
 """Paces go up to so many times what the samples said."""
@@ -127,7 +129,7 @@ class SpeedBudget:
         """Let paces follow the errors so far: down near the bound, up where there is room."""
         used = {one: self._used(one, found) for one, found in sums.items()}
         roomy = max(used.values(), default=0.0) < _FULL
-        for one, factor in self._factors.items():
+        for one, factor in sorted(self._factors.items()):
             if one not in sums:
                 continue
             new = sums[one] - self._since[one] if one in self._since else sums[one]
@@ -136,11 +138,20 @@ class SpeedBudget:
             lately, wanted = self._used(one, new), factor
             if min(used[one] / _FULL, lately / _ROOM) > 1.0:
                 wanted = max(1.0, _SLOWER * factor)
+                if factor == 1.0 and min(used[one], lately) > _HELPLESS:
+                    self._slow_others()
+                    self._since[one] = sums[one]
             elif roomy and max(used[one], lately) < _ROOM:
                 most = min(self.tops[one], _FURTHEST * self.paces.factors[one])
                 wanted = max(factor, min(_FASTER * factor, most))
             if wanted != factor:
                 self._factors[one], self._since[one] = wanted, sums[one]
+
+    def _slow_others(self) -> None:
+        """Slow down what shakes a class that is at its own pace: travel, and then all others."""
+        travel_first = self._factors.get(TRAVEL, 1.0) > 1.0
+        for one in [TRAVEL] if travel_first else [*self._factors]:
+            self._factors[one] = max(1.0, _SLOWER * self._factors[one])
 
     def milder(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
         """Return what the file is to be written with once more; None where it may stay."""
