@@ -34,6 +34,7 @@ __all__ = ["Interpreter", "interpret_bytes"]
 T = TypeVar("T", bound=np.generic)
 
 _BOM = b"\xef\xbb\xbf"
+_BOM_16 = (b"\xff\xfe", b"\xfe\xff")
 _PAD = b"\n" * PADDING
 _CHUNK = 1 << 20
 _LONGEST_LINE = 1 << 24
@@ -313,6 +314,8 @@ class Interpreter:
         raw = self._text[int(i[at.I_POS]) : int(i[at.I_END])]
         if i[at.I_LINE] == 1 and raw.startswith(_BOM):
             raw = raw[len(_BOM) :]
+        elif i[at.I_LINE] == 1 and raw.startswith(_BOM_16):
+            raise GcodeError("the file is UTF-16, which no printer reads; save it as UTF-8", line=1)
         return raw
 
     def _command(self, command: Command) -> int:

@@ -291,7 +291,7 @@ class MachineState:
         try:
             number = float(value)
         except ValueError:
-            raise self.problem(f"{key}{value!r} is not a number; correct it", command) from None
+            raise self.problem(f"{key} is {value!r}, not a number; correct it", command) from None
         if not abs(number) <= at.MAX_VALUE:
             raise self.problem(f"{key} {value} is out of range; correct it", command)
         return number

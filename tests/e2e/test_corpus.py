@@ -28,7 +28,7 @@ REFUSED = {
     ("hm_arcs_planes_marlin", "reprapfirmware"): _CIRCLE,
     # Words without their G are nothing to it outside of its CNC mode.
     ("hm_cnc_inches_g20_numbered", "reprapfirmware"): _CIRCLE,
-    ("hm_dialect_torture", "reprapfirmware"): "is not a number",
+    ("hm_dialect_torture", "reprapfirmware"): "not a number",
     # Klipper's polygons of objects.
     ("klipper_excludeobj_multi", "reprapfirmware"): _LONG,
     ("real_bambustudio1", "reprapfirmware"): _LONG,

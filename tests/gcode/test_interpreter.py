@@ -284,6 +284,12 @@ def test_bom_and_line_ends(golden_machine: Machine) -> None:
     assert (last.moves.byte_start[0], last.moves.byte_end[0]) == (len(data) - 5, len(data))
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_utf_16_is_named(encoding: str, golden_machine: Machine) -> None:
+    with pytest.raises(GcodeError, match="UTF-16"):
+        Interpreter(golden_machine).push("\ufeffG28\nG1 X5\n".encode(encoding))
+
+
 REFUSED = {
     "hm_arcs_planes_marlin": "do not take R",
     "hm_cnc_inches_g20_numbered": "inches",
