@@ -19,6 +19,8 @@ from service.settings import Settings
 
 __all__ = ["serve_forever"]
 
+_SWITCH_S = 0.001
+"""How long a thread may keep the others waiting; by default 5 ms, at every turn of an upload."""
 _BACKLOG = 1024
 _LONGEST_HEADERS_BYTES = 32 << 10
 _GOODBYE_S = 5
@@ -48,6 +50,7 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         If other computers can reach the address, and keys are switched off.
     """
     configure_logging()
+    sys.setswitchinterval(_SWITCH_S)
     app = create_app(settings, keys_required=keys_needed(settings, host), runner=runner)
     config = uvicorn.Config(
         app,

@@ -8,7 +8,7 @@ somebody on this computer.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from contextlib import suppress
 from typing import Annotated, NoReturn
 
@@ -40,14 +40,14 @@ _Header = Annotated[
 ]
 
 
-def _shown(bearer: _Bearer, header: _Header) -> str | None:
+async def _shown(bearer: _Bearer, header: _Header) -> str | None:
     return bearer.credentials if bearer is not None else header
 
 
 _Shown = Annotated[str | None, Depends(_shown)]
 
 
-# Every one of these looks into the database, so that they are plain functions: run in a thread.
+# Each of these looks into the database, so that they are plain functions: run in a thread.
 
 
 def _reader(request: Request, shown: _Shown) -> Caller:
@@ -81,7 +81,7 @@ Admin = Annotated[Caller, Depends(_admin)]
 Operator = Annotated[Caller, Depends(_operator)]
 
 
-def _uploader(request: Request, caller: Submitter) -> Iterator[Caller]:
+async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller]:
     limits: Limits = request.app.state.limits
     with limits.uploading(caller):
         yield caller

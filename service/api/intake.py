@@ -51,11 +51,12 @@ _ASKED_AT_ONCE = 8
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """A job, and whether it is the one that was there already."""
+    """A job, whether it is new or one that was there already, and how many wait before it."""
 
     job: Job
     is_new: bool
     upload: Upload
+    queue_position: int
 
 
 class Intake:
@@ -130,13 +131,13 @@ class Intake:
         Problem
             413, 422, 429 or 507; nothing of the upload is left then.
         """
-        await run_in_threadpool(self._check_targets, wanted)
         # A printer may take its time: threads are for all requests.
         limiter = None if wanted.printer is None else self._printers_asked
-        pinned = await to_thread.run_sync(self._pinned, wanted, limiter=limiter)
-        await run_in_threadpool(self._check_room, caller)
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
+            pinned = await to_thread.run_sync(
+                self._admit, wanted, caller, incoming, limiter=limiter
+            )
             upload = await receive_upload(
                 request, incoming, max_bytes=self._settings.max_upload_bytes
             )
@@ -160,6 +161,17 @@ class Intake:
             request.app.state.work.notify()
         return taken
 
+    def _admit(self, wanted: JobQuery, caller: Caller, incoming: Path) -> PinnedMachine:
+        """Refuse what can be refused before the body, and write the machine beside its place.
+
+        Whatever is done now, nobody waits for who has sent the body.
+        """
+        self._check_targets(wanted)
+        pinned = self._pinned(wanted)
+        self._check_room(caller)
+        pinned.write(incoming.with_suffix(".machine"))
+        return pinned
+
     def _accept(
         self,
         job_id: str,
@@ -176,13 +188,13 @@ class Intake:
             idempotency = (idempotency_key, _fingerprint(wanted, upload))
             earlier = self._earlier(caller, *idempotency)
             if earlier is not None:
-                return Taken(earlier, False, upload)
+                return self._taken(earlier, False, upload)
         dedupe_key = _dedupe_key(wanted, upload, pinned)
         shared = not wanted.fresh and wanted.webhook is None and wanted.printer is None
         if shared and idempotency is None:  # with a key, `add` looks, and notes the key
             same = self._store.find_same(caller.owner, dedupe_key)
             if same is not None:
-                return Taken(same, False, upload)
+                return self._taken(same, False, upload)
         job = Job(
             id=job_id,
             owner=caller.owner,
@@ -210,12 +222,13 @@ class Intake:
             source_sha256=upload.sha256,
         )
         prefix = f"jobs/{job_id}/"
-        document = incoming.with_suffix(".machine")
+        files = {
+            f"{prefix}machine.json": incoming.with_suffix(".machine"),
+            f"{prefix}source/{job.source_name}": incoming,
+        }
         added: Job | None = None
         try:
-            pinned.write(document)
-            self._storage.put(f"{prefix}machine.json", document)
-            self._storage.put(f"{prefix}source/{job.source_name}", incoming)
+            self._storage.put_all(files)
             added = self._store.add(
                 job,
                 idempotency=idempotency,
@@ -230,12 +243,14 @@ class Intake:
         except IdempotencyConflict:
             raise _conflict(idempotency_key) from None
         finally:
-            document.unlink(missing_ok=True)
             if added is None or added.id != job_id:
                 self._undo(job_id)
         if added.id == job_id:
             tell(audit_row)
-        return Taken(added, added.id == job_id, upload)
+        return self._taken(added, added.id == job_id, upload)
+
+    def _taken(self, job: Job, is_new: bool, upload: Upload) -> Taken:
+        return Taken(job, is_new, upload, self._store.queue_position(job))
 
     def _undo(self, job_id: str) -> None:
         """Delete what was stored for a job that was refused, or that another one stands for.
@@ -306,12 +321,16 @@ class Intake:
 
     @contextmanager
     def _incoming(self, job_id: str) -> Iterator[Path]:
-        """Give a file for an upload on its way; gone afterwards, however the block ends."""
+        """Give a file for an upload on its way; gone afterwards, however the block ends.
+
+        So is what lies beside it with the suffix ``.machine``.
+        """
         incoming = self._folder / f"{job_id}.upload"
         try:
             yield incoming
         finally:
             incoming.unlink(missing_ok=True)
+            incoming.with_suffix(".machine").unlink(missing_ok=True)
 
 
 def _with_fields(wanted: JobQuery, upload: Upload) -> JobQuery:

@@ -140,8 +140,8 @@ async def create_job(
     if not taken.is_new:
         response.status_code = 200
     response.headers["Location"] = f"/v1/jobs/{taken.job.id}"
-    (view,) = await _views(request.app.state.store, [taken.job])
-    return view
+    waits = taken.job.state is JobState.QUEUED
+    return JobView.of(taken.job, taken.queue_position if waits else None)
 
 
 @router.get("/{job_id}", responses=responses(404), summary="Ask how a job stands")
@@ -202,6 +202,9 @@ async def _changed(request: Request, caller: Caller, action: str, job_id: str) -
 async def _views(store: JobStore, jobs: Collection[Job]) -> list[JobView]:
     """Return the jobs as their owner sees them."""
     positions: dict[str, int] = {}
-    if any(job.state is JobState.QUEUED for job in jobs):
+    waiting = [job for job in jobs if job.state is JobState.QUEUED]
+    if len(waiting) == 1:
+        positions[waiting[0].id] = await run_in_threadpool(store.queue_position, waiting[0])
+    elif waiting:
         positions = await run_in_threadpool(store.queue_positions)
     return [JobView.of(job, positions.get(job.id)) for job in jobs]

@@ -57,6 +57,11 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.nanny.pre-spawn-environ": {},
     # Jobs compute for minutes without letting the event loop in.
     "distributed.admin.tick.limit": "1h",
+    # Fifty ticks a second, and what they cost, tell nobody anything then.
+    "distributed.admin.tick.interval": "5s",
+    "distributed.admin.tick.cycle": "30s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.system-monitor.gil.enabled": False,
     "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.comm.timeouts.connect": f"{_TIMEOUT_S}s",
     "distributed.diagnostics.nvml": False,

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Reconciler"]
 
-_LEASE, _LEASE_S = "reconciler", 5.0
+_LEASE, _LEASE_S, _RENEW_S = "reconciler", 5.0, 2.0
+"""A lease is renewed when it is older: every write waits for the disk, as uploads do."""
 _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
 _ORPHAN_S = 3600.0
@@ -77,6 +78,9 @@ class Reconciler:
         self._in_flight: dict[str, tuple[Job, Future]] = {}
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
+        self._leased_at = 0.0
+        # Places without a job after the last look; None while one is under way.
+        self._free: int | None = None
         self._took_over = False
         self._started_at = time.time()
         self._trouble: str | None = None
@@ -109,8 +113,12 @@ class Reconciler:
         self._in_flight.clear()
 
     def notify(self) -> None:
-        """Look at once: there is a new job, or a place became free."""
-        self._wake.set()
+        """Look at once if a job could be started: there is a new one.
+
+        Where no place is free, whatever frees one wakes the thread; so nothing is missed.
+        """
+        if self._free != 0:
+            self._wake.set()
 
     @property
     def trouble(self) -> str | None:
@@ -148,6 +156,7 @@ class Reconciler:
                 self._wake.clear()
 
     def _tick(self) -> None:
+        self._free = None
         if self._cluster.is_own and not self._took_over:
             self._take_over()
         if not self._cluster.is_connected:
@@ -157,13 +166,21 @@ class Reconciler:
                 return  # it took its time; start no workers that must end at once
         self.slots = self._cluster.slots()
         self._say(None if self.slots else "no worker is connected to the scheduler")
-        self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
+        self._renew()
         if not self._has_lease:
+            self._free = 0
             self._in_flight.clear()  # whoever has the lease hands them over again
             return
         self._find_silent()
         self._collect()
         self._hand_over()
+
+    def _renew(self) -> None:
+        """Take the lease, or renew it in good time."""
+        now = time.monotonic()
+        if not self._has_lease or now - self._leased_at > _RENEW_S:
+            self._has_lease = self._store.lease(_LEASE, self._holder, _LEASE_S, time.time())
+            self._leased_at = now
 
     def _take_over(self) -> None:
         """Give back what ran when the service before us ended; its workers ended with it.
@@ -227,10 +244,11 @@ class Reconciler:
         """
         running = {job.id for job in self._store.in_state(JobState.RUNNING)}
         free = self.slots - len(running | set(self._in_flight))
-        if free <= 0:
-            return
-        for job in self._store.next_queued(free, exclude=list(self._in_flight)):
-            self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+        if free > 0:
+            for job in self._store.next_queued(free, exclude=list(self._in_flight)):
+                self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+                free -= 1
+        self._free = max(free, 0)
 
     def _give_back(self, job_id: str, attempt: int, reason: str, *, blame: bool = True) -> None:
         event = Lost(attempt, time.time(), reason, self._settings.max_attempts, blame)

@@ -21,6 +21,7 @@ from sqlalchemy import (
     Select,
     Subquery,
     and_,
+    bindparam,
     case,
     delete,
     func,
@@ -51,6 +52,57 @@ _NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
 _OVER = tuple(state.value for state in JobState if state.is_final)
 _CLOCKS_APART = 12
 """A lease that lasts for longer than so many times what it may was taken before clocks were set."""
+
+
+def _in_order() -> Subquery:
+    """Return id and place, from 1, of every waiting job in the order of dispatch."""
+    running = (
+        select(_JOBS.owner, func.count().label("jobs"))
+        .where(_JOBS.state == "running")
+        .group_by(_JOBS.owner)
+        .subquery("running")
+    )
+    age = (_JOBS.created_at, _JOBS.id)
+    own_turn = func.row_number().over(
+        partition_by=_JOBS.owner, order_by=(_JOBS.priority.desc(), *age)
+    )
+    waiting = (
+        select(*age, _JOBS.priority, (own_turn + func.coalesce(running.c.jobs, 0)).label("turn"))
+        .outerjoin_from(tables.jobs, running, running.c.owner == _JOBS.owner)
+        .where(_JOBS.state == "queued")
+        .subquery("waiting")
+    )
+    row = waiting.c
+    order = (row.priority.desc(), row.turn, row.created_at, row.id)
+    return select(row.id, func.row_number().over(order_by=order).label("place")).subquery("queue")
+
+
+# Statements of every upload and every look of the reconciler are made once: to put one together
+# takes longer than to execute it.
+_QUEUE = _in_order()
+_PLACE = select(_QUEUE.c.place).where(_QUEUE.c.id == bindparam("job_id"))
+_GET = select(tables.jobs).where(_JOBS.id == bindparam("job_id"))
+_IN_STATE = (
+    select(tables.jobs)
+    .where(_JOBS.state == bindparam("wanted"))
+    .order_by(_JOBS.created_at, _JOBS.id)
+)
+_SAME = (
+    select(tables.jobs)
+    .where(_JOBS.owner == bindparam("owner"), _JOBS.dedupe_key == bindparam("key"))
+    .where(_JOBS.state.in_(("done", *_NOT_OVER)))
+    .order_by(
+        case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state),
+        _JOBS.created_at.desc(),
+        _JOBS.id.desc(),
+    )
+    .limit(1)
+)
+_USAGE = select(
+    func.count().filter(_JOBS.state.in_(_NOT_OVER)),
+    func.sum(_JOBS.source_bytes + func.coalesce(_JOBS.output_bytes, 0)),
+).where(_JOBS.owner == bindparam("owner"))
+_ADD, _ADD_AUDIT = tables.jobs.insert(), tables.audit.insert()
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,9 +203,9 @@ class JobStore:
                 return same
             if limits is not None:
                 _check_quota(connection, job, limits)
-            connection.execute(tables.jobs.insert().values(_to_row(job)))
+            connection.execute(_ADD, _to_row(job))
             if audit_row is not None:
-                connection.execute(tables.audit.insert().values(audit_row))
+                connection.execute(_ADD_AUDIT, dict(audit_row))
             return job
 
         return write_together(self.engine, add)
@@ -223,8 +275,7 @@ class JobStore:
 
     def in_state(self, state: JobState) -> list[Job]:
         """Return all jobs in a state, oldest first."""
-        query = select(tables.jobs).where(_JOBS.state == state.value)
-        return self._jobs(query.order_by(_JOBS.created_at, _JOBS.id))
+        return self._jobs(_IN_STATE, {"wanted": state.value})
 
     def counts(self) -> dict[JobState, int]:
         """Return how many jobs are in each state."""
@@ -257,28 +308,25 @@ class JobStore:
         Higher priority first; then owners take turns, where a job that runs was its owner's turn;
         then the older first. Jobs to `exclude` take their owners' turns but are not returned.
         """
-        queue = _queue()
         query = (
             select(tables.jobs)
-            .join(queue, queue.c.id == _JOBS.id)
+            .join(_QUEUE, _QUEUE.c.id == _JOBS.id)
             .where(_JOBS.id.not_in(list(exclude)))
-            .order_by(queue.c.place)
+            .order_by(_QUEUE.c.place)
             .limit(limit)
         )
         return self._jobs(query)
 
     def queue_position(self, job: Job) -> int:
         """Return how many jobs will be started before this one; 0 if it does not wait."""
-        queue = _queue()
         with reading(self.engine) as connection:
-            place = connection.execute(select(queue.c.place).where(queue.c.id == job.id)).scalar()
+            place = connection.execute(_PLACE, {"job_id": job.id}).scalar()
         return int(place or 1) - 1
 
     def queue_positions(self) -> dict[str, int]:
         """Return the `queue_position` of every waiting job, by id."""
-        queue = _queue()
         with reading(self.engine) as connection:
-            rows = connection.execute(select(queue.c.id, queue.c.place)).all()
+            rows = connection.execute(select(_QUEUE.c.id, _QUEUE.c.place)).all()
         return {job_id: place - 1 for job_id, place in rows}
 
     # Changing
@@ -396,9 +444,9 @@ class JobStore:
 
     # Private
 
-    def _jobs(self, query: Select[Any]) -> list[Job]:
+    def _jobs(self, query: Select[Any], values: Mapping[str, Any] | None = None) -> list[Job]:
         with reading(self.engine) as connection:
-            return [_from_row(row) for row in connection.execute(query)]
+            return [_from_row(row) for row in connection.execute(query, values or {})]
 
     def _count(self, statement: Any) -> int:
         with writing(self.engine) as connection:
@@ -407,33 +455,10 @@ class JobStore:
 
 
 def _get(connection: Connection, job_id: str, *, for_update: bool = False) -> Job | None:
-    query = select(tables.jobs).where(_JOBS.id == job_id)
     # SQLite needs no lock of a row: its transaction has locked the database.
-    row = connection.execute(query.with_for_update() if for_update else query).one_or_none()
+    query = _GET.with_for_update() if for_update else _GET
+    row = connection.execute(query, {"job_id": job_id}).one_or_none()
     return None if row is None else _from_row(row)
-
-
-def _queue() -> Subquery:
-    """Return id and place, from 1, of every waiting job in the order of dispatch."""
-    running = (
-        select(_JOBS.owner, func.count().label("jobs"))
-        .where(_JOBS.state == "running")
-        .group_by(_JOBS.owner)
-        .subquery("running")
-    )
-    age = (_JOBS.created_at, _JOBS.id)
-    own_turn = func.row_number().over(
-        partition_by=_JOBS.owner, order_by=(_JOBS.priority.desc(), *age)
-    )
-    waiting = (
-        select(*age, _JOBS.priority, (own_turn + func.coalesce(running.c.jobs, 0)).label("turn"))
-        .outerjoin_from(tables.jobs, running, running.c.owner == _JOBS.owner)
-        .where(_JOBS.state == "queued")
-        .subquery("waiting")
-    )
-    row = waiting.c
-    order = (row.priority.desc(), row.turn, row.created_at, row.id)
-    return select(row.id, func.row_number().over(order_by=order).label("place")).subquery("queue")
 
 
 def _submission(owner: str, key: str) -> Select[Any]:
@@ -477,15 +502,7 @@ def _lead_to(connection: Connection, owner: str, key: str, values: dict[str, Any
 
 
 def _same(connection: Connection, owner: str, dedupe_key: str) -> Job | None:
-    order = case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state)
-    query = (
-        select(tables.jobs)
-        .where(_JOBS.owner == owner, _JOBS.dedupe_key == dedupe_key)
-        .where(_JOBS.state.in_(("done", *_NOT_OVER)))
-        .order_by(order, _JOBS.created_at.desc(), _JOBS.id.desc())
-        .limit(1)
-    )
-    row = connection.execute(query).one_or_none()
+    row = connection.execute(_SAME, {"owner": owner, "key": dedupe_key}).one_or_none()
     return None if row is None else _from_row(row)
 
 
@@ -497,9 +514,7 @@ def _stand_in_line(connection: Connection, owner: str) -> None:
 
 
 def _usage(connection: Connection, owner: str) -> tuple[int, int]:
-    not_over = func.count().filter(_JOBS.state.in_(_NOT_OVER))
-    kept = func.sum(_JOBS.source_bytes + func.coalesce(_JOBS.output_bytes, 0))
-    jobs, size = connection.execute(select(not_over, kept).where(_JOBS.owner == owner)).one()
+    jobs, size = connection.execute(_USAGE, {"owner": owner}).one()
     return int(jobs), int(size or 0)
 
 

@@ -38,8 +38,11 @@ class PinnedMachine(BaseModel):
     warnings: tuple[str, ...] = ()
 
     def write(self, file: Path) -> None:
-        """Write it to a file of the caller's own, which `Storage.put` then keeps for good."""
-        file.write_text(document_text(self), encoding="utf-8")
+        """Write it to a file of the caller's own, and wait for the disk."""
+        with file.open("w", encoding="utf-8") as opened:
+            opened.write(document_text(self))
+            opened.flush()
+            os.fsync(opened.fileno())
 
     @classmethod
     def read(cls, file: Path, name: str) -> PinnedMachine:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +44,12 @@ class Storage(Protocol):
         """Move a local file to `key`; it is durable when this returns.
 
         `file` is gone afterwards. What lay at `key` is replaced at once.
+        """
+
+    def put_all(self, files: Mapping[str, Path]) -> None:
+        """Move local files to their keys, as `put` does; quicker than one after the other.
+
+        If an error is raised, some may be there.
         """
 
     def local(self, key: str) -> AbstractContextManager[Path]:

@@ -7,7 +7,7 @@ import errno
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from service.storage.base import Stat, StorageError
@@ -35,20 +35,35 @@ class LocalStorage:
     def __init__(self, root: Path) -> None:
         self._root = root
         with _explained():
-            _make_folder(root / _FRESH)
+            for folder in _make_folder(root / _FRESH):
+                _sync(folder)
             delete_leftovers(root / _FRESH, "*")
 
     def put(self, key: str, file: Path) -> None:
         """Move a local file to `key`; see `Storage.put`."""
-        target = self._path(key)
+        self.put_all({key: file})
+
+    def put_all(self, files: Mapping[str, Path]) -> None:
+        """Move local files to their keys; see `Storage.put_all`.
+
+        First the contents reach the disk, then the names; all names together, because a file system
+        with a journal writes it once for whatever changed before.
+        """
+        targets = {self._path(key): file for key, file in files.items()}
+        changed: set[Path] = set()
         with _explained():
-            _sync(file)
-            try:
-                self._publish(file, target)
-            except OSError as error:
-                if error.errno != errno.EXDEV:
-                    raise
-                self._copy(file, target)  # from another disk
+            for file in targets.values():
+                _sync(file)
+            for target, file in targets.items():
+                try:
+                    changed |= self._publish(file, target)
+                except OSError as error:
+                    if error.errno != errno.EXDEV:
+                        raise
+                    changed |= self._copy(file, target)  # from another disk
+            for folder in changed:
+                with contextlib.suppress(FileNotFoundError):  # deleted meanwhile
+                    _sync(folder)
 
     @contextlib.contextmanager
     def local(self, key: str) -> Iterator[Path]:
@@ -105,9 +120,11 @@ class LocalStorage:
             raise FileNotFoundError(errno.ENOENT, "there is no such file in the storage", key)
         return path
 
-    def _publish(self, file: Path, target: Path) -> None:
+    def _publish(self, file: Path, target: Path) -> set[Path]:
+        """Give a file its name; return the folders with new names, which are to be synced."""
+        changed = {target.parent}
         for attempt in range(_ATTEMPTS):
-            _make_folder(target.parent)
+            changed |= _make_folder(target.parent)
             try:
                 file.replace(target)
             except FileNotFoundError:
@@ -115,31 +132,33 @@ class LocalStorage:
                 if attempt == _ATTEMPTS - 1 or not file.exists():
                     raise
             else:
-                _sync(target.parent)
-                return
+                break
+        return changed
 
-    def _copy(self, file: Path, target: Path) -> None:
+    def _copy(self, file: Path, target: Path) -> set[Path]:
         handle, name = tempfile.mkstemp(dir=self._root / _FRESH)
         os.close(handle)
         fresh = Path(name)
         try:
             shutil.copyfile(file, fresh)
             _sync(fresh)
-            self._publish(fresh, target)
+            changed = self._publish(fresh, target)
         except BaseException:
             fresh.unlink(missing_ok=True)
             raise
         file.unlink()
+        return changed
 
 
-def _make_folder(folder: Path) -> None:
-    """Make a folder and those above it, each durable in the one above."""
+def _make_folder(folder: Path) -> set[Path]:
+    """Make a folder and those above it; return those with new names."""
     if folder.is_dir():
-        return
+        return set()
+    changed = {folder.parent}
     if folder.parent != folder:
-        _make_folder(folder.parent)
+        changed |= _make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
-    _sync(folder.parent)
+    return changed
 
 
 def _sync(path: Path) -> None:

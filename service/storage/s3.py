@@ -6,7 +6,7 @@ import contextlib
 import errno
 import tempfile
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,6 +73,11 @@ class S3Storage:
                 max_concurrency=_PARTS_AT_ONCE,
             )
         file.unlink()
+
+    def put_all(self, files: Mapping[str, Path]) -> None:
+        """Upload local files; see `Storage.put_all`."""
+        for key, file in files.items():
+            self.put(key, file)
 
     @contextlib.contextmanager
     def local(self, key: str) -> Iterator[Path]:

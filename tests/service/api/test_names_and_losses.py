@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -55,15 +56,15 @@ def test_long_names_are_kept_short(client: TestClient):
 def test_a_slow_storage_leaves_threads_to_others(
     client: TestClient, monkeypatch: pytest.MonkeyPatch
 ):
-    put, goes_on = client.app.state.storage.put, threading.Event()
+    put_all, goes_on = client.app.state.storage.put_all, threading.Event()
     waiting = threading.Semaphore(0)
 
-    def slow(key: str, file: Path) -> None:
+    def slow(files: Mapping[str, Path]) -> None:
         waiting.release()
         goes_on.wait()
-        put(key, file)
+        put_all(files)
 
-    monkeypatch.setattr(client.app.state.storage, "put", slow)
+    monkeypatch.setattr(client.app.state.storage, "put_all", slow)
     with ThreadPoolExecutor(30) as threads:
         answers = [threads.submit(post, client, b"G1 X%d" % n, "&fresh=true") for n in range(30)]
         try:

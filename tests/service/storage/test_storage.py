@@ -71,6 +71,17 @@ def test_what_is_put_can_be_read_in_part_and_as_a_file(storage: Storage, tmp_pat
     assert storage.stat(key).size_bytes == len(big)
 
 
+def test_several_are_put_at_once(storage: Storage, tmp_path: Path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    one.write_bytes(b"1")
+    two.write_bytes(b"2")
+    storage.put_all({"jobs/a/deep/one": one, "jobs/a/two": two})
+    assert content(storage, "jobs/a/deep/one") == b"1"
+    assert content(storage, "jobs/a/two") == b"2"
+    assert not one.exists()
+    assert not two.exists()
+
+
 def test_what_is_missing_is_not_found(storage: Storage):
     with pytest.raises(FileNotFoundError):
         storage.stat("jobs/none/x")
