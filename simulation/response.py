@@ -58,19 +58,22 @@ class PlantStream:
             axis.state[:] = 0.0
         self._origin = None
 
-    def push(self, u_mm: Array) -> Array:
-        """Return the positions that answer the command block `u_mm`, shape (axes, n)."""
-        u = np.ascontiguousarray(u_mm, dtype=np.float64)
+    def push(self, u_mm: Array, out: Array | None = None) -> Array:
+        """Return the positions that answer the command block `u_mm`, shape (axes, n).
+
+        They are written to `out`, if that is given.
+        """
+        u = np.asarray(u_mm, dtype=np.float64)
         if u.ndim != 2 or len(u) != len(self._axes):
             raise ValueError(f"command of shape {u.shape}, expected ({len(self._axes)}, n)")
-        y = np.empty_like(u)
+        y = np.empty(u.shape) if out is None else out
         if u.shape[1] == 0:
             return y
         if self._origin is None:
             # Counting from the start keeps digits: the response of a shift is that shift.
             self._origin = u[:, 0].copy()
         for axis, origin, row_u, row_y in zip(self._axes, self._origin, u, y, strict=True):
-            axis.push(row_u, float(origin), row_y)
+            axis.push(np.ascontiguousarray(row_u), float(origin), row_y)
         return y
 
 

@@ -78,30 +78,35 @@ class MachineStream:
             stream.push(self._past)
             self._streams.append(stream)
 
-    def push(self, u_mm: Array, path_mm: Array) -> Array:
+    def push(self, u_mm: Array, path_mm: Array, out: Array | None = None) -> Array:
         """Return the positions that answer a command, shape (2, n).
 
         Parameters
         ----------
         u_mm, path_mm : ndarray, shape (2, n)
             The command, and the planned positions that weigh the plants.
+        out : ndarray, shape (2, n), optional
+            Where the answer is written to.
         """
         received = self._ripple.received_mm(u_mm)
         if self._remembered:
             past = np.concatenate([self._past, received], axis=1)
             self._past = past[:, -self._remembered :].copy()
-        moved = self._answer(received, path_mm)
-        return moved + self._ripple.added_mm(path_mm) if self._machine.ripple else moved
+        moved = np.empty(u_mm.shape) if out is None else out
+        self._answer(received, path_mm, moved)
+        if self._machine.ripple:
+            moved += self._ripple.added_mm(path_mm)
+        return moved
 
     def _plant(self, axis: PlantSetSpec) -> DiscretePlant:
         if self._member is None:
             return discretise(axis.nominal, self._dt_s)
         return plant_set(axis, self._dt_s).members[self._member]
 
-    def _answer(self, u_mm: Array, path_mm: Array) -> Array:
+    def _answer(self, u_mm: Array, path_mm: Array, out: Array) -> None:
         if len(self._streams) == 1:
-            return self._streams[0].push(u_mm)
-        blended = u_mm.copy()
+            self._streams[0].push(u_mm, out)
+            return
+        out[:] = u_mm
         for share, stream in zip(self._grid.weights(path_mm), self._streams, strict=True):
-            blended += share * (stream.push(u_mm) - u_mm)
-        return blended
+            out += share * (stream.push(u_mm) - u_mm)

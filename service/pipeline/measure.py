@@ -206,9 +206,9 @@ class Measurement:
             "after": shaped.executed_mm,
             "shaper": shaped.command,
         }
-        answers = np.stack(
-            [self._streams[n].push(commands[n], shaped.path_mm) for n in self._names]
-        )
+        answers = np.empty((len(self._names), *shaped.path_mm.shape))
+        for name, answer in zip(self._names, answers, strict=True):
+            self._streams[name].push(commands[name], shaped.path_mm, answer)
         self._spectra.add(shaped.path_mm, answers, shaped.extruding)
         if self._tracer is not None:
             self._tracer.wait(shaped.executed_mm, answers)
