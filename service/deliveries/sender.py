@@ -241,7 +241,7 @@ class Sender:
         if state == "done":
             told = what_started(printer, reply) if starts else None
             if job.print_after and unsafe:
-                told = "uploaded, but not started, because it would be unsafe"
+                told = "uploaded, but not started, because it may be unsafe"
             elif job.print_after and late:
                 told = (
                     "uploaded, but not started: it was done more than "
@@ -252,7 +252,10 @@ class Sender:
         return state, error
 
     def _looked_at(self, printer: Printer, job: Job) -> tuple[list[str], list[str]]:
-        """Return what to mind of a printer, and what makes a print on it unsafe."""
+        """Return what to mind of a printer, and what makes a print on it unsafe.
+
+        An OctoPrint cannot tell: what is asked for there is done.
+        """
         if self._checker is None or printer.kind != "moonraker":
             return [], []
         try:
@@ -260,7 +263,8 @@ class Sender:
             method = str(job.options.get("method", "fbf"))
             found = self._checker.check(printer, machine, method=method).findings
         except (PrinterUnknown, ModelError) as error:
-            return [f"the printer was not compared with its machine: {error}"], []
+            # Whether its limits and macros are what the file needs is not known then.
+            return [], [f"the printer was not compared with its machine: {error}"]
         return (
             [finding.text for finding in found if not finding.unsafe],
             [finding.text for finding in found if finding.unsafe],

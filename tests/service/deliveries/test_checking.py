@@ -268,7 +268,9 @@ def test_a_printer_that_is_off_and_an_octoprint(tmp_path: Path):
 # When a result is handed over
 
 
-def delivered(tmp_path: Path, status: dict[str, Any], **fields: Any) -> tuple[Any, list[Any]]:
+def delivered(
+    tmp_path: Path, status: dict[str, Any] | None, **fields: Any
+) -> tuple[Any, list[Any]]:
     with moonraker(status=status, key="k1") as server:
         file = tmp_path / "printers.toml"
         file.write_text(
@@ -305,8 +307,14 @@ def test_what_is_unsafe_is_uploaded_and_not_started(tmp_path: Path):
     _kinematics(status)
     delivery, [upload] = delivered(tmp_path, status, print_after=True)
     assert (delivery.state, upload.parts()["print"][1]) == ("done", b"false")
-    assert delivery.error.startswith("uploaded, but not started, because it would be unsafe; ")
+    assert delivery.error.startswith("uploaded, but not started, because it may be unsafe; ")
     assert "limited_cartesian" in delivery.error
+
+
+def test_a_printer_that_does_not_answer_is_sent_its_file_and_nothing_more(tmp_path: Path):
+    delivery, [upload] = delivered(tmp_path, None, print_after=True)
+    assert (delivery.state, upload.parts()["print"][1]) == ("done", b"false")
+    assert "was not compared with its machine" in delivery.error
 
 
 # Over HTTP, and on the command line

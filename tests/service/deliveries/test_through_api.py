@@ -8,17 +8,20 @@ from pathlib import Path
 
 from starlette.testclient import TestClient
 
+from models.store import load_machine
 from service.api import create_app
 from service.deliveries.webhooks import verify
 from service.settings import Settings
 from tests.service.deliveries.listeners import Listener, moonraker, until, uploads
 from tests.service.deliveries.places import SECRET
+from tests.service.deliveries.recorded_printer import status_of
 from tests.service.runners import pretend
 
 
 def test_a_slicers_upload_reaches_the_printer(tmp_path: Path):
     printers = tmp_path / "printers.toml"
-    with Listener() as listener, moonraker(key="k1") as server:
+    status = status_of(load_machine("ender3"))
+    with Listener() as listener, moonraker(key="k1", status=status) as server:
         printers.write_text(
             f"[printer.voron]\nkind = 'moonraker'\nurl = '{server.url}'\napi_key = 'k1'\n"
             "machine = 'ender3'\nmethod = 'none'\nstart = true\n"
