@@ -194,9 +194,9 @@ class PreviewFbf:
         if n > 2:
             largest = max(one.mean_square for one in asked)
             rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
-        accel_limit = self.accel_limit_mm_s2(y_d_mm)
+        accel_limit = self._accel_limit_mm_s2(asked)
         tasks = [
-            AxisTask(path, weight, stops, self._bounds(i, path, accel_limit), rms_limit)
+            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limit), rms_limit)
             for i, path in enumerate(y_d_mm)
         ]
         found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
@@ -211,18 +211,21 @@ class PreviewFbf:
 
     def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
         """Acceleration that the command of a path (2, n) may ask for."""
+        return self._accel_limit_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm])
+
+    def _accel_limit_mm_s2(self, asked: list[Extremes]) -> float:
         ceiling = self._limits.accel_mm_s2
-        path_accel = max(Extremes.of(p, p[0], p[0]).accel for p in y_d_mm) / self._dt_s**2
+        path_accel = max(one.accel for one in asked) / self._dt_s**2
         return min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
 
-    def _bounds(self, i: int, path: Array, accel_limit: float) -> Bounds:
+    def _bounds(self, i: int, asked: Extremes, accel_limit: float) -> Bounds:
         travel, dt = self._travel[i], self._dt_s
         return Bounds(
             accel=accel_limit * dt**2,
             speed=self._limits.velocity_mm_s * dt,
             # The path itself may touch the ends of the travel, or be judged elsewhere.
-            low_mm=min(travel.min_mm, float(path.min())),
-            high_mm=max(travel.max_mm, float(path.max())),
+            low_mm=min(travel.min_mm, asked.low_mm),
+            high_mm=max(travel.max_mm, asked.high_mm),
         )
 
     def _ladder(self, axis: PreviewAxis, task: AxisTask) -> tuple[AxisCommand, int, frozenset[int]]:
