@@ -17,6 +17,7 @@ from gcode.pieces import Passage, Piece
 from gcode.types import EventKind
 from models.machine import AxisTravel, Machine
 from models.store import load_machine
+from tests.fuzz.machines import machine_of
 from tests.gcode.cutting import HEAD, cut, pieces_of
 from tests.gcode.prints import made_up_print, polygon
 
@@ -299,3 +300,24 @@ def test_a_line_that_finds_the_height_stays(machine: Machine, chunk: int) -> Non
     pieces = [x.text for x in cut(text, machine, chunk=chunk) if isinstance(x, Piece)]
     assert b"".join(pieces).count(b"E") == 3
     assert not any(b"Z0" in piece for piece in pieces)
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("klipper", "SAVE_GCODE_STATE"),
+        ("klipper", "M221 S95"),
+        ("marlin", "G60 S1"),
+        ("marlin", "M221 S95"),
+        ("reprapfirmware", "G60 S1"),
+        ("reprapfirmware", "M120"),
+    ],
+)
+def test_lines_that_must_find_the_file_s_own_state(kind: str, line: str) -> None:
+    machine = machine_of(kind)
+    if kind == "marlin":
+        firmware = machine.firmware.model_copy(update={"saved_positions": True})
+        machine = machine.model_copy(update={"firmware": firmware})
+    *_, first, second = pieces_of(HEAD + f"G1 X70\nG1 X80\n{line}\nG1 X90\n", machine)
+    assert line.encode() not in first.text + second.text
+    assert first.moves.end_mm[-1, 0] == second.moves.start_mm[0, 0] == 80.0
