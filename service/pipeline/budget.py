@@ -13,9 +13,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcode.pieces import Piece
 from gcode.quickening import AS_SLICED, TRAVEL, FirstLayer, move_classes, quickened, top_limits
+from gcode.types import Moves
 from models.machine import Machine
 from service.pipeline.options import Options
 from service.pipeline.pace_search import PaceChoice, allowed_um, search
@@ -103,12 +105,16 @@ class SpeedBudget:
             tops,
         )
 
+    def classes(self, moves: Moves) -> NDArray[np.int32]:
+        """Return the class of every move; `AS_SLICED` of one that stays as it is."""
+        return move_classes(moves, self.first_layer)
+
     def paced(self, piece: Piece) -> Iterator[Piece]:
         """Yield a piece at its new pace, then gentler ones, and at last the piece as it came.
 
         What it would take with the shaper is counted.
         """
-        classes = move_classes(piece.moves, self.first_layer)
+        classes = self.classes(piece.moves)
         if self.shaper_paces.reached:
             slow = quickened(piece, classes, paces(self.shaper_paces.factors), self.machine)
             self._shaper_s += slow.phases.duration_s
@@ -127,10 +133,10 @@ class SpeedBudget:
 
     def correct(self, sums: Mapping[int, ErrorSum]) -> None:
         """Let paces follow the errors so far: down near the bound, up where there is room."""
-        used = {one: self._used(one, found) for one, found in sums.items()}
+        used = {one: self._used(one, sums[one]) for one in self._factors if one in sums}
         roomy = max(used.values(), default=0.0) < _FULL
         for one, factor in sorted(self._factors.items()):
-            if one not in sums:
+            if one not in used:
                 continue
             new = sums[one] - self._since[one] if one in self._since else sums[one]
             if new.seconds < _SURE_S:
@@ -138,7 +144,8 @@ class SpeedBudget:
             lately, wanted = self._used(one, new), factor
             if min(used[one] / _FULL, lately / _ROOM) > 1.0:
                 wanted = max(1.0, _SLOWER * factor)
-                if factor == 1.0 and min(used[one], lately) > _HELPLESS:
+                helpless = factor == 1.0 and min(used[one], lately) > _HELPLESS
+                if helpless and self._keeps_budget(one):
                     self._slow_others()
                     self._since[one] = sums[one]
             elif roomy and max(used[one], lately) < _ROOM:
@@ -155,7 +162,8 @@ class SpeedBudget:
 
     def milder(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
         """Return what the file is to be written with once more; None where it may stay."""
-        over = {one: self._used(one, found) for one, found in sums.items()}
+        kept = [one for one in self._factors if one in sums and self._keeps_budget(one)]
+        over = {one: self._used(one, sums[one]) for one in kept}
         over = {one: ratio for one, ratio in over.items() if ratio > _ABOVE}
         quicker = any(factor > 1.0 for factor in self.paces.factors.values())
         if not over or not quicker or self.attempt + 1 == _ATTEMPTS:
@@ -181,6 +189,10 @@ class SpeedBudget:
     def again(self) -> SpeedBudget:
         """Return the same as it was before anything was written."""
         return replace(self)
+
+    def _keeps_budget(self, one: int) -> bool:
+        """Tell whether a class keeps the budget at its own pace, in the samples."""
+        return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
     def _used(self, one: int, found: ErrorSum) -> float:
         """Return the part of its bound that an error of a class is."""
@@ -258,4 +270,6 @@ def _tops(samples: list[Sample], machine: Machine) -> Factors:
 def _name(one: int, names: Sequence[str]) -> str:
     if one == TRAVEL:
         return "travel"
+    if one == AS_SLICED:
+        return "all that stays as sliced"
     return names[one] if one >= 0 else "unnamed"

@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.quickening import AS_SLICED
 from models.machine import Machine
 from models.schedule import OperatingPoint
 from service.pipeline.layers import LayerTile
 from service.pipeline.measure import Measurement, MotionSamples, Trace
 from service.pipeline.result import Channel, GroupFigures
-from service.pipeline.set_errors import ErrorSum, SetErrors, error_classes
+from service.pipeline.set_errors import ErrorSum, SetErrors
 from service.pipeline.yardstick import BestShaper
 
 __all__ = ["BudgetMeasurement"]
@@ -58,15 +62,24 @@ class BudgetMeasurement(Measurement):
 
     def add(self, samples: MotionSamples) -> None:
         """Add motion that leaves as it came."""
-        self.add_pair(samples, samples)
+        self.add_pair(samples, samples, np.full(len(samples.moves), AS_SLICED, np.int32))
 
-    def add_pair(self, written: MotionSamples, sliced: MotionSamples) -> None:
-        """Add the motion of a piece as it is written, and as it was sliced."""
+    def add_pair(
+        self, written: MotionSamples, sliced: MotionSamples, classes: NDArray[np.int32]
+    ) -> None:
+        """Add the motion of a piece as it is written, and as it was sliced.
+
+        Parameters
+        ----------
+        written, sliced : MotionSamples
+        classes : ndarray of int32
+            What the errors of each of `written.moves` count for.
+        """
         super().add(written)
         self._sliced.add(sliced)
         if len(written):
-            classes = error_classes(written.moves)[written.row]
-            self._set.add(written.path_mm, written.executed_mm, written.extruding, classes)
+            of_sample = classes[written.row]
+            self._set.add(written.path_mm, written.executed_mm, written.extruding, of_sample)
 
     def jump(self) -> None:
         """Say that the position is lost: the machine stands still when motion goes on."""

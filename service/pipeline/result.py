@@ -138,7 +138,8 @@ class BudgetClass(_Figures):
     """How quick one class of moves became within a budget, and its error."""
 
     name: str
-    """The slicer's name of the feature, or `travel`."""
+    """The slicer's name of the feature, `travel`, or `all that stays as sliced`: the first layer,
+    and lines that leave as they came."""
     acceleration_factor: float
     """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
     shaper_acceleration_factor: float

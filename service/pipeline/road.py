@@ -390,7 +390,7 @@ class _Job:
         count = max(round(phases.duration_s / DT_S), 1)
         position, row = sample_phases(phases, (0.0, DT_S, count))
         sliced = self._samples(piece, row, position, position, _feeding(phases)[row])
-        self._pairs.add_pair(written, sliced)
+        self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
         self._budget.correct(self._pairs.sums())
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:

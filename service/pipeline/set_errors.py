@@ -7,15 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.quickening import AS_SLICED, TRAVEL
-from gcode.types import Moves
+from gcode.quickening import TRAVEL
 from models.machine import Machine
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
 from simulation.measures import ContourErrors, ContourMeter, GroupTally
 from simulation.scheduled import MachineStream
 
-__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors", "error_classes"]
+__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -60,15 +59,6 @@ class ErrorSum:
             return ClassError(0.0, 0.0)
         mean = max(float(np.max(self.squares_um2_s)), 0.0) / self.seconds
         return ClassError(float(np.sqrt(mean)), self.seconds)
-
-
-def error_classes(moves: Moves) -> Ints:
-    """Return what the errors of each move count for: its feature, or travel."""
-    way = moves.end_mm - moves.start_mm
-    travels = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] <= 0.0)
-    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
-    other = np.where(travels, TRAVEL, AS_SLICED)
-    return np.where(prints, moves.feature, other).astype(np.int32)
 
 
 class SetErrors:
