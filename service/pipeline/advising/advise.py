@@ -166,6 +166,7 @@ class _Job:
                 self._adviser,
                 self._before,
                 options.budget_um,
+                {f: error.rms_um for f, error in was.items()},
                 reading.levels,
                 lambda share: self._say("choosing", 0.3 + 0.3 * share),
                 shaped=shaped,

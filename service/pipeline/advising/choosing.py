@@ -46,6 +46,8 @@ _POINTS, _MEMBERS = 1000, 5
 _COARSE = 6
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
+_UNLIKE = 2.0
+"""How much more or less than the whole file samples may be said to err."""
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
@@ -134,6 +136,7 @@ def choose(
     adviser: Adviser,
     before: Shaping,
     budget_um: float | None,
+    whole_um: Mapping[int, float],
     levels: Sequence[tuple[int, OperatingPoint]],
     told: Told = lambda _share: None,
     *,
@@ -152,6 +155,8 @@ def choose(
         What the printer would shape with.
     budget_um : float, optional
         What every feature may err; None: what it erred before.
+    whole_um : mapping
+        What every feature erred in the whole file as it came.
     levels : sequence of (layer, OperatingPoint)
         Where the machine is from which layer on; more than one where plants follow a schedule.
     told : callable, optional
@@ -165,7 +170,7 @@ def choose(
     visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
     was = {f: max(um, 1e-3) for f, um in as_sliced.errors(before).items()}
     limits = _Limits(
-        {f: was[f] if budget_um is None else budget_um for f in features},
+        {f: _bound_um(was[f], whole_um.get(f, was[f]), budget_um) for f in features},
         has_budget=budget_um is not None,
     )
     choice = Choice(
@@ -447,6 +452,14 @@ def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:
             rows = (moves.feature == feature) & ~np.isnan(wanted)
             own[feature] = max(own.get(feature, 0.0), float(np.max(file[rows])))
     return own
+
+
+def _bound_um(sampled_um: float, whole_um: float, budget_um: float | None) -> float:
+    """Return what a feature may err in the samples, where it errs otherwise than in the file."""
+    if budget_um is None:
+        return sampled_um
+    ratio = sampled_um / max(whole_um, 1e-3)
+    return budget_um * min(max(ratio, 1.0 / _UNLIKE), _UNLIKE)
 
 
 def _bound(accel_mm_s2: float, *, visible: bool) -> Bound:
