@@ -1,9 +1,9 @@
 """Files made to be slow or large, at a size and at twice that size: CPU time and memory.
 
 Each file goes down the whole road in a process of its own that may not take more memory than
-``--limit-mb``. What is told is the CPU time of the second size over the first (2 is linear) and the
-peak of resident memory. MISS marks what is more than linear, too large, or ends in anything but a
-result or a `GcodeError`.
+``--limit-mb`` or more processor time than ``--limit-s``. What is told is the CPU time of the second
+size over the first (2 is linear) and the peak of resident memory. MISS marks what is more than
+linear, too large, or ends in anything but a result or a `GcodeError`.
 
     python benchmarks/hostile.py [NAME ...] [--scale .1] [--methods none,fbf] [--machine ender3]
         [--firmware marlin]
@@ -70,22 +70,24 @@ def measured(
             file.write(part)
     context = multiprocessing.get_context("fork")  # everything is compiled and loaded already
     here, there = context.Pipe(duplex=False)
-    process = context.Process(target=child, args=(there, source, method, machine, options.limit_mb))
+    process = context.Process(target=child, args=(there, source, method, machine, options))
     process.start()
     there.close()
     try:
-        answer = json.loads(here.recv()) if here.poll(options.timeout_s) else None
+        answer = json.loads(here.recv())
     except EOFError:
         answer = None
-    process.kill()
     process.join()
-    dead = {"outcome": f"DIED OR > {options.timeout_s} s", "cpu_s": float("nan"), "rss_mb": 0.0}
+    dead = {"outcome": f"DIED OR > {options.limit_s} s", "cpu_s": float("nan"), "rss_mb": 0.0}
     return answer or dead
 
 
-def child(there: Connection, source: Path, method: str, machine: Machine, limit_mb: float) -> None:
-    most = int(limit_mb * 1e6)
+def child(
+    there: Connection, source: Path, method: str, machine: Machine, options: argparse.Namespace
+) -> None:
+    most = int(options.limit_mb * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    resource.setrlimit(resource.RLIMIT_CPU, (options.limit_s, options.limit_s + 5))
     began = time.process_time()
     try:
         result = compensate_file(source, source.with_name("o"), machine, Options(method=method))
@@ -128,7 +130,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--machine", default="ender3")
     parser.add_argument("--firmware", choices=KINDS, help="another than the machine's own")
     parser.add_argument("--limit-mb", type=float, default=3000.0)
-    parser.add_argument("--timeout-s", type=float, default=600.0)
+    parser.add_argument("--limit-s", type=int, default=600, help="of processor time")
     return parser.parse_args()
 
 
