@@ -106,6 +106,8 @@ class GroupTally:
         before = max(self.lowest - low, 0)
         after = max(high - (self.lowest + len(self.count) - 1), 0)
         if before or after:
+            # Room for as many again: layers come one by one.
+            after = max(after, len(self.count)) if after else 0
             self.lowest -= before
             self.count = np.pad(self.count, (before, after))
             self.square_sum = np.pad(self.square_sum, ((0, 0), (before, after)))
