@@ -42,9 +42,10 @@ _GENTLER = (1.0, 0.6, 0.3)
 """Exponents of factors that are tried one after the other where no command can follow."""
 _SURE_S = 5.0
 """Errors of so much extruding time say something of a class."""
-_ATTEMPTS = 3
+_ATTEMPTS = 4
 """How often a file is written at most; the last time at its own paces."""
-_MILDER = 0.9
+_MILDER, _POWER = 0.9, 0.5
+"""Part of its bound that a class is brought to then, if errors rise with this power."""
 
 
 @dataclass(slots=True)
@@ -168,14 +169,17 @@ class SpeedBudget:
         quicker = any(factor > 1.0 for factor in self.paces.factors.values())
         if not over or not quicker or self.attempt + 1 == _ATTEMPTS:
             return None
-        factors = dict.fromkeys(self._factors, 1.0)
-        if self.attempt + 2 < _ATTEMPTS:
-            factors = {
-                one: min(factor, self.paces.factors[one]) for one, factor in self._factors.items()
-            }
-            for one in {*over, TRAVEL} & {*factors}:
-                ratio = over.get(one, max(over.values()))
-                factors[one] = max(1.0, _MILDER * factors[one] / ratio)
+        factors = {
+            one: min(factor, self.paces.factors[one]) for one, factor in self._factors.items()
+        }
+        if self.attempt + 2 == _ATTEMPTS:
+            factors = dict.fromkeys(factors, 1.0)
+        elif self.attempt > 0:
+            factors = {one: factor**0.5 for one, factor in factors.items()}
+        for one, ratio in over.items():
+            factors[one] = max(1.0, factors[one] * (_MILDER / ratio) ** (1.0 / _POWER))
+        if any(factors[one] == 1.0 for one in over) and TRAVEL in factors:
+            factors[TRAVEL] = max(1.0, _MILDER * factors[TRAVEL] / max(over.values()))
         return SpeedBudget(
             self.machine,
             self.budget_um,
