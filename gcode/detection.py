@@ -58,6 +58,7 @@ def _sign(dialect: str, weight: float, pattern: bytes, reason: str) -> _Sign:
     return _Sign(dialect, weight, re.compile(pattern, re.MULTILINE), reason)
 
 
+_MOVES = re.compile(rb"^(?:G[01] .*\n)+", re.MULTILINE)
 # Commands stand at the start of a line, behind blanks and a line number.
 _LINE = rb"^[ \t]*(?:N\d+[ \t]+)?"
 _SIGNS = (
@@ -165,7 +166,8 @@ def detect(head: bytes, tail: bytes = b"") -> Detection:
     head, tail : bytes
         The two ends of its text; a quarter of a megabyte of each is looked at.
     """
-    text = head[:_HEAD_BYTES] + b"\n" + tail[-_TAIL_BYTES:]
+    # Nearly all of it are moves, which no sign looks at.
+    text = _MOVES.sub(b"\n", head[:_HEAD_BYTES] + b"\n" + tail[-_TAIL_BYTES:])
     found = [sign for sign in _SIGNS if sign.pattern.search(text)]
     weights = dict.fromkeys(DIALECTS, 0.0)
     for sign in found:

@@ -22,6 +22,7 @@ from models.machine import Machine
 from models.operating import OperatingGrid, machine_at
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
+from service.pipeline._peak_kernels import peaks
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
@@ -154,8 +155,8 @@ class PieceCompensator:
         limit = self._machine.command.speed_step_mm_s
         tolerance = self._tolerance_mm
         # No step of speed larger than what the command itself asks for within a sample.
-        bend = np.diff(command[:2], 2)
-        step_mm_s = max(float(np.max(np.abs(bend), initial=0.0)) / timeline.dt_s, MIN_STEP_MM_S)
+        _, bend_mm = peaks(command)
+        step_mm_s = max(bend_mm / timeline.dt_s, MIN_STEP_MM_S)
         for _ in range(3):
             segments = fit_segments(
                 timeline,

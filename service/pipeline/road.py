@@ -32,6 +32,7 @@ from gcode.slicers.retiming import Retiming
 from gcode.types import EventKind, Events, Moves, Phases, rows_of
 from models.errors import ModelError
 from models.machine import Machine
+from service.pipeline._peak_kernels import peaks
 from service.pipeline.budget import SpeedBudget
 from service.pipeline.budget_measure import BudgetMeasurement
 from service.pipeline.clock import StageClock
@@ -639,11 +640,9 @@ class _Sums:
         if len(segments):
             rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
             self.peak_rate = max(self.peak_rate, float(rate.max()))
-        steps = np.diff(made.command_mm[:2])
-        speed2 = float(np.max(steps[0] ** 2 + steps[1] ** 2, initial=0.0)) / DT_S**2
-        self.peak_velocity = max(self.peak_velocity, float(np.sqrt(speed2)))
-        accel = float(np.max(np.abs(np.diff(steps)), initial=0.0)) / DT_S**2
-        self.peak_accel = max(self.peak_accel, accel)
+        step_mm, bend_mm = peaks(made.command_mm)
+        self.peak_velocity = max(self.peak_velocity, step_mm / DT_S)
+        self.peak_accel = max(self.peak_accel, bend_mm / DT_S**2)
         self.gap2 += float(gap @ gap)
         self.gap_count += len(gap)
         self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
