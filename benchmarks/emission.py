@@ -121,9 +121,8 @@ def watched(
     """Compensate a file on the watched road."""
     options = Options(tolerance_um=tolerance_um)
     with source.open("rb") as text, target.open("wb") as written:
-        job = Watched(
-            text, written, machine, options, cache, progress=None, layers=None, trace=None
-        )
+        unwatched = {"progress": None, "layers": None, "trace": None, "budget": None}
+        job = Watched(text, written, machine, options, cache, **unwatched)
         job.prepare()
         return job, job.run(source.name, SlicerFacts())
 
