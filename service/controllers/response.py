@@ -45,6 +45,8 @@ _MOST_TICKS = 3e7
 _POINTS = 400
 _PERIODS_SHOWN = 12
 _PART_SAMPLES = 3000
+_LATEST_S = 60.0
+"""Of the beginning of a disturbance's last part."""
 _HEARD_S = 1e-3
 _HARMONICS = 5
 _SEED = 0
@@ -217,8 +219,18 @@ def told(disturbance: Disturbance) -> str:
 
 
 def _check(disturbance: Disturbance) -> None:
-    if isinstance(disturbance, Switched) and not disturbance.parts:
-        raise DesignError("a switched disturbance needs at least one part")
+    if isinstance(disturbance, Switched):
+        count, starts = len(disturbance.parts), disturbance.start_s
+        if not count or len(starts) != count:
+            raise DesignError(
+                f"a switched disturbance of {count} parts with {len(starts)} times (start_s): give "
+                "at least one part, and a time for each"
+            )
+        if starts[-1] > _LATEST_S:
+            raise DesignError(
+                f"the last part of the disturbance begins at {starts[-1]:g} s; the latest possible "
+                f"is {_LATEST_S:g} s"
+            )
     if isinstance(disturbance, Wideband):
         sizes = [disturbance.floor_rms, *(peak.rms for peak in disturbance.peaks)]
     elif isinstance(disturbance, Periodic):

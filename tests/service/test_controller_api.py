@@ -80,6 +80,22 @@ def test_refusals(
     assert answer.json().get("reason") == reason
 
 
+@pytest.mark.parametrize(
+    ("starts", "parts", "words"),
+    [
+        ([], [[{"f_hz": 500.0}]], "1 parts with 0 times"),
+        ([], [], "0 parts with 0 times"),
+        ([0.0, 1e300], [[{"f_hz": 500.0}], []], "1e+300 s"),
+    ],
+)
+def test_disturbances_that_cannot_be(
+    client: TestClient, starts: list[float], parts: list[Any], words: str
+) -> None:
+    disturbance = {"kind": "switched", "start_s": starts, "parts": parts}
+    body = {"method": "fmsdob-adaptive", "tones": 1, "disturbance": disturbance}
+    assert_problem(client.post(WHERE, json=body), 422, words)
+
+
 def test_no_file_is_reached(client: TestClient, tmp_path: Path) -> None:
     file = tmp_path / "x.json"
     file.write_text(load_loop("galvo-40khz").model_dump_json())
