@@ -3,6 +3,8 @@
 Figures (SVG) are drawn from what the programs compute and from the tables of docs/benchmarks.md;
 screenshots (WebP) show our own page and our own reports, in Debian's Chromium. What was computed
 stays in the folder and is used again. Needs the dependency groups `docs` and `test`; some minutes.
+
+The screenshots of slicers are made by docs/make_slicer_images.sh.
 """
 
 from __future__ import annotations
