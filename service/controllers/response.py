@@ -45,6 +45,7 @@ _MOST_TICKS = 3e7
 _POINTS = 400
 _PERIODS_SHOWN = 12
 _PART_SAMPLES = 3000
+_SLOWEST_HZ = 1e-3
 _LATEST_S = 60.0
 """Of the beginning of a disturbance's last part."""
 _HEARD_S = 1e-3
@@ -238,6 +239,11 @@ def _check(disturbance: Disturbance) -> None:
     else:
         parts = disturbance.parts if isinstance(disturbance, Switched) else (disturbance.tones,)
         sizes = [tone.amplitude for part in parts for tone in part]
+    slowest_hz = min(_frequencies(disturbance), default=_SLOWEST_HZ)
+    if slowest_hz < _SLOWEST_HZ:
+        raise DesignError(
+            f"the disturbance has {slowest_hz:g} Hz; the lowest possible is {_SLOWEST_HZ:g} Hz"
+        )
     if sum(map(abs, sizes)) > _LARGEST_SIZE:
         raise DesignError(
             f"the disturbance is larger than {_LARGEST_SIZE:g}; give it in the machine's unit"

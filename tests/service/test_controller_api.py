@@ -96,6 +96,11 @@ def test_disturbances_that_cannot_be(
     assert_problem(client.post(WHERE, json=body), 422, words)
 
 
+def test_a_disturbance_without_end(client: TestClient) -> None:
+    slow = {"kind": "periodic", "f_hz": 5e-324, "amplitudes": [1.0]}
+    assert_problem(client.post(WHERE, json=FMSDOB | {"disturbance": slow}), 422, "0.001 Hz")
+
+
 def test_no_file_is_reached(client: TestClient, tmp_path: Path) -> None:
     file = tmp_path / "x.json"
     file.write_text(load_loop("galvo-40khz").model_dump_json())
