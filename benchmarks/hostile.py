@@ -1,9 +1,10 @@
 """Files made to be slow or large, at a size and at twice that size: CPU time and memory.
 
 Each file goes down the whole road in a process of its own that may not take more memory than
-``--limit-mb`` or more processor time than ``--limit-s``. What is told is the CPU time of the second
-size over the first (2 is linear) and the peak of resident memory. MISS marks what is more than
-linear, too large, or ends in anything but a result or a `GcodeError`.
+``--limit-mb`` or more processor time than ``--limit-s``; one that only waits is killed after
+``--wall-s``. What is told is the CPU time of the second size over the first (2 is linear) and the
+peak of resident memory. MISS marks what is more than linear, too large, or ends in anything but a
+result or a `GcodeError`.
 
     python benchmarks/hostile.py [NAME ...] [--scale .1] [--methods none,fbf] [--machine ender3]
         [--firmware marlin]
@@ -14,6 +15,7 @@ The full sizes of `tests.fuzz.hostile` are the second ones of ``--scale .5``.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import resource
@@ -73,13 +75,17 @@ def measured(
     process = context.Process(target=child, args=(there, source, method, machine, options))
     process.start()
     there.close()
-    try:
-        answer = json.loads(here.recv())
-    except EOFError:
-        answer = None
+    dead = f"DIED OR > {options.limit_s} s"
+    answer = None
+    if here.poll(options.wall_s):
+        with contextlib.suppress(EOFError):
+            answer = json.loads(here.recv())
+    else:
+        dead = f"HUNG: killed after {options.wall_s} s"
+        process.kill()
     process.join()
-    dead = {"outcome": f"DIED OR > {options.limit_s} s", "cpu_s": float("nan"), "rss_mb": 0.0}
-    return answer or dead
+    here.close()
+    return answer or {"outcome": dead, "cpu_s": float("nan"), "rss_mb": 0.0}
 
 
 def child(
@@ -131,6 +137,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--firmware", choices=KINDS, help="another than the machine's own")
     parser.add_argument("--limit-mb", type=float, default=3000.0)
     parser.add_argument("--limit-s", type=int, default=600, help="of processor time")
+    parser.add_argument("--wall-s", type=int, default=3600, help="for a process that only waits")
     return parser.parse_args()
 
 
