@@ -1,8 +1,9 @@
 """Cut an interpreted file into pieces to compensate and passages that leave as they came.
 
 A *piece* starts and ends with a move of X or Y, at rest, with X and Y known throughout; nothing in
-it stops the machine but its own retractions and Z hops. It lasts at most a minute, so that memory
-does not grow with the file and a fault costs little. Everything else is a *passage*.
+it stops the machine but its own retractions and Z hops. It lasts at most a minute and has at most
+so many moves and lines, so that memory does not grow with the file and a fault costs little.
+Everything else is a *passage*.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ S = TypeVar("S", Moves, Events)
 WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of its way more than the second, is
 one of the extruder: X and Y creep, and would be cut into thousands of segments."""
+
+_MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
+"""What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
+moves of a micrometre it would have millions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +250,9 @@ class Splitter:
             barriers = events.move_index[self._barriers(events)]
             stops = np.concatenate([barriers[barriers > 0], np.flatnonzero(self._raw), [count]])
             end = int(stops.min())
-            closed = final or len(stops) > 1
+            most = self._most_moves(moves, events)
+            closed = final or len(stops) > 1 or most < count
+            end = min(end, most)
             if not closed and _shortest_s(moves) < self._longest_s:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
@@ -273,6 +280,15 @@ class Splitter:
             else:
                 phases = plan_moves(rows_of(moves, slice(0, last)), limits, self._machine)
             yield self._piece(last, phases)
+
+    def _most_moves(self, moves: Moves, events: Events) -> int:
+        """Return how many of the moves a piece may have: all, or less where too much is held."""
+        count, until = len(moves), self._text_offset + _MOST_BYTES
+        if len(events) > _MOST_EVENTS:
+            until = min(until, int(events.byte_start[_MOST_EVENTS]))
+        if count > _MOST_MOVES:
+            until = min(until, int(moves.byte_end[_MOST_MOVES - 1]))
+        return int(np.searchsorted(moves.byte_start, until))
 
     def _piece(self, last: int, phases: Phases) -> Piece:
         assert self._moves is not None

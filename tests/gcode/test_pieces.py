@@ -172,6 +172,26 @@ def test_one_move_longer_than_a_piece(machine: Machine) -> None:
     assert text_of(items) == text.encode()
 
 
+@pytest.mark.parametrize(
+    ("between", "kept"),
+    [
+        (b"G1 X60.001 E.0001\nG1 X60 E.0001\n" * 17_000, 32_768),
+        (b"; nothing\n" * 70_000, 0),
+        (b";" + b"-" * 9_000_000 + b"\n", 0),
+    ],
+    ids=["moves", "lines", "bytes"],
+)
+def test_what_a_piece_holds_is_bounded(machine: Machine, between: bytes, kept: int) -> None:
+    data = HEAD.encode() + b"G1 X70\nG1 X60\n" + between + b"G1 X80\nG1 Y60\nG1 X85\n"
+    items, whole = (cut(data, machine, chunk=chunk) for chunk in (1 << 18, 1 << 24))
+    check(items, data)
+    assert [item.text for item in items] == [item.text for item in whole]
+    pieces = [item for item in items if isinstance(item, Piece)]
+    assert len(pieces) == 3  # one in the head
+    assert len(pieces[1].moves) == max(kept, 2)
+    assert pieces[1].text.startswith(b"G1 X70\n")
+
+
 def test_states_around_items(machine: Machine) -> None:
     text = HEAD + "M204 S900\nG1 X80 F1800 E1\nG91\nG1 X2\nM204 S700\nG28\nG1 X9\n"
     items = cut(text.encode(), machine)
