@@ -10,11 +10,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from service.farm.output import Figures, Trouble
+from service.processes import loaded_context
 
 if TYPE_CHECKING:
     from models.machine import Machine
@@ -65,7 +66,7 @@ class Lane:
     """One process; it is started when it is needed, and again if it dies."""
 
     def __init__(self) -> None:
-        self._process: SpawnProcess | None = None
+        self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
     def do(self, task: Task, stopping: threading.Event) -> Made:
@@ -115,13 +116,14 @@ class Lane:
     def _connect(self) -> Connection:
         if self._connection is None or self._process is None or not self._process.is_alive():
             self.end()
-            context = multiprocessing.get_context("spawn")
+            context = loaded_context()
             self._connection, theirs = context.Pipe()
-            self._process = context.Process(
-                target=_serve, args=(theirs,), name="stillpath-farm", daemon=True
-            )
-            self._process.start()
-            theirs.close()  # so that its death closes the pipe
+            with theirs:  # closed here, so that its death closes the pipe
+                process = context.Process(
+                    target=_serve, args=(theirs,), name="stillpath-farm", daemon=True
+                )
+                process.start()
+            self._process = process
         return self._connection
 
     def _reason_of_death(self) -> str:

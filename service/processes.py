@@ -1,0 +1,31 @@
+"""Processes that compensate are forked from one that has loaded the libraries already.
+
+To load numba, scipy and our own modules takes longer than many a print does. One process loads
+them, and all others begin as its copies: they start at once, and share its memory.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
+__all__ = ["METHOD", "loaded_context"]
+
+METHOD = "forkserver" if sys.platform == "linux" else "spawn"
+"""Windows has no fork, and on macOS libraries of the system do not bear one."""
+
+
+def loaded_context() -> ForkServerContext | SpawnContext:
+    """Return what starts such processes; the first start loads the libraries.
+
+    On Windows and macOS each process loads them itself.
+    """
+    if sys.platform != "linux":
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["service.preloaded"])
+    return context
