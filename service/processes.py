@@ -19,13 +19,18 @@ METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 """Windows has no fork, and on macOS libraries of the system do not bear one."""
 
 
-def loaded_context() -> ForkServerContext | SpawnContext:
+def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
     """Return what starts such processes; the first start loads the libraries.
 
     On Windows and macOS each process loads them itself.
+
+    Parameters
+    ----------
+    *more : str
+        Modules to be loaded too.
     """
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["service.preloaded"])
+    context.set_forkserver_preload(["service.preloaded", *more])
     return context

@@ -27,6 +27,7 @@ import structlog
 from service.jobs.preload import quiet_dask
 from service.jobs.state import Job
 from service.jobs.worker import Runner, run_job
+from service.processes import METHOD, loaded_context
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.terminate": False,
     "distributed.worker.profile.enabled": False,
     "distributed.worker.preload": ["service.jobs.preload"],
+    "distributed.worker.multiprocessing-method": METHOD,
     # They die with us.
     "distributed.worker.daemon": True,
     # `service.environment` knows better.
@@ -206,8 +208,10 @@ def prepare_dask() -> None:
     import dask
 
     dask.config.set(DASK_SETTINGS)
-    import distributed  # noqa: F401  it sets up logs of its own
+    from distributed.utils import get_mp_context  # its import sets up logs
 
+    get_mp_context()  # it chooses once what is loaded beforehand; what is chosen last counts
+    loaded_context("distributed", "service.jobs.worker")
     quiet_dask()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -11,6 +12,8 @@ import time
 from pathlib import Path
 
 import pytest
+
+from service.processes import METHOD, loaded_context
 
 ROOT = Path(__file__).parents[3]
 PRINT = "G28\n" + "".join(f"G1 X{20 + 15 * (n % 2)} Y{20 + 5 * n} E{n} F6000\n" for n in range(20))
@@ -109,3 +112,19 @@ def test_processes_end_with_their_parent(files):
         process.communicate(timeout=600)
     assert process.returncode == 0
     assert not list((files.parent / "out/.stillpath/work").iterdir())
+
+
+@pytest.mark.skipif(METHOD != "forkserver", reason="processes are no copies here")
+def test_processes_begin_with_the_libraries_loaded():
+    ours, theirs = multiprocessing.Pipe()
+    with ours, theirs:
+        process = loaded_context().Process(target=tell_loaded, args=(theirs,))
+        process.start()
+        loaded = ours.recv()
+        process.join()
+        process.close()
+    assert {"numba", "scipy", "service.pipeline.road", "service.reports"} <= loaded
+
+
+def tell_loaded(connection):
+    connection.send(set(sys.modules))
