@@ -662,6 +662,9 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
     None
         The position becomes unknown here.
     """
+    if isinstance(passage, Piece):
+        yield passage.phases
+        return
     events = passage.events
     done = 0
     for k in [*np.flatnonzero(stops(events)).tolist(), None]:
