@@ -15,24 +15,38 @@ Array = NDArray[np.float64]
 
 BOX = 16
 """Segments of the path that share a box."""
+_STRAIGHT_MM = 1e-11
+"""A vertex so near to the line on which a run has come goes straight on: rounding is less."""
 
 
 @kernel
-def path_tables(path: Array, inverse: Array, boxes: Array) -> None:
+def path_tables(
+    path: Array, first: NDArray[np.int64], last: NDArray[np.int64], boxes: Array
+) -> None:
     """Prepare the polyline `path`, shape (2, n), for many distances.
+
+    Segments that go straight on make one run, whose distance from a point is that of a segment.
 
     Parameters
     ----------
-    inverse : ndarray, shape (n - 1,)
-        Becomes 1 / length^2 of every segment, 0 for one of no length.
+    first, last : ndarray, shape (n - 1,)
+        Become the vertices at which the run of every segment begins and ends.
     boxes : ndarray, shape (ceil((n - 1) / BOX), 4)
         Becomes lowest x, highest x, lowest y, highest y of `BOX` segments each.
     """
     segments = path.shape[1] - 1
+    begun = 0
+    way_x = way_y = 0.0
     for j in range(segments):
         dx, dy = path[0, j + 1] - path[0, j], path[1, j + 1] - path[1, j]
-        size = dx * dx + dy * dy
-        inverse[j] = 1.0 / size if size > 0.0 else 0.0
+        across = way_x * dy - way_y * dx
+        off = across * across > _STRAIGHT_MM * _STRAIGHT_MM * (way_x * way_x + way_y * way_y)
+        if off or way_x * dx + way_y * dy < 0.0:
+            last[begun:j] = j
+            begun = j
+        first[j] = begun
+        way_x, way_y = path[0, j + 1] - path[0, begun], path[1, j + 1] - path[1, begun]
+    last[begun:] = segments
     for b in range(len(boxes)):
         x, y = path[0, b * BOX], path[1, b * BOX]
         left, right, below, above = x, x, y, y
@@ -44,14 +58,16 @@ def path_tables(path: Array, inverse: Array, boxes: Array) -> None:
 
 
 @kernel(inline=True)
-def _segment_squared(path: Array, inverse: Array, j: int, px: float, py: float) -> float:
-    """Squared distance from a point to the segment between the vertices j and j + 1."""
+def _squared(path: Array, j: int, k: int, px: float, py: float) -> float:
+    """Squared distance from a point to the straight line between the vertices j and k."""
     ax, ay = path[0, j], path[1, j]
-    dx, dy = path[0, j + 1] - ax, path[1, j + 1] - ay
+    dx, dy = path[0, k] - ax, path[1, k] - ay
     ex, ey = px - ax, py - ay
-    along = min(1.0, max(0.0, (ex * dx + ey * dy) * inverse[j]))
-    ex -= along * dx
-    ey -= along * dy
+    size = dx * dx + dy * dy
+    if size > 0.0:
+        along = min(1.0, max(0.0, (ex * dx + ey * dy) / size))
+        ex -= along * dx
+        ey -= along * dy
     squared: float = ex * ex + ey * ey
     return squared
 
@@ -59,7 +75,8 @@ def _segment_squared(path: Array, inverse: Array, j: int, px: float, py: float) 
 @kernel
 def contour_distances(
     path: Array,
-    inverse: Array,
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
     boxes: Array,
     points: Array,
     centres: NDArray[np.int64],
@@ -70,12 +87,12 @@ def contour_distances(
 
     Point i belongs to the vertex `centres[i]` of the path; its distance is taken to the segments
     between the vertices up to `window` before and after. A guess, the lag of the point before, is
-    nearly always right; boxes of segments that are all further away are passed over.
+    nearly always on the right run; boxes of segments that are all further away are passed over.
 
     Returns
     -------
     int
-        Segments looked at.
+        Straight lines looked at.
     """
     n = path.shape[1]
     looked = 0
@@ -89,19 +106,28 @@ def contour_distances(
             out[i] = math.hypot(px - path[0, low], py - path[1, low])
             continue
         best_at = min(max(centre + lag, low), high - 1)
-        best2 = _segment_squared(path, inverse, best_at, px, py)
+        begin, end = max(low, first[best_at]), min(high, last[best_at])
+        best2 = _squared(path, begin, end, px, py)
         looked += 1
-        for b in range(low // BOX, (high - 1) // BOX + 1):
+        j = low
+        while j < high:
+            if begin <= j < end:
+                j = end
+                continue
+            b = j // BOX
+            stop = min(high, (b + 1) * BOX)
             ex = max(boxes[b, 0] - px, px - boxes[b, 1], 0.0)
             ey = max(boxes[b, 2] - py, py - boxes[b, 3], 0.0)
             if ex * ex + ey * ey >= best2:
+                j = stop
                 continue
-            first, last = max(low, b * BOX), min(high, (b + 1) * BOX)
-            looked += last - first
-            for j in range(first, last):
-                found2 = _segment_squared(path, inverse, j, px, py)
+            while j < stop:
+                k = min(high, last[j])
+                found2 = _squared(path, j, k, px, py)
+                looked += 1
                 if found2 < best2:
                     best2, best_at = found2, j
+                j = k
         out[i] = math.sqrt(best2)
         lag = best_at - centre
     return looked

@@ -155,7 +155,7 @@ class ContourMeter:
     Attributes
     ----------
     evaluations : int
-        Point-to-segment distances worked out so far.
+        Distances from points to straight lines worked out so far.
     """
 
     def __init__(
@@ -363,8 +363,9 @@ class PathDistances:
         return out
 
 
-def _path_tables(path: Array) -> tuple[Array, Array]:
+def _path_tables(path: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     segments = max(path.shape[1] - 1, 0)
-    inverse, boxes = np.empty(segments), np.empty((-(-segments // BOX), 4))
-    path_tables(path, inverse, boxes)
-    return inverse, boxes
+    first, last = np.empty((2, segments), np.int64)
+    boxes = np.empty((-(-segments // BOX), 4))
+    path_tables(path, first, last, boxes)
+    return first, last, boxes

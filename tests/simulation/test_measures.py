@@ -31,10 +31,13 @@ def brute_force(y_d: np.ndarray, y: np.ndarray, i: int, window: int) -> float:
     return float(np.sqrt(np.sum((offset - along * step) ** 2, axis=0).min()))
 
 
-def wander(seed: int, n: int, deviation: float) -> tuple[np.ndarray, np.ndarray]:
+def wander(
+    seed: int, n: int, deviation: float, bends: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """A path with rests, reversals and loops, and points beside it."""
     rng = np.random.default_rng(seed)
-    heading = np.cumsum(rng.normal(scale=0.3, size=n)) + np.pi * np.cumsum(rng.random(n) < 0.03)
+    heading = np.cumsum(rng.normal(scale=0.3, size=n) * (rng.random(n) < bends))
+    heading += np.pi * np.cumsum(rng.random(n) < 0.03)
     speed = np.repeat(rng.choice([0.0, 0.02, 0.1], size=n // 7 + 1), 7)[:n]
     path = np.cumsum(speed * np.vstack([np.cos(heading), np.sin(heading)]), axis=1)
     return path, path + rng.normal(scale=deviation, size=(2, n))
@@ -42,13 +45,14 @@ def wander(seed: int, n: int, deviation: float) -> tuple[np.ndarray, np.ndarray]
 
 @given(
     st.integers(0, 10_000), st.integers(1, 300), st.sampled_from([1e-4, 0.02, 1.0]),
-    st.integers(1, 5), st.integers(1, 80), st.lists(st.integers(0, 300), max_size=4),
+    st.sampled_from([0.03, 1.0]), st.integers(1, 5), st.integers(1, 80),
+    st.lists(st.integers(0, 300), max_size=4),
 )  # fmt: skip
 @settings(max_examples=80, deadline=None)
 def test_contour_meter_is_brute_force(
-    seed: int, n: int, deviation: float, stride: int, window: int, cuts: list[int]
+    seed: int, n: int, deviation: float, bends: float, stride: int, window: int, cuts: list[int]
 ) -> None:
-    y_d, y = wander(seed, n, deviation)
+    y_d, y = wander(seed, n, deviation, bends)
     meter = ContourMeter(1e-3, window * 1e-3, stride)
     edges = [0, *sorted(min(c, n) for c in cuts), n]
     parts = [meter.push(y_d[:, a:b], y[None, :, a:b]) for a, b in pairwise(edges)]
