@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ssl
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -17,6 +18,8 @@ __all__ = ["Reply", "Unanswered", "Unreached", "get", "post"]
 
 _CONNECT_S = 10.0
 _LONGEST_REPLY_BYTES = 4096
+_SLOWEST = 3.0
+"""In how many times ``timeout_s`` the body of a reply must be there, if it comes in drops."""
 
 
 class Unreached(Exception):
@@ -157,7 +160,7 @@ def _exchange(
                 **body,
             )
             try:
-                return _sent(client, request, longest_bytes)
+                return _sent(client, request, longest_bytes, most_s=_SLOWEST * timeout_s)
             except (httpx2.ConnectError, httpx2.ConnectTimeout, httpx2.PoolTimeout) as error:
                 reason = f"{target} cannot be reached: {error or type(error).__name__}"
             except httpx2.HTTPError as error:
@@ -167,14 +170,21 @@ def _exchange(
     raise Unreached(reason)
 
 
-def _sent(client: httpx2.Client, request: httpx2.Request, longest_bytes: int) -> Reply:
+def _sent(
+    client: httpx2.Client, request: httpx2.Request, longest_bytes: int, *, most_s: float
+) -> Reply:
+    import httpx2
+
     response = client.send(request, stream=True)
+    deadline = time.monotonic() + most_s
     try:
         start = b""
         for chunk in response.iter_raw():
             start += chunk
             if len(start) >= longest_bytes:
                 break
+            if time.monotonic() > deadline:
+                raise httpx2.ReadTimeout(f"its reply was not whole after {most_s:g} s")
     finally:
         response.close()
     return Reply(response.status_code, start[:longest_bytes].decode("utf-8", "replace"))
