@@ -45,7 +45,7 @@ _P_ONLY, _OR_NOTHING = 0, 2
 _BARE_IS_ZERO, _OFFSET, _POSITION = 0, 1, 2
 
 
-@kernel
+@kernel(allocates=False)
 def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
     """Carry out one command of the kernel's table; write its move or event.
 
@@ -106,7 +106,7 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
     return OK
 
 
-@kernel
+@kernel(allocates=False)
 def _dwell(w: Any, mask: int, f: Any, i: Any, rows: Any) -> int:
     """G4: every firmware comes to rest first."""
     seconds = 0.0
@@ -130,7 +130,7 @@ def _dwell(w: Any, mask: int, f: Any, i: Any, rows: Any) -> int:
     return OK
 
 
-@kernel
+@kernel(allocates=False)
 def _set_position(w: Any, mask: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
     """G92; the rows before it are settled."""
     rule = i[I_ORIGIN_RULE]

@@ -65,7 +65,7 @@ _POWERS = 10.0 ** np.arange(23)
 _MOVES = 22  # actions 20 to 22 are G0 to G3
 
 
-@kernel
+@kernel(allocates=False)
 def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
     """Do what the line did when Python carried it out; HANDBACK if it is not remembered."""
     slot = memo_slot(tables.memo_keys, line_hash(buf, start, stop))
@@ -106,7 +106,7 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
     return OK
 
 
-@kernel
+@kernel(allocates=False)
 def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> int:
     """Interpret the lines of ``buf[i[I_POS]:stop]``; the last one may lack its newline.
 

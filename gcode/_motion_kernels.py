@@ -57,7 +57,7 @@ _MODE, _UNKNOWN = 1, 4
 _X, _E, _F = 23, 4, 5
 
 
-@kernel
+@kernel(allocates=False)
 def travel(
     f: Any,
     i: Any,
@@ -132,7 +132,7 @@ def travel(
     return OK
 
 
-@kernel
+@kernel(allocates=False)
 def set_feed(f: Any, i: Any, feed: float) -> int:
     """Take the F of a line."""
     if feed <= 0.0 and i[I_ZERO_FEED]:
@@ -144,13 +144,13 @@ def set_feed(f: Any, i: Any, feed: float) -> int:
     return OK
 
 
-@kernel
+@kernel(allocates=False)
 def extruder_is_absolute(i: Any) -> bool:
     """Tell whether E counts from the origin."""
     return bool(i[I_ABS_E] != 0 and (i[I_E_RULE] != 0 or i[I_ABS_XYZ] != 0))
 
 
-@kernel
+@kernel(allocates=False)
 def move(
     w: Any,
     mask: int,

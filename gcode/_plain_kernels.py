@@ -77,7 +77,7 @@ for _pair in ("la", "ty", "ch", "fe", "z:", "z_", "pr", "st", "me", "be", "ob", 
 _MARKS[(ord("'") & 31) << 5 : ((ord("'") & 31) + 1) << 5] = True
 
 
-@kernel
+@kernel(allocates=False)
 def eight_digits(digits: Any) -> Any:
     """Return the number that eight digits (0 to 9, the first in the lowest byte) make."""
     pairs = digits * _TEN + (digits >> _EIGHT)
@@ -86,7 +86,7 @@ def eight_digits(digits: Any) -> Any:
     return np.int64((high + low) >> _32)
 
 
-@kernel
+@kernel(allocates=False)
 def decimal(buf: Any, p: int) -> Any:
     """Read a number; return it and where it ends, or -1 where it is no plain one.
 
@@ -137,7 +137,7 @@ def decimal(buf: Any, p: int) -> Any:
     return (-value if negative else value), p + k
 
 
-@kernel
+@kernel(allocates=False)
 def may_be_mark(buf: Any, p: int) -> bool:
     """Tell whether a comment (p: behind its semicolon) may be one that `recall` knows."""
     c = byte_at(buf, p)
@@ -147,7 +147,7 @@ def may_be_mark(buf: Any, p: int) -> bool:
     return bool(_MARKS[(c & 31) << 5 | byte_at(buf, p + 1) & 31])
 
 
-@kernel
+@kernel(allocates=False)
 def line_end(buf: Any, p: int) -> int:
     """Find the newline at or behind p."""
     while True:
@@ -158,7 +158,7 @@ def line_end(buf: Any, p: int) -> int:
         p += 8
 
 
-@kernel
+@kernel(allocates=False)
 def _whole_number(buf: Any, p: int) -> Any:
     """Read the number of a command; return where it ends (or -1) and the number, below 1000."""
     number = 0
@@ -173,7 +173,7 @@ def _whole_number(buf: Any, p: int) -> Any:
     return (p if good else -1), number
 
 
-@kernel
+@kernel(allocates=False)
 def _end_of_words(buf: Any, p: int) -> int:
     """Find the end of simple words (no G, no M, no text); -1 where there are others."""
     c = byte_at(buf, p)
@@ -186,7 +186,7 @@ def _end_of_words(buf: Any, p: int) -> int:
     return p
 
 
-@kernel
+@kernel(allocates=False)
 def plain(buf: Any, stop: int, f: Any, i: Any, rows: Any, m_words: Any) -> None:
     """Read plain lines from I_POS on; stop in front of the first that is not plain."""
     if f[F_UNIT_MM] != 1.0 or f[F_UNIT_E_MM] != 1.0 or i[I_HOLD]:

@@ -136,7 +136,7 @@ _FNV_OFFSET = 1469598103934665603
 _FNV_PRIME = 1099511628211
 
 
-@kernel
+@kernel(allocates=False)
 def line_hash(text: Any, start: int, stop: int) -> int:
     """Hash the bytes (FNV-1a) to a positive int64."""
     h = np.int64(_FNV_OFFSET)
@@ -146,7 +146,7 @@ def line_hash(text: Any, start: int, stop: int) -> int:
     return int(h) if h != 0 else 1
 
 
-@kernel
+@kernel(allocates=False)
 def memo_slot(keys: Any, h: int) -> int:
     """Find the slot of a remembered line, or the free slot where it belongs."""
     mask = len(keys) - 1
@@ -156,7 +156,7 @@ def memo_slot(keys: Any, h: int) -> int:
     return slot
 
 
-@kernel
+@kernel(allocates=False)
 def _same(rows: Any, one: int, other: int) -> bool:
     same = True
     for k in range(rows.shape[1]):
@@ -164,7 +164,7 @@ def _same(rows: Any, one: int, other: int) -> bool:
     return same
 
 
-@kernel
+@kernel(allocates=False)
 def intern_row(rows: Any, index: Any, count: int) -> int:
     """Look row `count` up among those before it; its number is `count` if it is new."""
     mask = len(index) - 1
@@ -186,7 +186,7 @@ def intern_row(rows: Any, index: Any, count: int) -> int:
         slot = (slot + 1) & mask
 
 
-@kernel
+@kernel(allocates=False)
 def settle(f: Any, i: Any, rows: Any) -> None:
     """Fill the slow columns of the rows written since the last time."""
     a, b = i[I_FILLED_MOVES], i[I_MOVES]
@@ -228,7 +228,7 @@ def settle(f: Any, i: Any, rows: Any) -> None:
         i[I_FILLED_EVENTS] = b
 
 
-@kernel
+@kernel(allocates=False)
 def note_modal(f: Any, i: Any, tables: Any) -> None:
     """Enter the modal state in its table; the rows before it must be settled."""
     rows, count = tables.modal, i[I_N_MODAL]
@@ -246,7 +246,7 @@ def note_modal(f: Any, i: Any, tables: Any) -> None:
     i[I_MODAL_ID] = number
 
 
-@kernel
+@kernel(allocates=False)
 def note_limits(f: Any, i: Any, tables: Any) -> None:
     """Enter the planner's limits in their table; the rows before them must be settled."""
     rows, count = tables.limits, i[I_N_LIMITS]
@@ -259,7 +259,7 @@ def note_limits(f: Any, i: Any, tables: Any) -> None:
     i[I_LIMITS_ID] = number
 
 
-@kernel
+@kernel(allocates=False)
 def put_event(i: Any, rows: Any, kind: int) -> None:
     """Write the line in hand as an event."""
     n = i[I_EVENTS]

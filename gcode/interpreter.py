@@ -40,7 +40,7 @@ _CHUNK = 1 << 20
 _LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
 _FEWEST_ROWS, _MOST_ROWS = 1024, 32_768
-_SHORT_LINE = 16  # bytes; rows are made for lines of this length
+_SHORT_LINE = 24  # bytes; rows are made for lines of this length, a little less than is usual
 _SPARE_ROWS = 8  # as many as one command of Python's may write
 
 
@@ -170,7 +170,7 @@ class Interpreter:
             self._carry.append(data)
             self._carried += len(data)
             return []
-        text = b"".join((*self._carry, data[:cut], _PAD))
+        text = b"".join((*self._carry, memoryview(data)[:cut], _PAD))
         self._carry = [data[cut:]] if cut < len(data) else []
         self._carried = len(data) - cut
         return self._read(text)

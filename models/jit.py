@@ -114,7 +114,7 @@ def kernel(function: Callable[P, R], /) -> Callable[P, R]: ...
 
 @overload
 def kernel(
-    *, inline: bool = False, parallel: bool = False
+    *, inline: bool = False, parallel: bool = False, allocates: bool = True
 ) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
 
 
@@ -124,6 +124,7 @@ def kernel(
     *,
     inline: bool = False,
     parallel: bool = False,
+    allocates: bool = True,
 ) -> Any:
     """Compile a function of numbers and arrays with numba.
 
@@ -136,6 +137,9 @@ def kernel(
         Paste the body into its callers (for helpers of a few lines in a hot loop).
     parallel : bool
         Allow `numba.prange`.
+    allocates : bool
+        False: it neither makes nor returns arrays, so nobody has to count who holds them. That
+        counting costs more than the work of a small kernel that is handed many arrays.
     """
 
     def compiled(body: Callable[..., Any]) -> Callable[..., Any]:
@@ -143,6 +147,7 @@ def kernel(
             nogil=True,
             fastmath=False,
             parallel=parallel,
+            _nrt=allocates,
             inline="always" if inline else "never",
         )
         dispatcher: Any = decorate(body)
