@@ -143,7 +143,7 @@ def kernel(
     """
 
     def compiled(body: Callable[..., Any]) -> Callable[..., Any]:
-        decorate = numba.njit(
+        decorate: Any = numba.njit(  # type: ignore[call-overload]  # its stubs lack _nrt
             nogil=True,
             fastmath=False,
             parallel=parallel,
