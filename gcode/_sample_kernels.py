@@ -1,4 +1,4 @@
-"""Kernel of the sampler: positions along phases at ascending times."""
+"""Kernels of the sampler: positions along phases at ascending times."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from models.jit import kernel
 
-__all__ = ["sweep"]
+__all__ = ["distances", "sweep"]
 
 
 @kernel
@@ -30,15 +30,15 @@ def sweep(
     position: Any,
     row: Any,
 ) -> None:
-    """Fill `position` (4, n) and `row` (n) at `times`, or at t0 + (first + k) dt if it is empty.
+    """Fill `position` and `row` (n) at `times`, or at t0 + (first + k) dt if it is empty.
 
-    On an s_curve the speed between v and v + d follows Marlin's quintic Bezier,
-    v + d (10 u^3 - 15 u^4 + 6 u^5) with u from 0 to 1 (stepper.cpp, bugfix-2.1.x, 2026-08).
-    Between phases and behind the last one the tool stands where the phase before ended.
+    `position` has two rows, x y, or four, x y z e. Between phases and behind the last one the
+    tool stands where the phase before ended.
     """
     moves = len(t_s)
     count = len(row)
     given = len(times) > 0
+    flat = len(position) == 2
     k = 0
     for m in range(moves):
         # Samples k..stop - 1 belong to this move.
@@ -62,23 +62,85 @@ def sweep(
         dx, dy, dz, de = direction[m]
         for i in range(k, stop):
             t = times[i] if given else t0_s + (first + i) * dt_s
-            left = max(t - begin, 0.0)
-            rising = min(left, accel)
-            left -= rising
-            steady = min(left, cruise)
-            falling = min(left - steady, decel)
-            if eased:
-                path = _eased(v0, rate, accel, rising) + v1 * steady
-                path += _eased(v1, -rate, decel, falling)
-            else:
-                path = (v0 + 0.5 * rate * rising) * rising + v1 * steady
-                path += (v1 - 0.5 * rate * falling) * falling
+            path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
             position[0, i] = x + dx * path
             position[1, i] = y + dy * path
-            position[2, i] = z + dz * path
-            position[3, i] = e + de * path
             row[i] = m
+            if not flat:
+                position[2, i] = z + dz * path
+                position[3, i] = e + de * path
         k = stop
+
+
+@kernel
+def distances(
+    times: Any,
+    points: Any,
+    t_s: Any,
+    accel_s: Any,
+    cruise_s: Any,
+    decel_s: Any,
+    start_mm: Any,
+    direction: Any,
+    start_mm_s: Any,
+    cruise_mm_s: Any,
+    accel_mm_s2: Any,
+    s_curve: Any,
+    out: Any,
+) -> None:
+    """Fill `out` (n) with the distance in x y between `points` (2, n) and the tool at `times`.
+
+    Time never goes back: one before the time of a sample before counts as that.
+    """
+    moves = len(t_s)
+    m = 0
+    begin, accel, cruise, decel = t_s[0], accel_s[0], cruise_s[0], decel_s[0]
+    v0, v1, rate, eased = start_mm_s[0], cruise_mm_s[0], accel_mm_s2[0], s_curve[0]
+    x, y, dx, dy = start_mm[0, 0], start_mm[0, 1], direction[0, 0], direction[0, 1]
+    behind = t_s[1] if moves > 1 else np.inf
+    t = -np.inf
+    for k in range(len(times)):
+        t = max(t, times[k])
+        if t >= behind:
+            while m + 1 < moves and t >= t_s[m + 1]:
+                m += 1
+            begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
+            v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
+            x, y, dx, dy = start_mm[m, 0], start_mm[m, 1], direction[m, 0], direction[m, 1]
+            behind = t_s[m + 1] if m + 1 < moves else np.inf
+        path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
+        gap_x, gap_y = x + dx * path - points[0, k], y + dy * path - points[1, k]
+        out[k] = np.sqrt(gap_x * gap_x + gap_y * gap_y)
+
+
+@kernel(inline=True)
+def _way(
+    left: float,
+    accel: float,
+    cruise: float,
+    decel: float,
+    v0: float,
+    v1: float,
+    rate: float,
+    eased: bool,
+) -> float:
+    """Way along a move so long after it began.
+
+    On an s_curve the speed between v and v + d follows Marlin's quintic Bezier,
+    v + d (10 u^3 - 15 u^4 + 6 u^5) with u from 0 to 1 (stepper.cpp, bugfix-2.1.x, 2026-08).
+    """
+    left = max(left, 0.0)
+    rising = min(left, accel)
+    left -= rising
+    steady = min(left, cruise)
+    falling = min(left - steady, decel)
+    if eased:
+        path = _eased(v0, rate, accel, rising) + v1 * steady
+        path += _eased(v1, -rate, decel, falling)
+    else:
+        path = (v0 + 0.5 * rate * rising) * rising + v1 * steady
+        path += (v1 - 0.5 * rate * falling) * falling
+    return path
 
 
 @kernel(inline=True)

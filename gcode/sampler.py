@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gcode import _sample_kernels as kernels
 from gcode.types import Phases
 
-__all__ = ["Sampler", "Samples", "sample_phases"]
+__all__ = ["Sampler", "Samples", "distances", "sample_phases"]
 
 _MOST = 1 << 17  # samples at once: a dwell may last for hours
 _NO_TIMES: NDArray[np.float64] = np.empty(0)
@@ -60,7 +60,7 @@ class Samples:
 
 
 def sample_phases(
-    phases: Phases, t_s: NDArray[np.float64] | tuple[float, float, int]
+    phases: Phases, t_s: NDArray[np.float64] | tuple[float, float, int], *, flat: bool = False
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Sample planned moves.
 
@@ -70,11 +70,13 @@ def sample_phases(
         At least one, in order of time.
     t_s : ndarray, shape (n,), or tuple (t0, dt, n)
         Ascending times, or the grid ``t0 + k dt``.
+    flat : bool
+        x and y are all that is wanted.
 
     Returns
     -------
-    position_mm : ndarray, shape (4, n)
-        x y z e. Before the first phase its start, behind a phase its end.
+    position_mm : ndarray, shape (4, n) or (2, n)
+        x y z e, or x y. Before the first phase its start, behind a phase its end.
     row : ndarray of int64, shape (n,)
         Row of `phases` in force.
 
@@ -83,17 +85,37 @@ def sample_phases(
     ValueError
         If there are no phases, or the times descend or are not finite.
     """
-    if len(phases) == 0:
-        raise ValueError("nothing to sample: there are no phases")
+    _check(phases)
+    axes = 2 if flat else 4
     if isinstance(t_s, tuple):
         t0_s, dt_s, n = t_s
         if not (math.isfinite(t0_s) and dt_s > 0 and math.isfinite(dt_s) and n >= 0):
             raise ValueError(f"the grid (t0 {t0_s}, dt {dt_s}, n {n}) needs dt > 0 and n >= 0")
-        return _sweep(phases, _NO_TIMES, t0_s, dt_s, 0, n)
+        return _sweep(phases, _NO_TIMES, t0_s, dt_s, 0, np.empty((axes, n)))
     times = np.ascontiguousarray(t_s, np.float64)
     if times.ndim != 1 or not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
         raise ValueError("the sampling times must be finite and ascending")
-    return _sweep(phases, times, 0.0, 1.0, 0, len(times))
+    return _sweep(phases, times, 0.0, 1.0, 0, np.empty((axes, len(times))))
+
+
+def distances(
+    phases: Phases, t_s: NDArray[np.float64], points_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the distance in X Y between points and the tool on planned moves, shape (n,).
+
+    Parameters
+    ----------
+    phases : Phases
+        At least one, in order of time.
+    t_s : ndarray, shape (n,)
+        Time never goes back: one before the time of an earlier point counts as that.
+    points_mm : ndarray, shape (2 or more, n)
+        x y first.
+    """
+    _check(phases)
+    out = np.empty(len(t_s))
+    kernels.distances(t_s, points_mm, *_columns(phases), out)
+    return out
 
 
 class Sampler:
@@ -129,7 +151,8 @@ class Sampler:
         end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
         while self._next < stop:
             n = min(stop - self._next, _MOST)
-            position, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, n)
+            position = np.empty((4, n))
+            _, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, position)
             t_s = np.arange(self._next, self._next + n, dtype=np.float64) * self.dt_s
             self._next += n
             moving = t_s <= end_s[row]
@@ -137,15 +160,21 @@ class Sampler:
 
 
 def _sweep(
-    phases: Phases, times: NDArray[np.float64], t0_s: float, dt_s: float, first: int, n: int
+    phases: Phases,
+    times: NDArray[np.float64],
+    t0_s: float,
+    dt_s: float,
+    first: int,
+    position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    position = np.empty((4, n))
-    row = np.empty(n, np.int64)
-    kernels.sweep(
-        times,
-        t0_s,
-        dt_s,
-        first,
+    row = np.empty(position.shape[1], np.int64)
+    kernels.sweep(times, t0_s, dt_s, first, *_columns(phases), position, row)
+    return position, row
+
+
+def _columns(phases: Phases) -> tuple[NDArray[np.float64] | NDArray[np.bool_], ...]:
+    """Return what the kernels take of phases."""
+    return (
         phases.t_s,
         phases.accel_s,
         phases.cruise_s,
@@ -156,10 +185,12 @@ def _sweep(
         phases.cruise_mm_s,
         phases.accel_mm_s2,
         phases.s_curve,
-        position,
-        row,
     )
-    return position, row
+
+
+def _check(phases: Phases) -> None:
+    if len(phases) == 0:
+        raise ValueError("nothing to sample: there are no phases")
 
 
 def _end_s(phases: Phases) -> float:

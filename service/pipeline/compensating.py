@@ -14,7 +14,7 @@ from gcode.errors import GcodeError
 from gcode.firmware.encoding import Encoded
 from gcode.firmware.registry import kit
 from gcode.pieces import Piece
-from gcode.sampler import sample_phases
+from gcode.sampler import distances, sample_phases
 from gcode.segments import ErrorFilter, Segments, fit_segments
 from gcode.timeline import Timeline, build_timeline, group_rows
 from gcode.types import Phases
@@ -247,10 +247,7 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     # In a rest, time waits where the stretch behind it begins.
     until = np.append(encoded.group_start_s[1:], np.inf)
     np.minimum(t, np.repeat(until, lengths), out=t)
-    moved = np.maximum.accumulate(t) - float(timeline.start_s[0])
-    position, _ = sample_phases(executed, moved)
-    gap = position[:2] - piece.command_mm[:2]
-    return np.asarray(np.sqrt(gap[0] ** 2 + gap[1] ** 2))
+    return distances(executed, t - float(timeline.start_s[0]), piece.command_mm)
 
 
 def as_executed(
@@ -260,7 +257,7 @@ def as_executed(
 
     Returns
     -------
-    planned_mm, executed_mm : ndarray, shape (4, n)
+    planned_mm, executed_mm : ndarray, shapes (4, n) and (2, n)
     row : ndarray of int64, shape (n,)
         Row of the piece's `phases`.
     extruding : ndarray of bool, shape (n,)
@@ -271,7 +268,7 @@ def as_executed(
     n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
     moved = replace(phases, t_s=piece.encoded.row_start_s)
     planned, row = sample_phases(moved, (0.0, dt_s, n))
-    position, _ = sample_phases(executed, (-origin, dt_s, n))
+    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
     direction = phases.direction
     feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))

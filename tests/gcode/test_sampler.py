@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gcode.firmware.klipper.planner import Planner
 from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
-from gcode.sampler import Sampler, Samples, sample_phases
+from gcode.sampler import Sampler, Samples, distances, sample_phases
 from gcode.types import Phases
 from models.machine import Machine
 
@@ -48,6 +48,18 @@ def test_twin(plan: Phases, times: list[float]) -> None:
     expected = np.array([position_at(plan, t) for t in times]).reshape(-1, 4).T
     np.testing.assert_allclose(position, expected, rtol=0, atol=1e-9)
     assert np.all(np.diff(row) >= 0)
+    flat, same = sample_phases(plan, np.array(times), flat=True)
+    np.testing.assert_array_equal(flat, position[:2])
+    np.testing.assert_array_equal(same, row)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(-1, 6), max_size=40), st.integers(0, 1000))
+def test_distances(plan: Phases, times: list[float], seed: int) -> None:
+    points = np.random.default_rng(seed).normal(scale=20.0, size=(2, len(times)))
+    found = distances(plan, np.array(times), points)
+    position, _ = sample_phases(plan, np.maximum.accumulate(np.array(times)))
+    np.testing.assert_allclose(found, np.hypot(*(position[:2] - points)), rtol=0, atol=1e-9)
 
 
 def test_ends_and_stand(plan: Phases) -> None:
@@ -90,6 +102,8 @@ def test_refused(plan: Phases) -> None:
     none = Phases(*(getattr(plan, name)[:0] for name in Phases.__dataclass_fields__))
     with pytest.raises(ValueError, match="no phases"):
         sample_phases(none, (0.0, 1.0, 1))
+    with pytest.raises(ValueError, match="no phases"):
+        distances(none, np.zeros(1), np.zeros((2, 1)))
     with pytest.raises(ValueError, match="ascending"):
         sample_phases(plan, np.array([1.0, 0.0]))
     with pytest.raises(ValueError, match="dt > 0"):
