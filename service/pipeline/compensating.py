@@ -247,7 +247,8 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     # In a rest, time waits where the stretch behind it begins.
     until = np.append(encoded.group_start_s[1:], np.inf)
     np.minimum(t, np.repeat(until, lengths), out=t)
-    return distances(executed, t - float(timeline.start_s[0]), piece.command_mm)
+    t -= float(timeline.start_s[0])
+    return distances(executed, t, piece.command_mm)
 
 
 def as_executed(
