@@ -17,6 +17,8 @@ def sweep(
     t0_s: float,
     dt_s: float,
     first: int,
+    position: Any,
+    row: Any,
     t_s: Any,
     accel_s: Any,
     cruise_s: Any,
@@ -27,8 +29,6 @@ def sweep(
     cruise_mm_s: Any,
     accel_mm_s2: Any,
     s_curve: Any,
-    position: Any,
-    row: Any,
 ) -> None:
     """Fill `position` and `row` (n) at `times`, or at t0 + (first + k) dt if it is empty.
 
@@ -76,6 +76,7 @@ def sweep(
 def distances(
     times: Any,
     points: Any,
+    out: Any,
     t_s: Any,
     accel_s: Any,
     cruise_s: Any,
@@ -86,7 +87,6 @@ def distances(
     cruise_mm_s: Any,
     accel_mm_s2: Any,
     s_curve: Any,
-    out: Any,
 ) -> None:
     """Fill `out` (n) with the distance in x y between `points` (2, n) and the tool at `times`.
 

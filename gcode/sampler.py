@@ -114,7 +114,7 @@ def distances(
     """
     _check(phases)
     out = np.empty(len(t_s))
-    kernels.distances(t_s, points_mm, *_columns(phases), out)
+    kernels.distances(t_s, points_mm, out, *_columns(phases))
     return out
 
 
@@ -168,7 +168,7 @@ def _sweep(
     position: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     row = np.empty(position.shape[1], np.int64)
-    kernels.sweep(times, t0_s, dt_s, first, *_columns(phases), position, row)
+    kernels.sweep(times, t0_s, dt_s, first, position, row, *_columns(phases))
     return position, row
 
 

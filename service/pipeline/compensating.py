@@ -239,7 +239,7 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     """
     timeline, encoded = piece.timeline, piece.encoded
     n = piece.command_mm.shape[1]
-    t = timeline.dt_s * np.arange(n)
+    t = timeline.dt_s * np.arange(n, dtype=np.float64)
     starts = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
     starts[0] = 0
     lengths = np.diff(np.append(np.clip(starts, 0, n), n))
