@@ -9,6 +9,8 @@ from models.jit import kernel
 
 __all__ = ["add_delayed"]
 
+_BLOCK = 1024
+
 
 @kernel
 def add_delayed(
@@ -22,13 +24,15 @@ def add_delayed(
     Before its first and behind its last sample the command stands; shifts below 0 are earlier.
     """
     n = len(command)
-    for late, gain in zip(samples, gains):  # noqa: B905 - numba knows no strict
-        begun = min(max(late, 0), n)
-        ended = max(begun, min(max(n + late, 0), n))
-        # Three plain loops: an index that is clipped would not be vectorised.
-        for k in range(begun):
-            out[k] += gain * command[0]
-        for k in range(begun, ended):
-            out[k] += gain * command[k - late]
-        for k in range(ended, n):
-            out[k] += gain * command[n - 1]
+    # Block by block, so that what was written is still in the cache for the next pulse.
+    for first in range(0, n, _BLOCK):
+        stop = min(first + _BLOCK, n)
+        for late, gain in zip(samples, gains):  # noqa: B905 - numba knows no strict
+            begun = min(max(late, first), stop)
+            ended = max(begun, min(max(n + late, first), stop))
+            out[first:begun] += gain * command[0]
+            out[ended:stop] += gain * command[n - 1]
+            # Slices and an index from 0: what numba vectorises.
+            moved, taken = out[begun:ended], command[begun - late : ended - late]
+            for k in range(len(moved)):
+                moved[k] += gain * taken[k]
