@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import io
 import lzma
 import re
 import shutil
@@ -28,9 +29,11 @@ __all__ = ["ThreeMf"]
 
 _PLATE = re.compile(r"Metadata/plate_([1-9]\d{0,3})\.gcode")
 _SLICE_INFO = "Metadata/slice_info.config"
-_LARGEST_INFO_BYTES = 1 << 24
+_LARGEST_INFO_BYTES = 1 << 22
+_LARGEST_DIGEST_BYTES = 1 << 10
 _COPY_BYTES = 1 << 20
 _MOST_MEMBERS = 10_000
+_LARGEST_DIRECTORY_BYTES = 1 << 22
 _BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
@@ -98,8 +101,9 @@ class ThreeMf:
                             member.write(data)
                             told(text.tell())
                     elif info.filename == f"{self._name}.md5":
-                        member.write(_renewed(archive.read(info), digest))
-                    elif info.filename == _SLICE_INFO and info.file_size < _LARGEST_INFO_BYTES:
+                        with archive.open(info) as original:
+                            member.write(_renewed(original.read(_LARGEST_DIGEST_BYTES), digest))
+                    elif info.filename == _SLICE_INFO and _is_small(info):
                         member.write(_retimed(archive.read(info), self._name, self.delay_s))
                     else:
                         with archive.open(info) as original:
@@ -110,11 +114,30 @@ class ThreeMf:
         shutil.copyfileobj(text, target, _COPY_BYTES)
 
 
+class _Bounded(io.BufferedReader):
+    """A file of which no more is read at once than a directory of so many members has."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        most = _LARGEST_DIRECTORY_BYTES
+        data = super().read(most + 1 if size is None or size < 0 else min(size, most + 1))
+        if len(data) > most:
+            raise GcodeError(
+                f"the 3MF package's directory has more than {most >> 20} MiB: that is no sliced "
+                "print"
+            )
+        return data
+
+
 @contextlib.contextmanager
 def _reading(source: Path) -> Iterator[zipfile.ZipFile]:
     """Open an archive; what is wrong with it becomes a `GcodeError`."""
     try:
-        with warnings.catch_warnings(), zipfile.ZipFile(source) as archive:
+        with (
+            source.open("rb", buffering=0) as raw,
+            _Bounded(raw) as file,
+            warnings.catch_warnings(),
+            zipfile.ZipFile(file) as archive,
+        ):
             # Of names that occur twice, which are refused.
             warnings.simplefilter("ignore", UserWarning)
             yield archive
@@ -178,12 +201,16 @@ def _retimed(info: bytes, name: str, delay_s: float) -> bytes:
     """Return the list of plates with another prediction, in whole seconds, for one of them."""
     found = _PLATE.fullmatch(name)
     number = found[1].encode() if found else b""
-    for plate in re.finditer(rb"<plate>.*?</plate>", info, re.DOTALL):
-        if re.search(rb'key="index"\s+value="%s"' % number, plate[0]):
-            told = re.search(rb'key="prediction"\s+value="(\d+)"', plate[0])
+    end = 0
+    while (begin := info.find(b"<plate>", end)) >= 0 and (
+        end := info.find(b"</plate>", begin)
+    ) >= 0:
+        plate = info[begin:end]
+        if re.search(rb'key="index"\s+value="%s"' % number, plate):
+            told = re.search(rb'key="prediction"\s+value="(\d{1,18})"', plate)
             if told is None:
                 return info
-            start = plate.start() + told.start(1)
+            start = begin + told.start(1)
             seconds = max(round(int(told[1]) + delay_s), 0)
             return info[:start] + b"%d" % seconds + info[start + len(told[1]) :]
     return info
@@ -197,6 +224,10 @@ def _md5(text: BinaryIO) -> tuple[str, int]:
     size = text.tell()
     text.seek(0)
     return digest.hexdigest(), size
+
+
+def _is_small(info: zipfile.ZipInfo) -> bool:
+    return max(info.file_size, info.compress_size) < _LARGEST_INFO_BYTES
 
 
 def _like(info: zipfile.ZipInfo, size: int) -> zipfile.ZipInfo:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import struct
 import tempfile
@@ -160,6 +161,26 @@ def test_a_bomb_is_defused(tmp_path: Path):
     data = b"G28\n" * (1 << 20)
     many = block(1, data, compression=1, checked=False) * 20
     refused(binary([], checked=False) + many, tmp_path, "unpacks to more than 64 MiB")
+
+
+def test_metadata_are_bounded_unpacked_and_in_number(tmp_path: Path):
+    settings = block(2, bytes(1 << 24), compression=1, checked=False) * 4
+    refused(binary(TEXT, checked=False) + settings, tmp_path, "unpacks to more than 64 MiB")
+    empty = block(2, b"", checked=False) * 1000
+    refused(binary(TEXT, checked=False) + empty, tmp_path, "more than 1000 blocks of metadata")
+
+
+def test_a_large_thumbnail_as_comments(tmp_path: Path):
+    image = bytes(range(256)) * 8000
+    thumbnail = block(5, image, parameters=struct.pack("<3H", 0, 640, 480), checked=False)
+    file = binary([], checked=False) + thumbnail + block(1, TEXT, checked=False)
+    (tmp_path / "in").write_bytes(file)
+    with open_text(tmp_path / "in") as container:
+        container.write_plain(container.text, tmp_path / "plain")
+    _, _, told = (tmp_path / "plain").read_bytes().partition(b"begin 640x480 2730668\n")
+    lines = told.partition(b"; thumbnail end")[0].splitlines()
+    assert max(map(len, lines)) == 80
+    assert base64.b64decode(b"".join(line[2:] for line in lines)) == image
 
 
 @pytest.mark.parametrize("length", [1 << 16, 200_000])

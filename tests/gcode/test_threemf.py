@@ -113,9 +113,30 @@ def test_packages_that_are_refused(tmp_path: Path):
     file = bytearray(package({1: TEXT}))
     with zipfile.ZipFile(io.BytesIO(bytes(file))) as archive:
         assert archive.namelist()[2] == "Metadata/plate_1.gcode"
+    names = {f"{k:03}" + 60_000 * "n": b"" for k in range(80)}
+    refused(package({1: TEXT}, more=names), tmp_path, "directory has more than 4 MiB")
     encrypted = [k for k in range(len(file)) if file[k : k + 4] == b"PK\1\2"][2] + 8
     file[encrypted] |= 1
     refused(bytes(file), tmp_path, "cannot be read .*encrypted")
+
+
+def test_what_stands_beside_a_plate_may_be_long_or_endless(tmp_path: Path):
+    info = b"<plate>" * 300_000 + b'<metadata key="index" value="1"/>'
+    beside = {"Metadata/slice_info.config": info, "Metadata/plate_2.gcode.md5": b" " * 5_000_000}
+    made = members(rewritten(package({1: TEXT}, more=beside), NEW, tmp_path))
+    assert made["Metadata/plate_1.gcode"] == NEW
+    assert {name: made[name] for name in beside} == beside
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        digest = {"Metadata/plate_1.gcode.md5": b"0" * 32 + b" " * 5_000_000}
+        plate = io.BytesIO()
+        with zipfile.ZipFile(plate, "w") as archive:
+            archive.writestr("Metadata/plate_1.gcode", TEXT)
+            archive.writestr(*digest.popitem())
+    made = members(rewritten(plate.getvalue(), NEW, tmp_path))
+    told = made["Metadata/plate_1.gcode.md5"]
+    assert told.strip().decode() == hashlib.md5(NEW, usedforsecurity=False).hexdigest().upper()
+    assert len(told) < 2000
 
 
 def test_damage_is_told(tmp_path: Path):
