@@ -154,7 +154,7 @@ _SIGNS = (
     ),
     _sign("marlin", 1, _LINE + rb"M900 K", "M900 K"),
     _sign("marlin", 1, _LINE + rb"(?:M205 [XYJ]|M420 S|M413 S)", "M205, M420 or M413"),
-    _sign("marlin", 0.5, _LINE + rb"M201 X\S+ Y\S+.*\n.*M203 X\d{1,3}\b", "M203 with mm/s"),
+    _sign("marlin", 0.5, _LINE + rb"M201 X\S+ Y\S.*\n.*M203 X\d{1,3}\b", "M203 with mm/s"),
 )
 
 

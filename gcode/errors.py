@@ -5,9 +5,13 @@
 
 from __future__ import annotations
 
+import re
+
 __all__ = ["GcodeError"]
 
 _SHOWN_CHARACTERS = 80
+_LONGEST_MESSAGE = 1000
+_LONG_WORD = re.compile(r"\S{61,}")
 
 
 class GcodeError(ValueError):
@@ -16,7 +20,8 @@ class GcodeError(ValueError):
     Parameters
     ----------
     message : str
-        What is wrong: the value, the limit and the remedy.
+        What is wrong: the value, the limit and the remedy. Numbers and names of a file may have
+        thousands of characters: long words are shortened.
     line : int, optional
         Line number, from 1.
     text : str
@@ -27,6 +32,7 @@ class GcodeError(ValueError):
         shown = text.strip()
         if len(shown) > _SHOWN_CHARACTERS:
             shown = shown[: _SHOWN_CHARACTERS - 3] + "..."
+        message = _LONG_WORD.sub(lambda word: word[0][:57] + "...", message)[:_LONGEST_MESSAGE]
         self.message = message
         self.line = line
         self.text = shown

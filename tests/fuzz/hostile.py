@@ -334,6 +334,247 @@ def modes_in_motion(size: int) -> Iterator[bytes]:
     )
 
 
+# Words of every kind in motion
+
+
+@hostile(300_000)
+def feeds_in_turn(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G1 X%d.1 E.01 F%d\n" % (100 + k % 2, 600 + k % 5000)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(100_000)
+def origins_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G92 X100 Y100\nG1 X100.%d E.01\n" % (k % 10) for k in range(size))
+
+
+@hostile(100_000)
+def corners_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=%d\nM205 X%d\nM566 X%d\nG1 X%d.1 E.01\n"
+        % (1 + k % 9, 1 + k % 9, 60 * (1 + k % 9), 100 + k % 2)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def waits_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(b"M204 S%d\nG1 X%d.1 E.01\nM400\n" % (900 + k % 99, 100 + k % 2)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(300_000)
+def fans_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(b"M106 S%d\nG1 X%d.1 E.01\n" % (k % 256, 100 + k % 2) for k in range(size))
+
+
+@hostile(100_000)
+def pressures_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"SET_PRESSURE_ADVANCE ADVANCE=.0%d\nM900 K.0%d\nM572 D0 S.0%d\nG1 X%d.1 E.01\n"
+        % (k % 9, k % 9, k % 9, 100 + k % 2)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def shapers_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"SET_INPUT_SHAPER SHAPER_FREQ_X=%d\nM593 X F%d\nG1 X%d.1 E.01\n"
+        % (30 + k % 9, 30 + k % 9, 100 + k % 2)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def switched_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"; STILLPATH_OFF\nG1 X100.5 E.01\n; STILLPATH_ON\nG1 X%d.1 E.01\n" % (100 + k % 2)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def states_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"SAVE_GCODE_STATE NAME=a\nG60 S0\nG1 X%d.5 E.01\nRESTORE_GCODE_STATE NAME=a MOVE=1\n"
+        b"G61 S0\n" % (100 + k % 2)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def garbage_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(b"\xff\x00\x80\x1b[%d;\xe2\x28\n; ok\nG1 X%d.1 E.01\n" % (k, 100 + k % 2)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(100_000)
+def one_move_layers(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b";LAYER_CHANGE\n;Z:%.3f\n;TYPE:Perimeter\nG1 Z%.3f F600\nG1 X%d E.1 F3000\n"
+        % (5 + 0.001 * k, 5 + 0.001 * k, 100 + k % 9)
+        for k in range(size)
+    )
+
+
+@hostile(100_000)
+def marks_in_motion(size: int) -> Iterator[bytes]:
+    yield from _framed(b"M73 P%d R%d\n; PAUSE_PRINT\nG1 X%d.1 E.01\n" % (k % 100, k, 100 + k % 2)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(10_000)
+def large_circles(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G2 X100 Y100 I80 J0 E20 F12000\n" for _ in range(size))
+
+
+@hostile(10_000)
+def large_spirals(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G3 X100 Y100 Z%.4f I0 J70 E20 F12000\n" % (5 + 1e-3 * k)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(100_000)
+def splines(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G5 X%d Y100 I0 J3 P0 Q-3 E.1\nG5 X100 Y100 P0 Q3 E.1\n" % (100 + k % 9)
+                       for k in range(size // 2))  # fmt: skip
+
+
+# Words on their own
+
+
+@hostile(100_000)
+def many_tools(size: int) -> Iterator[bytes]:
+    yield from _framed(b"T%d\n" % k for k in range(size))
+
+
+@hostile(1_000_000)
+def dwells_of_nothing(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G4 P0\n" for _ in range(size))
+
+
+@hostile(300_000)
+def progress(size: int) -> Iterator[bytes]:
+    yield from _framed(b"M73 P%d R%d\n" % (k % 100, k) for k in range(size))
+
+
+@hostile(10_000)
+def long_names(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b";TYPE:%d%s\nEXCLUDE_OBJECT_START NAME=%d%s\n" % (k, b"n" * 3000, k, b"n" * 3000)
+        for k in range(size)
+    )
+
+
+@hostile(10_000)
+def long_messages(size: int) -> Iterator[bytes]:
+    yield from _framed(b'M117 "%s\nFOO_%d A="%s\n' % (b"n" * 3000, k, b"' " * 1500)
+                       for k in range(size))  # fmt: skip
+
+
+@hostile(10_000)
+def lines_of_many_words(size: int) -> Iterator[bytes]:
+    yield from _framed(b"M118 " + b"A1 " * 2000 + b"\n" for _ in range(size))
+
+
+@hostile(10_000)
+def long_numbers(size: int) -> Iterator[bytes]:
+    digits = b"0" * 1000
+    yield from _framed(b"G1 X100.%s1 E.1\nG1 X%s101 E.1\n" % (digits, digits) for _ in range(size))
+
+
+@hostile(10_000)
+def huge_numbers(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"M204 S" + b"9" * 400 + b"\nM73 P" + b"9" * 400 + b"\n" for _ in range(size)
+    )
+
+
+@hostile(10_000)
+def subprograms(size: int) -> Iterator[bytes]:
+    yield from _framed(b'M98 P"a%d.g"\nM808 L0\nO%d\nM808\nM99\n' % (k, k) for k in range(size))
+
+
+@hostile(10_000)
+def nested_expressions(size: int) -> Iterator[bytes]:
+    yield from _framed(
+        b"G1 X{" + b"(" * 200 + b"100" + b")" * 200 + b"} E.1\n" for _ in range(size)
+    )
+
+
+@hostile(20_000)
+def deep_expression(size: int) -> Iterator[bytes]:
+    yield from _framed(b"G1 X{" + b"(" * size + b"\n" for _ in range(1))
+
+
+@hostile(1000)
+def nested_loops(size: int) -> Iterator[bytes]:
+    yield HEAD
+    for k in range(size):
+        yield b" " * k + b"while true\n"
+    yield b" " * size + b"G1 X101 E.1\n"
+
+
+# What slicers say about a file
+
+
+@hostile(1_000_000)
+def settings_without_end(size: int) -> Iterator[bytes]:
+    yield from _filled(b"; prusaslicer_config = begin\n; CONFIG_BLOCK_START\n", size)
+    yield b"\n" + HEAD + TAIL
+
+
+@hostile(1_000_000)
+def settings_of_nothing(size: int) -> Iterator[bytes]:
+    yield b"; prusaslicer_config = begin"
+    yield from _filled(b" \n", size)
+    yield HEAD + TAIL
+
+
+@hostile(1_000_000)
+def generators(size: int) -> Iterator[bytes]:
+    yield from _filled(b";GENERATOR.NAME:x\n; KISSlicer\n; generated by x\n", size)
+    yield b"\n" + HEAD + TAIL
+
+
+@hostile(1_000_000)
+def long_generator(size: int) -> Iterator[bytes]:
+    yield b";GENERATOR.NAME:"
+    yield from _filled(b"x", size)
+    yield b"\n" + HEAD + TAIL
+
+
+@hostile(1_000_000)
+def deep_settings(size: int) -> Iterator[bytes]:
+    yield b";SETTING_3 "
+    yield from _filled(b"[", size)
+    yield b"\n" + HEAD + TAIL
+
+
+@hostile(1_000_000)
+def wide_settings(size: int) -> Iterator[bytes]:
+    yield b';SETTING_3 {"global_quality": "[values]\\\\na'
+    yield from _filled(b" ", size)
+    yield b'b"}\n' + HEAD + TAIL
+
+
+@hostile(200_000)
+def wide_limits(size: int) -> Iterator[bytes]:
+    yield b"M201 X1 Y"
+    yield from _filled(b"1", size)
+    yield b"\n" + HEAD + TAIL
+
+
+@hostile(10_000_000)
+def thumbnails(size: int) -> Iterator[bytes]:
+    for _ in range(0, size, 100_000):
+        yield b"; thumbnail begin 640x480 98000\n"
+        yield from _filled(b"; " + b"iVBORw0KGgo" * 7 + b"\n", 99_840)
+        yield b"; thumbnail end\n"
+    yield HEAD + TAIL
+
+
 def _filled(pattern: bytes, size: int) -> Iterator[bytes]:
     whole, rest = divmod(size, len(pattern))
     for _ in range(whole):

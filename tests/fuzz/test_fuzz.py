@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from gcode.detection import detect
 from gcode.errors import GcodeError
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
+from gcode.slicers.facts import facts_in
 from tests.fuzz.checks import read_through, through_the_road, walk
 from tests.fuzz.hostile import HOSTILE, pieces
 from tests.fuzz.machines import KINDS, machine_of
@@ -53,6 +55,18 @@ def test_hostile_files_are_read_or_refused(kind: str, name: str) -> None:
         return
     assert told.line is not None
     assert len(str(told)) < 500
+
+
+TOLD = """settings_without_end settings_of_nothing generators long_generator
+    deep_settings wide_settings wide_limits"""
+
+
+@pytest.mark.parametrize("name", TOLD.split())
+def test_what_a_file_says_about_itself_is_found_in_passing(name: str) -> None:
+    """Patterns that go back and forth need hours for these."""
+    head = b"".join(pieces(name, 200_000))
+    assert facts_in(head).estimate_s is None
+    assert detect(head).certainty < 1.0
 
 
 @pytest.fixture(scope="module")
