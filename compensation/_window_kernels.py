@@ -7,106 +7,195 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["extremes", "segment_states", "tied_command", "tied_response"]
+__all__ = ["command_of", "constraints_at", "extremes", "tied_command", "tied_problem"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 
 @kernel
-def segment_states(summed: Array, reach: Array, moving: Ints, begun: Array, stopped: Array) -> None:
-    """Find the states that functions leave behind, moved by increments in segments only.
+def tied_problem(
+    basis: Array,
+    summed: Array,
+    effort: Array,
+    filtered: Array,
+    free: Array,
+    reach: Array,
+    stop: Array,
+    price: float,
+    z: Array,
+    targets: Array,
+    weight: Array,
+    moving: Ints,
+) -> tuple[Array, Array, Array]:
+    """Weighted least squares of a window with rests, factored: least |w - wish|^2.
+
+    Between rests the tied functions are the free ones without a past: their response is the free
+    one minus what the states at the segment's start would go on to do, plus what the segments
+    before left behind. In a rest there is only what was left behind, a few states for many samples:
+    these samples are summed up first, and meet the functions by way of the states.
 
     Parameters
     ----------
-    summed : ndarray, shape (window, n)
-        Commands of the functions: the double running sums of their increments.
+    basis, summed : ndarray, shape (window, n)
+        Increments of the functions, and their double running sums: the commands.
+    effort : ndarray, shape (n, n)
+        Gram matrix of `basis`.
+    filtered : ndarray, shape (components, window, n)
+    free : ndarray, shape (components, window, nz)
+        What states do by themselves.
     reach : ndarray, shape (nz - 2, window)
         From commands to states at the window's end.
+    stop : ndarray, shape (components, window)
+        Response to a step of the command's speed at the first rest.
+    price : float
+        Of squared increments.
+    z, targets, weight
+        As in `compensation.window_problem.solve_window`.
     moving : ndarray of int64, shape (k, 2)
-        Segments [s, e) between rests.
-    begun, stopped : ndarray, shape (k, nz, n)
-        Filled: states at s from all increments before; states at e from those of the segment.
+        Segments [s, e) between rests, some of them without samples.
+
+    Returns
+    -------
+    factor : ndarray, shape (n, n)
+        L with w = L' c; the upper half is 0.
+    wish : ndarray, shape (n,)
+    ends : ndarray, shape (k - 1, n)
+        Where the functions' commands stand in each rest.
     """
-    window = len(summed)
-    for m in range(len(moving)):
-        s, e = moving[m]
-        _states_at(summed, reach, 0, s, begun[m])
-        if e < window:
-            _states_at(summed, reach, s, e, stopped[m])
+    window, n = basis.shape
+    rests, states = len(moving) - 1, free.shape[2]
+    left = states - 1
+    speed = z[-2] - z[-1]
+    # What segments leave behind: the plants' states and the position, as the command stands.
+    behind = np.zeros((rests * left, n))
+    ends, position = np.zeros((rests, n)), np.zeros(n)
+    normal, right = _effort(basis, effort, moving, price), np.zeros(n)
+    # Rows of which the squares are added up.
+    rows, count = np.zeros((len(filtered) * window + rests, n)), 0
+    for m in range(rests):
+        state = _states(summed, reach, moving[m, 0], moving[m, 1])
+        behind[m * left : (m + 1) * left] = state[:-1]
+        position += state[-2]
+        ends[m] = position
+        step = state[-2] - state[-1]
+        _add(np.sqrt(price), step, rows[count])
+        count += 1
+        if m == 0:
+            _add(-price * speed, step, right)
+    for c in range(len(filtered)):
+        error = weight * (targets[c] - np.dot(free[c], z) + speed * stop[c])
+        square, pull = np.zeros((rests * left, rests * left)), np.zeros(rests * left)
+        gain = np.zeros(rests * left)
+        for m in range(rests + 1):
+            s, e = moving[m]
+            begun = _states(summed, reach, 0, s) if e > s else behind
+            for r in range(s, moving[m + 1, 0] if m < rests else window):
+                for before in range(m + 1 if r >= e else m):
+                    at = free[c, r - moving[before, 1]]
+                    for i in range(left):
+                        gain[before * left + i] = weight[r] * at[i]
+                    # Both last commands are the same from now on.
+                    gain[(before + 1) * left - 1] += weight[r] * at[left]
+                if r >= e:
+                    for i in range((m + 1) * left):
+                        pull[i] += gain[i] * error[r]
+                        for j in range(i + 1):
+                            square[i, j] += gain[i] * gain[j]
+                    continue
+                row = rows[count]
+                count += 1
+                _add(weight[r], filtered[c, r], row)
+                if s > 0:
+                    for i in range(m * left):
+                        _add(gain[i], behind[i], row)
+                    for i in range(states):
+                        _add(-weight[r] * free[c, r - s, i], begun[i], row)
+                _add(error[r], row, right)
+        for i in range(len(pull)):
+            _add(pull[i], behind[i], right)
+            for j in range(i):
+                square[j, i] = square[i, j]
+        if rests:
+            normal += np.dot(behind.T, np.dot(square, behind))
+    normal += np.dot(rows[:count].T, rows[:count])
+    factor = np.linalg.cholesky(normal)
+    forward(factor, right)
+    return factor, right, ends
 
 
 @kernel
-def _states_at(summed: Array, reach: Array, s: int, e: int, states: Array) -> None:
-    window, n = summed.shape
-    order = len(reach)
-    states[:] = 0.0
-    # The straight line on which the functions go on from before.
-    line, step = np.zeros(n), np.zeros(n)
-    if s > 0:
-        line[:] = summed[s - 1]
-        step[:] = summed[s - 1]
-        if s > 1:
-            step -= summed[s - 2]
-    newest, before = states[order], states[order + 1]
-    for k in range(s, e):
-        function = summed[k]
-        for j in range(n):
-            line[j] += step[j]
-            before[j] = newest[j]
-            newest[j] = function[j] - line[j]
-        for i in range(order):
-            _add(reach[i, window - e + k], newest, states[i])
+def _effort(basis: Array, effort: Array, moving: Ints, price: float) -> Array:
+    """Price of the increments while the command moves, and of the untied ones.
 
-
-@kernel
-def tied_response(
-    filtered: Array,
-    free: Array,
-    moving: Ints,
-    begun: Array,
-    stopped: Array,
-    weight: Array,
-    error: Array,
-    right: Array,
-) -> Array:
-    """Return a component's weighted response to the tied functions, shape (window, n).
-
-    Between rests, from sample s on, the tied functions are the free ones without a past: their
-    response is the free one, `filtered` (window, n), minus what the states at s would go on to do.
-    From the rest at e on, it is what the segment's states there go on to do with a command that
-    stands. What states do by themselves is `free` (window, nz). Adds response' weight^2 error to
-    `right`.
+    The untied ones keep the matrix definite when a rest leaves few samples.
     """
-    window, n = filtered.shape
-    states = free.shape[1]
-    response = np.zeros((window, n))
-    for m in range(len(moving)):
-        s, e = moving[m]
-        for r in range(s, e):
-            out = response[r]
-            out += filtered[r]
-            if s > 0:
-                for i in range(states):
-                    _add(-free[r - s, i], begun[m, i], out)
-        if s < e:
-            for r in range(e, window):
-                out = response[r]
-                for i in range(states - 2):
-                    _add(free[r - e, i], stopped[m, i], out)
-                # Both last commands are the same from now on.
-                _add(free[r - e, -2] + free[r - e, -1], stopped[m, -2], out)
-    for r in range(window):
-        out = response[r]
-        out *= weight[r]
-        _add(weight[r] * error[r], out, right)
-    return response
+    if len(moving) == 1:
+        return price * effort
+    still = 0
+    for m in range(len(moving) - 1):
+        still += moving[m + 1, 0] - moving[m, 1]
+    # Outside the rests the increments are the untied ones: whichever samples are fewer.
+    few = 2 * still <= len(basis)
+    rows, count = np.empty((len(basis), basis.shape[1])), 0
+    for m in range(len(moving) - 1 if few else len(moving)):
+        first, last = (moving[m, 1], moving[m + 1, 0]) if few else (moving[m, 0], moving[m, 1])
+        rows[count : count + last - first] = basis[first:last]
+        count += last - first
+    square = np.dot(rows[:count].T, rows[:count])
+    out: Array = price * (2.0 * effort - square) if few else price * (effort + square)
+    return out
 
 
 @kernel(inline=True)
 def _add(gain: float, row: Array, out: Array) -> None:
     for j in range(len(out)):
         out[j] += gain * row[j]
+
+
+@kernel
+def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
+    """States at e, shape (nz, n), that increments in [s, e) leave behind."""
+    order, samples = len(reach), e - s
+    gain = np.zeros((order + 2, samples))
+    gain[:order] = reach[:, len(summed) - samples :]
+    for i in range(min(2, samples)):
+        gain[order + i, samples - 1 - i] = 1.0
+    states: Array = np.dot(gain, summed[s:e])
+    if s > 0:
+        # Off the straight line on which the functions go on from before.
+        for i in range(order + 2):
+            at, by = 0.0, 0.0
+            for k in range(samples):
+                at += gain[i, k]
+                by += gain[i, k] * (k + 1)
+            _add(-at - by, summed[s - 1], states[i])
+            if s > 1:
+                _add(by, summed[s - 2], states[i])
+    return states
+
+
+@kernel
+def forward(factor: Array, values: Array) -> None:
+    """Solve factor x = values in place, for a lower triangle."""
+    for j in range(len(values)):
+        values[j] /= factor[j, j]
+        for i in range(j + 1, len(values)):
+            values[i] -= factor[i, j] * values[j]
+
+
+@kernel
+def command_of(
+    factor: Array, w: Array, basis: Array, moving: Ints, last: float, previous: float
+) -> Array:
+    """Command of the coefficients c with factor' c = w."""
+    c = w.copy()
+    for j in range(len(c) - 1, -1, -1):
+        for i in range(j + 1, len(c)):
+            c[j] -= factor[i, j] * c[i]
+        c[j] /= factor[j, j]
+    return tied_command(np.dot(basis, c), moving, last, previous)
 
 
 @kernel
@@ -155,3 +244,96 @@ def extremes(
         accel = max(accel, abs(step))
         total += step * step
     return accel, speed, low, high, total / len(command)
+
+
+@kernel
+def constraints_at(
+    command: Array,
+    fixed: Array,
+    last: float,
+    previous: float,
+    bounds: Array,
+    factor: Array,
+    summed: Array,
+    moving: Ints,
+    ends: Array,
+    taken: Flags,
+) -> tuple[Array, Array, Array]:
+    """Bound a command's increments, steps and positions where they leave their bounds.
+
+    Parameters
+    ----------
+    command, fixed : ndarray, shape (window,)
+        A command, and the one without functions.
+    last, previous : float
+        The commands before the window.
+    bounds : ndarray, shape (3, 4)
+        For increments, steps and positions: lowest and highest value, by how much a constraint is
+        tighter, and what rows are scaled by.
+    factor, summed, moving, ends
+        As in `tied_problem`.
+    taken : ndarray of bool, shape (3, window)
+        Samples that have a constraint; those found are added.
+
+    Returns
+    -------
+    rows : ndarray, shape (m, n)
+        For w.
+    low, high : ndarray, shape (m,)
+    """
+    window, n = summed.shape
+    rows = np.zeros((3 * window, n))
+    low, high = np.empty(3 * window), np.empty(3 * window)
+    count = 0
+    for m in range(len(moving)):
+        s, e = moving[m]
+        # The first sample of a rest has the increment that stops the command.
+        for k in range(s, min(e + 1, window)):
+            for kind in range(3 if k < e else 1):
+                value, constant = 0.0, 0.0
+                for back in range(3 - kind):
+                    share = _SHARES[kind, back]
+                    i = k - back
+                    before = last if i == -1 else previous
+                    value += share * (command[i] if i >= 0 else before)
+                    constant += share * (fixed[i] if i >= 0 else before)
+                lowest, highest, margin, scale = bounds[kind]
+                if taken[kind, k] or lowest <= value <= highest:
+                    continue
+                taken[kind, k] = True
+                for back in range(3 - kind):
+                    share = _SHARES[kind, back] / scale
+                    _add_position(share, k - back, summed, moving, ends, rows[count])
+                forward(factor, rows[count])
+                low[count] = (lowest + margin - constant) / scale
+                high[count] = (highest - margin - constant) / scale
+                count += 1
+    return rows[:count].copy(), low[:count].copy(), high[:count].copy()
+
+
+@kernel
+def _add_position(
+    share: float, k: int, summed: Array, moving: Ints, ends: Array, row: Array
+) -> None:
+    """Add a share of the tied functions' commands at sample k."""
+    if k < 0:
+        return
+    m = len(moving) - 1
+    while moving[m, 0] > k:
+        m -= 1
+    s, e = moving[m]
+    if m > 0:
+        row += share * ends[m - 1]
+    last = min(k, e - 1)
+    if last >= s:
+        row += share * summed[last]
+        # Without what the functions did before, and the line on which they would go on.
+        steps = float(last - s + 1)
+        if s > 0:
+            row -= share * (steps + 1.0) * summed[s - 1]
+        if s > 1:
+            row += share * steps * summed[s - 2]
+
+
+_SHARES = np.array([[1.0, -2.0, 1.0], [1.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
+"""How increments, steps and positions are made of a command's last samples."""

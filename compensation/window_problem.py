@@ -13,17 +13,22 @@ programme (DAQP, a dual active-set method).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import NamedTuple
 
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dsyrk
-from scipy.linalg.lapack import dgesv, dpotrf, dtrtrs
+from scipy.linalg.lapack import dgesv, dtrtrs
 
-from compensation._window_kernels import extremes, segment_states, tied_command, tied_response
+from compensation._window_kernels import (
+    command_of,
+    constraints_at,
+    extremes,
+    tied_command,
+    tied_problem,
+)
 from compensation.base import DesignError
+from compensation.lifted_window import LiftedWindow
 from compensation.preview import PreviewDesign
 
 __all__ = ["EFFORT_PRICE", "TRAVEL_SLACK_MM", "Bounds", "Extremes", "solve_window"]
@@ -61,6 +66,16 @@ class Bounds:
     def seen_from(self, origin_mm: float) -> Bounds:
         """Return the bounds for positions relative to an origin."""
         return replace(self, low_mm=self.low_mm - origin_mm, high_mm=self.high_mm - origin_mm)
+
+    def table(self) -> Array:
+        """Return lowest and highest increment, step and position, margins and scales, (3, 4)."""
+        return np.array(
+            [
+                [-self.accel, self.accel, _MARGIN * self.accel, self.accel],
+                [-self.speed, self.speed, _MARGIN * self.speed, self.speed],
+                [self.low_mm, self.high_mm, 0.0, _TRAVEL_SCALE_MM],
+            ]
+        )
 
     def kept(self, reached: Extremes) -> tuple[bool, bool, bool]:
         """Whether acceleration, speed and travel are kept."""
@@ -125,49 +140,55 @@ def solve_window(
     spans = [(max(int(a), 0), min(int(b), window)) for a, b in rests]
     edges = [0, *(edge for span in spans for edge in span), window]
     moving = np.array(edges, dtype=np.int64).reshape(-1, 2)
-    normal, right, ends = _normal_equations(design, z, targets_mm, weight, moving)
+    lifted, summed = design.lifted, design.summed
+    # In the coordinates w = L' c, normal = L L', the cost is |w - wish|^2: well conditioned even
+    # where a rest leaves few samples.
+    try:
+        factor, wish, ends = tied_problem(
+            design.basis,
+            summed,
+            design.effort,
+            design.filtered,
+            lifted.from_state,
+            lifted.reach,
+            _stop(lifted, moving),
+            max(EFFORT_PRICE, design.price) if len(rests) else design.price,
+            z,
+            targets_mm,
+            weight,
+            moving,
+        )
+    except np.linalg.LinAlgError as error:
+        raise DesignError(f"the window problem at a rest is singular ({error})") from error
     pins = [a - 1 for a, _ in spans if a > 0]
-    rows = ends[len(spans) - len(pins) :]
-    values = path_mm[pins] - tied_command(np.zeros(window), moving, last, previous)[pins]
-
-    # In the coordinates w = L' c, normal = L L', the cost is |w - free|^2: well conditioned even
-    # where a rest leaves few samples. LAPACK itself: the wrappers' checks would take as long.
-    factor, flaw = dpotrf(normal, lower=1, overwrite_a=1)
-    if flaw:
-        raise DesignError(f"the window problem at a rest is singular (LAPACK dpotrf: {flaw})")
-    found = free = dtrtrs(factor, right, lower=1)[0]
-    pinned = np.ascontiguousarray(dtrtrs(factor, rows.T, lower=1)[0].T)
+    fixed = tied_command(np.zeros(window), moving, last, previous)
+    values = path_mm[pins] - fixed[pins]
+    found = wish
+    pinned = dtrtrs(factor, ends[len(spans) - len(pins) :].T, lower=1)[0].T
     if pins:
         # The nearest w for which the command stands on the path in the rests.
-        *_, pull, flaw = dgesv(pinned @ pinned.T, pinned @ free - values)
+        *_, pull, flaw = dgesv(pinned @ pinned.T, pinned @ wish - values)
         if flaw:
             raise DesignError(f"rests contradict each other in a window (LAPACK dgesv: {flaw})")
-        found = free - pull @ pinned
-
-    def command_of(found: Array) -> Array:
-        increments = design.basis @ dtrtrs(factor, found, lower=1, trans=1)[0]
-        return tied_command(increments, moving, last, previous)
-
-    command = command_of(found)
-    broken = _broken(bounds, z, command)
-    while any(broken):
-        # Only the kinds of bounds that are broken: most windows know one.
-        rows, low, high = _constraints(bounds, z, design.basis, moving, broken)
-        found, _, flag, _ = daqp.solve(
-            np.eye(len(free)),
-            -free,
-            np.concatenate([pinned, dtrtrs(factor, rows.T, lower=1)[0].T]),
-            np.concatenate([values, high]),
-            np.concatenate([values, low]),
-            np.array([_EQUAL] * len(pins) + [0] * len(rows), dtype=np.int32),
+        found = wish - pull @ pinned
+    command = untied = command_of(factor, found, design.basis, moving, last, previous)
+    rows, low, high = pinned, values, values
+    taken = np.zeros((3, window), bool)
+    while not all(bounds.kept(Extremes.of(command, last, previous))):
+        # Constraints where the command leaves its bounds, then where it does so instead.
+        more = constraints_at(
+            command, fixed, last, previous, bounds.table(), factor, summed, moving, ends, taken
         )
-        if flag <= 0:
-            break  # no command keeps them; the caller sees that and takes a gentler design
-        command = command_of(found)
-        also = [a and not b for a, b in zip(_broken(bounds, z, command), broken, strict=True)]
-        if not any(also):
+        if len(more[0]) == 0:
             break
-        broken = [a or b for a, b in zip(broken, also, strict=True)]
+        rows, low, high = map(np.concatenate, zip((rows, low, high), more, strict=True))
+        kinds = np.zeros(len(rows), np.int32)
+        kinds[: len(pins)] = _EQUAL
+        found, _, flag, _ = daqp.solve(np.eye(design.n), -wish, rows, high, low, kinds)
+        if flag <= 0:
+            command = untied  # nothing keeps them; the caller sees that and takes a gentler design
+            break
+        command = command_of(factor, found, design.basis, moving, last, previous)
     command[pins] = path_mm[pins]
     for a, b in rests:
         # Rounding must not move a resting axis.
@@ -175,83 +196,9 @@ def solve_window(
     return np.asarray(command)
 
 
-def _normal_equations(
-    design: PreviewDesign, z: Array, targets_mm: Array, weight: Array, moving: Ints
-) -> tuple[Array, Array, Array]:
-    """Weighted least squares with a price on increments, as a quadratic form.
-
-    Returns
-    -------
-    normal : ndarray, shape (n, n)
-        Its lower half.
-    right : ndarray, shape (n,)
-    ends : ndarray, shape (rests, n)
-        Where the functions' commands stand in each rest.
-    """
-    lifted = design.lifted
-    resting = len(moving) > 1
-    price = max(EFFORT_PRICE, design.price) if resting else design.price
-    # Outside the rests the increments are the untied ones, so their effort is known. The price of
-    # the untied functions keeps the matrix definite when a rest leaves few samples. BLAS wants
-    # columns one behind the other: here the transpose of a symmetric matrix.
-    normal = ((2.0 if resting else 1.0) * price * design.effort).T
-    right = np.zeros(design.n)
-    begun = np.empty((len(moving), lifted.states, design.n))
-    stopped = np.empty_like(begun)
-    segment_states(design.summed, lifted.reach, moving, begun, stopped)
-    speed, first = float(z[-2] - z[-1]), int(moving[0, 1])
-    if resting:
-        steps = stopped[:-1, -2] - stopped[:-1, -1]
-        normal = dsyrk(price, steps.T, 1.0, normal, lower=1, overwrite_c=1)
-        right -= price * speed * steps[0]
-    for (_, a), (b, _) in pairwise(moving.tolist()):
-        normal = dsyrk(-price, design.basis[a:b].T, 1.0, normal, lower=1, overwrite_c=1)
-    for target, free, integrated, filtered in zip(
-        targets_mm, lifted.from_state, lifted.integrated, design.filtered, strict=True
-    ):
-        error = target - free @ z
-        if resting:
-            # The increment that stops the motion from before.
-            error += speed * integrated[:, first]
-        response = tied_response(filtered, free, moving, begun, stopped, weight, error, right)
-        normal = dsyrk(1.0, response.T, 1.0, normal, lower=1, overwrite_c=1)
-    return normal, right, np.cumsum(stopped[:-1, -2], axis=0)
-
-
-def _broken(bounds: Bounds, z: Array, command: Array) -> list[bool]:
-    return [not kept for kept in bounds.kept(Extremes.of(command, z[-2], z[-1]))]
-
-
-def _constraints(
-    bounds: Bounds, z: Array, basis: Array, moving: Ints, which: list[bool]
-) -> tuple[Array, Array, Array]:
-    """Rows, lower and upper ends of the bounds on the coefficients."""
-    last, step = float(z[-2]), float(z[-2] - z[-1])
-    accel, speed = (1.0 - _MARGIN) * bounds.accel, (1.0 - _MARGIN) * bounds.speed
-    tied, offset = basis.copy(), np.zeros(len(basis))
-    for (s, a), (b, _) in pairwise(moving.tolist()):
-        tied[a:b] = 0.0
-        tied[a] = -basis[s:a].sum(axis=0)
-        offset[a] = -step if s == 0 else 0.0
-    line = np.arange(1.0, len(basis) + 1.0) * step
-    kinds = [
-        (offset, -accel, accel, accel),
-        (step + np.cumsum(offset), -speed, speed, speed),
-        (
-            last + line + np.cumsum(np.cumsum(offset)),
-            bounds.low_mm,
-            bounds.high_mm,
-            _TRAVEL_SCALE_MM,
-        ),
-    ]
-    rows, lows, highs = [], [], []
-    for times, ((at, low, high, scale), wanted) in enumerate(zip(kinds, which, strict=True)):
-        if wanted:
-            functions = tied
-            for _ in range(times):
-                functions = np.cumsum(functions, axis=0)
-            free = np.any(functions != 0.0, axis=1)  # increments in a rest are not
-            rows.append(functions[free] / scale)
-            lows.append((low - at[free]) / scale)
-            highs.append((high - at[free]) / scale)
-    return np.concatenate(rows), np.concatenate(lows), np.concatenate(highs)
+def _stop(lifted: LiftedWindow, moving: Ints) -> Array:
+    """Response to the increment that stops a motion of 1 mm/sample at the first rest."""
+    window, first = lifted.window, int(moving[0, 1])
+    response = np.zeros((len(lifted.integrated), window))
+    response[:, first:] = lifted.integrated[:, : window - first, 0]
+    return response
