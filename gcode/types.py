@@ -68,7 +68,7 @@ class Limits:
 
     def as_row(self) -> tuple[float, ...]:
         """Return the fields in order."""
-        return tuple(getattr(self, field.name) for field in fields(self))
+        return tuple(getattr(self, name) for name in type(self).__dataclass_fields__)
 
     @classmethod
     def from_row(cls, row: Iterable[float]) -> Self:

@@ -55,7 +55,8 @@ def plan_moves(moves: Moves, limits: Sequence[Limits], machine: Machine) -> Phas
         For a move that the firmware refuses, or that takes more than 20 minutes.
     """
     planner = kit(machine).planner()
-    phases = join_phases([planner.push_moves(moves, limits), planner.flush()])
+    planner.queue_moves(moves, limits)
+    phases = planner.flush()
     check_moves_end(phases, lambda index: int(moves.line[index]))
     return phases
 

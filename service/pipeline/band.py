@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,7 @@ from models.machine import Machine
 __all__ = ["BandContent"]
 
 Array = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
 _ALL, _EVERY = 64, 8
@@ -46,20 +49,22 @@ class BandContent:
         """Add planned positions, shape (2, n), that follow what was added before."""
         if not self._limited:
             return
-        path = np.concatenate([self._path, path_mm], axis=1)
-        prints = np.concatenate([self._prints, extruding])
-        count = max(0, (path.shape[1] - 2) // BLOCK)
+        before, printed = self._path, self._prints
+        total = before.shape[1] + path_mm.shape[1]
+        count = max(0, (total - 2) // BLOCK)
         for k in range(count):
             self._seen += 1
             if self._seen > _ALL and self._seen % _EVERY:
                 continue
             first = k * BLOCK
-            if np.count_nonzero(prints[first : first + BLOCK]) > BLOCK // 2:
-                accel = np.diff(path[:, first : first + BLOCK + 2], 2) / self._dt_s**2
+            prints = _span(printed, extruding, first, first + BLOCK)
+            if np.count_nonzero(prints) > BLOCK // 2:
+                path = _span(before, path_mm, first, first + BLOCK + 2)
+                accel = np.diff(path, 2) / self._dt_s**2
                 self._power += np.abs(np.fft.rfft(accel * self._window)) ** 2
                 self._blocks += 1
-        self._path = path[:, count * BLOCK :].copy()
-        self._prints = prints[count * BLOCK :].copy()
+        self._path = _span(before, path_mm, count * BLOCK, total).copy()
+        self._prints = _span(printed, extruding, count * BLOCK, total).copy()
 
     def jump(self) -> None:
         """Say that what comes does not follow what was."""
@@ -100,3 +105,11 @@ class BandContent:
                         "would tell."
                     )
         return found
+
+
+def _span(before: NDArray[T], behind: NDArray[T], start: int, stop: int) -> NDArray[T]:
+    """Return the samples start..stop - 1 of two arrays, the second being behind the first."""
+    held = before.shape[-1]
+    if start >= held:
+        return behind[..., start - held : stop - held]
+    return np.concatenate([before[..., start:stop], behind[..., : max(stop - held, 0)]], axis=-1)

@@ -241,22 +241,30 @@ class LayerRecorder:
         if count > 1:
             on = self._on[:count] > 0
             z = self._xyz[2, :count][on] if on.any() else self._xyz[2, 1:count]
-            squares, largest, seen = np.split(self._tally, [len(self._high), -1])
+            channels = len(self._high)
+            squares, largest = self._tally[:channels], self._tally[channels:-1]
+            seen = float(self._tally[-1])
             tile = LayerTile(
                 layer=self._layer,
-                z_mm=round(float(np.median(z)), 4),
+                z_mm=round(_median(z), 4),
                 x_mm=self._xyz[0, :count].copy(),
                 y_mm=self._xyz[1, :count].copy(),
                 line=self._line[:count].copy(),
                 error=self._error[:, :count].copy(),
                 feature=self._feature[:count].copy(),
                 on=self._on[:count].copy(),
-                rms_um=1e3 * np.sqrt(squares / max(float(seen[0]), 1.0)),
+                rms_um=1e3 * np.sqrt(squares / max(seen, 1.0)),
                 max_um=1e3 * largest,
-                seconds=float(seen[0]) * self._sample_s,
+                seconds=seen * self._sample_s,
             )
             for take in self._takers:
                 take(tile)
         self._number[kernels.COUNT] = 0
         self._place[kernels.HEIGHT] = np.nan
         self._tally[:] = 0.0
+
+
+def _median(z_mm: NDArray[np.float32]) -> float:
+    """Return the median of heights, most often all the same."""
+    low = z_mm.min()
+    return float(low) if low == z_mm.max() else float(np.median(z_mm))
