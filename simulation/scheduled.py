@@ -67,6 +67,8 @@ class MachineStream:
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Go on with the plants of this point, which still vibrate from what was before."""
+        if self._streams and not self._machine.schedules:
+            return
         level = self._grid.level(point)
         if level == self._level:
             return

@@ -31,12 +31,13 @@ LONGEST_MOVE_S = 1200.0
 LONGEST_PRINT_S = 3.6e6
 """So is a print that takes longer: a small file must not keep a computer busy for days."""
 
-_STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])
+_STOPS = np.array([kind in STOPPING for kind in EventKind])
+"""By the number of an event's kind."""
 
 
 def stops(events: Events) -> NDArray[np.bool_]:
     """Mark events at which the motion comes to rest."""
-    return np.isin(events.kind, _STOPPING)
+    return np.asarray(_STOPS[events.kind])
 
 
 def plan_moves(moves: Moves, limits: Sequence[Limits], machine: Machine) -> Phases:

@@ -25,6 +25,8 @@ _COMMENTS = re.compile(rb"(?:\xef\xbb\xbf)?(?:[ \t\r]*(?:;[^\n]*)?\n)*")
 _COMMAND = re.compile(rb"^[ \t\r\f\v]*(?:[^\s;]|; stillpath)[^\n]*\n?", re.MULTILINE)
 _LOOKED_THROUGH_BYTES = 1 << 16
 _STOPS = (MarkKind.COLOR_CHANGE, MarkKind.PAUSE)
+_BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", b"TPRemCE-"))
+"""Bytes with which a line that tells times may begin, and the first one behind its semicolon."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,11 +216,13 @@ def _candidates(item: Passage) -> NDArray[np.int64]:
     text = np.frombuffer(item.text, np.uint8)
     start = events.byte_start - item.text_offset
     last = len(text) - 1
-    first, second, third = (text[np.minimum(start + k, last)] for k in range(3))
+    rows = np.flatnonzero(_BEGINS[text[np.minimum(start, last)]])
+    first, second, third = (text[np.minimum(start[rows] + k, last)] for k in range(3))
     letter = np.where(second == ord(" "), third, second)
-    comment = (first == ord(";")) & np.isin(letter, list(b"TPRemCE-"))
+    comment = (first == ord(";")) & _TELLS[letter]
     progress = (first == ord("M")) & (second == ord("7")) & (third == ord("3"))
-    return np.flatnonzero(comment | progress | (first == ord(" ")) | (first == ord("\t")))
+    indented = (first == ord(" ")) | (first == ord("\t"))
+    return np.asarray(rows[comment | progress | indented])
 
 
 def behind_last_command(text: bytes) -> int:
