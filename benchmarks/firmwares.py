@@ -31,7 +31,9 @@ from service.pipeline.options import Options
 _LEAST_WITHIN = 0.99
 
 
-def machine_with(name: str, firmware: str, steps_per_mm: float) -> Machine:
+def machine_with(
+    name: str, firmware: str, steps_per_mm: float, advance_k_s: float = 0.0
+) -> Machine:
     """Return a printer with another firmware, under the limits of golden/klipper/README.md."""
     machine = load_machine(name)
     speed, accel, z_speed, z_accel = 500.0, 5000.0, 20.0, 200.0
@@ -53,6 +55,8 @@ def machine_with(name: str, firmware: str, steps_per_mm: float) -> Machine:
                 junction_deviation_mm=0.013,
             ),
             min_steps_per_segment=1,
+            linear_advance=True if advance_k_s > 0.0 else None,
+            linear_advance_k_s=advance_k_s,
             **common,
         )
     else:
@@ -68,7 +72,8 @@ def machine_with(name: str, firmware: str, steps_per_mm: float) -> Machine:
             extruder=RepRapExtruder(max_speed_mm_s=100.0, max_accel_mm_s2=accel, jerk_mm_s=5.0),
             **common,
         )
-    changes = {"name": f"{name}-{firmware}-{steps_per_mm:.0f}", "firmware": other}
+    advance = f"-k{advance_k_s:g}" if advance_k_s else ""
+    changes = {"name": f"{name}-{firmware}-{steps_per_mm:.0f}{advance}", "firmware": other}
     return Machine.model_validate({**machine.model_dump(), **_dumped(changes)})
 
 
@@ -126,6 +131,7 @@ def main() -> None:
     parser.add_argument("--firmware", choices=("marlin", "reprapfirmware"), required=True)
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--steps-per-mm", nargs="+", type=float, default=[80.0, 160.0])
+    parser.add_argument("--advance-k-s", type=float, default=0.0, help="Marlin's M900 K")
     parser.add_argument("--tolerance-um", nargs="+", type=float, default=[5.0])
     parser.add_argument("--tables", choices=("readback", "quality", "both"), default="both")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
@@ -141,7 +147,12 @@ def main() -> None:
             without_macros(plain_copy(find_input(name, shared), plain), own) for name in given.files
         ]
         cases = [
-            (source, machine_with(name, given.firmware, steps), steps, tolerance_um)
+            (
+                source,
+                machine_with(name, given.firmware, steps, given.advance_k_s),
+                steps,
+                tolerance_um,
+            )
             for source in sources
             for name in given.machines
             for steps in given.steps_per_mm

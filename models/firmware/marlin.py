@@ -93,7 +93,8 @@ class Marlin(FirmwareFacts):
     """MINIMUM_PLANNER_SPEED of 2.0 and 2.1."""
     linear_advance: bool | None = None
     """LIN_ADVANCE, classic: K above 0 caps accelerations. None: not known; times are planned as
-    without it, but a file that sets K is taken for one of a printer that has it."""
+    without it, but a file that sets K is taken for one of a printer that has it: the stream's
+    filament holds its advance, where that would not have lowered the accelerations."""
     linear_advance_k_s: NonNegative = 0.0
     """K at power-on (M900)."""
     min_arc_segment_mm: Positive = 0.1

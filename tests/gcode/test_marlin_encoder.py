@@ -127,7 +127,7 @@ def test_limits_of_a_stream() -> None:
     stream = stream_limits(own, 500.0)
     assert stream.min_segment_time_us == 0.0
     assert stream.retract_accel_mm_s2 == own.retract_accel_mm_s2
-    assert stream.linear_advance_k_s == own.linear_advance_k_s
+    assert stream.advance_in_filament == 0.0
     lines = MarlinVoice(FIRMWARE).limits(stream).decode().splitlines()
     assert lines == [
         "M201 X300000 Y300000 Z20000 E300000",
@@ -203,16 +203,27 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, None])
-def test_linear_advance_leaves_the_print_as_it_came(tmp_path: Path, stated: bool | None) -> None:
+def test_linear_advance_is_off_in_the_stream_and_on_again_behind_it(
+    tmp_path: Path, stated: bool | None
+) -> None:
     """Whether the machine says that it has it or only the file does."""
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_text("M900 K0.05\n" + PRINT)
     facts = {"home_mm": (0.0, 0.0, 0.0), "linear_advance": stated}
     machine = with_firmware(FIRMWARE.model_copy(update=facts))
     result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
-    assert len(result.put_back) == result.pieces > 0
-    assert all("M900 K0" in piece.reason for piece in result.put_back)
-    assert b"M205 B0" not in target.read_bytes()
+    assert result.pieces > 0
+    assert result.put_back == []
+    text = target.read_bytes()
+    lines = text.decode().splitlines()
+    on, off = (lines.index(f"; stillpath: stream {word}") for word in ("on", "off"))
+    known = [(i, line) for i, line in enumerate(lines) if line.startswith("M900")]
+    assert known[0][1] == "M900 K0.05"
+    assert {line for i, line in known if on < i < off - 8} == {"M900 K0"}
+    assert next(line for i, line in known if i >= off - 8) == "M900 K0.05"
+    fed = [Interpreter(machine).push(source.read_bytes()), Interpreter(machine).push(text)]
+    ends = [[b.moves.end_mm[-1, 3] for b in blocks if len(b.moves)][-1] for blocks in fed]
+    assert ends[1] == pytest.approx(ends[0], abs=1e-4)
 
 
 @pytest.mark.slow

@@ -49,7 +49,8 @@ S_SIZE = 25
 
 # A row of limits (MarlinLimits).
 L_ACCEL, L_FEEDRATE, L_PRINT, L_RETRACT, L_TRAVEL, L_JERK, L_DEVIATION = 0, 4, 8, 9, 10, 11, 15
-L_MIN_SEGMENT_US, L_MIN_FEEDRATE, L_MIN_TRAVEL, L_ADVANCE = 16, 17, 18, 19
+L_MIN_SEGMENT_US, L_MIN_FEEDRATE, L_MIN_TRAVEL = 16, 17, 18
+L_ADVANCE, L_IN_FILAMENT = 19, 20
 
 # Facts of the machine.
 C_STEPS_PER_MM = 0  # x y z e
@@ -187,7 +188,8 @@ def _block(
         accel = _up(limit[L_RETRACT] * per_mm)
     else:
         accel = _up((limit[L_PRINT] if e > 0.0 else limit[L_TRAVEL]) * per_mm)
-        if facts[C_ADVANCE] != 0.0 and limit[L_ADVANCE] > 0.0 and d3 > 0.0:
+        advances = facts[C_ADVANCE] != 0.0 and limit[L_IN_FILAMENT] == 0.0
+        if advances and limit[L_ADVANCE] > 0.0 and d3 > 0.0:
             accel = min(accel, _advance_cap(end, limit, facts, state) * per_mm)
         accel = _axis_accel(accel, limit[L_ACCEL] * facts[C_STEPS_PER_MM], steps, a)
         accel = _axis_accel(accel, limit[L_ACCEL + 1] * facts[C_STEPS_PER_MM + 1], steps, b)

@@ -9,7 +9,7 @@ import numpy as np
 from gcode.firmware._writing_kernels import printed_feedrate
 from models.jit import kernel
 
-__all__ = ["assign_rates", "bend_reversals", "thin"]
+__all__ = ["assign_rates", "bend_reversals", "spread_advance", "thin"]
 
 RUSH, RUSH_MM_S = 1.25, 10.0
 """No segment is hurried beyond this much of its planned speed and this much more: what is lost at
@@ -115,6 +115,48 @@ def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any) -> None:
             far_x, far_y = near_x, near_y
             near_x, near_y, near = steps[k, 0], steps[k, 1], k
             known += 1
+
+
+@kernel
+def spread_advance(
+    wanted_mm: Any,
+    keeps: Any,
+    fastest_mm_s: Any,
+    end_s: Any,
+    group: Any,
+    start_s: Any,
+    lead_mm: Any,
+) -> None:
+    """How far the filament is ahead at each end: as wanted, no faster than the extruder may.
+
+    Parameters
+    ----------
+    wanted_mm : ndarray, shape (n,)
+        K times the feed.
+    keeps : ndarray of bool, shape (n,)
+        Moves that do not print leave it as it is, as the firmware does.
+    fastest_mm_s, end_s, group : ndarray, shape (n,)
+    start_s : ndarray, shape (groups,)
+        When each group starts.
+    lead_mm : ndarray, shape (n,)
+        Filled. A stretch begins and ends with none.
+    """
+    count = len(end_s)
+    now = before_s = 0.0
+    for i in range(count):
+        if i == 0 or group[i] != group[i - 1]:
+            now, before_s = 0.0, start_s[group[i]]
+        if not keeps[i]:
+            most = fastest_mm_s[i] * max(end_s[i] - before_s, 0.0)
+            now += min(max(wanted_mm[i] - now, -most), most)
+        lead_mm[i] = now
+        before_s = end_s[i]
+    for i in range(count - 1, -1, -1):
+        if i + 1 == count or group[i + 1] != group[i]:
+            lead_mm[i] = 0.0
+        else:
+            most = fastest_mm_s[i + 1] * max(end_s[i + 1] - end_s[i], 0.0)
+            lead_mm[i] = min(lead_mm[i], lead_mm[i + 1] + most)
 
 
 @kernel

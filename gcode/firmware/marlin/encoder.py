@@ -3,7 +3,8 @@
 Marlin moves in whole steps and times them in whole ticks. The vertices lie on whole steps, so that
 its rounding changes nothing, and far enough apart that it executes each; the feedrates are those of
 step rates that it can produce, and what a segment gains or loses is carried to the next. What the
-law misses is measured with the firmware's own planner and corrected (docs/marlin.md).
+law misses is measured with the firmware's own planner and corrected. Linear advance is written into
+the filament (docs/marlin.md).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
+from gcode.firmware.advance import feed_at_ends
 from gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -27,8 +29,13 @@ from gcode.firmware.encoding import (
     limits_in_force,
     to_units,
 )
-from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
-from gcode.firmware.marlin.limits import MarlinLimits
+from gcode.firmware.marlin._encoder_kernels import (
+    assign_rates,
+    bend_reversals,
+    spread_advance,
+    thin,
+)
+from gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from gcode.firmware.marlin.planner import Planner
 from gcode.firmware.planning import join_phases
 from gcode.pieces import Piece
@@ -49,6 +56,8 @@ STREAM_JERK_MM_S = 500.0
 STREAM_E_JERK_MM_S = 100.0
 STREAM_Z_JERK_MM_S = 10.0
 
+_MOST_FEED = 3.0
+"""Filament per mm, above which the firmware takes a move for a retraction and advances none."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
@@ -58,17 +67,21 @@ _BYTES_PER_LINE = 32.0
 def stream_limits(own: MarlinLimits, velocity_mm_s: float) -> MarlinLimits:
     """Return what a stream runs under where the file has set `own`.
 
-    Retractions are not ours, so their acceleration stays; so does linear advance.
+    Retractions are not ours, so their acceleration stays. Linear advance is off, and the extruder
+    may be as much faster as the filament has to do for it.
     """
+    feed = 2.0 * own.feedrate_e_mm_s
+    if own.linear_advance_k_s > 0.0:
+        feed += 2.0 * max(advance_speed_mm_s(own, classic_jerk=jerk) for jerk in (False, True))
     return replace(
-        own,
+        without_advance(own),
         accel_x_mm_s2=STREAM_ACCEL_MM_S2,
         accel_y_mm_s2=STREAM_ACCEL_MM_S2,
         accel_z_mm_s2=max(own.accel_z_mm_s2, STREAM_Z_ACCEL_MM_S2),
         accel_e_mm_s2=STREAM_ACCEL_MM_S2,
         feedrate_x_mm_s=max(own.feedrate_x_mm_s, velocity_mm_s),
         feedrate_y_mm_s=max(own.feedrate_y_mm_s, velocity_mm_s),
-        feedrate_e_mm_s=2.0 * own.feedrate_e_mm_s,
+        feedrate_e_mm_s=feed,
         print_accel_mm_s2=STREAM_ACCEL_MM_S2,
         travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
         jerk_x_mm_s=STREAM_JERK_MM_S,
@@ -121,19 +134,12 @@ class MarlinEncoder:
         Raises
         ------
         GcodeError
-            Where linear advance would cap the stream's accelerations.
+            Where linear advance would drive the extruder faster than the firmware lets it.
         """
         own = cast(MarlinLimits, piece.limits_before)
-        if self._firmware.linear_advance is not False and own.linear_advance_k_s > 0.0:
-            raise GcodeError(
-                f"linear advance is on (M900 K{own.linear_advance_k_s:g}): Marlin would lower the "
-                "stream's accelerations and send the extruder a burst of steps at each of its "
-                "corners; print with M900 K0, or use --method advise, which leaves all moves as "
-                "they are. For a firmware without it say linear_advance false",
-                line=int(piece.moves.line[0]),
-            )
         limits = stream_limits(own, self._velocity)
-        moves = interleave(piece, timeline, self._on_steps(timeline, segments), 1)
+        segments = self._advanced(piece, timeline, self._on_steps(timeline, segments))
+        moves = interleave(piece, timeline, segments, 1)
         moves = self._where_the_file_says(piece, timeline, moves)
         rows = moves.row
         start = np.concatenate([moves.begin[None], moves.position[:-1]])
@@ -183,6 +189,36 @@ class MarlinEncoder:
         group_start_s[0] += delay_s
         row_start_s[: timeline.groups[0].last] += delay_s
         return replace(encoded, group_start_s=group_start_s, row_start_s=row_start_s)
+
+    def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
+        """Segments with linear advance in their filament.
+
+        The firmware's own would be lost: it adds and takes back steps during a block's ramps, and
+        those of a stream last a part of a step.
+        """
+        limits = cast(list[MarlinLimits], piece.limits)
+        k_s = np.array([x.linear_advance_k_s for x in limits])
+        if self._firmware.linear_advance is False or not np.any(k_s):
+            return segments
+        classic = self._firmware.junction == "classic_jerk"
+        fastest = np.array([advance_speed_mm_s(x, classic_jerk=classic) for x in limits])
+        if self._firmware.linear_advance is None:
+            _check_advance(piece, k_s, fastest)
+        row, feed_mm_s, prints = feed_at_ends(piece, timeline, segments)
+        prints &= piece.phases.direction[row, 3] <= _MOST_FEED
+        which = piece.moves.limits_id[row]
+        end_mm, lead_mm = segments.end_mm.copy(), np.zeros(len(segments))
+        spread_advance(
+            k_s[which] * feed_mm_s,
+            ~prints,
+            fastest[which],
+            segments.end_s,
+            segments.group,
+            timeline.start_s,
+            lead_mm,
+        )
+        end_mm[3] += lead_mm
+        return replace(segments, end_mm=end_mm)
 
     def _where_the_file_says(
         self, piece: Piece, timeline: Timeline, moves: Interleaved
@@ -256,3 +292,25 @@ class MarlinEncoder:
         planner = Planner(self._firmware, corexy=self._corexy)
         moves = as_moves(start_mm, end_mm, speed_mm_s, limits_id)
         return join_phases([planner.push_moves(moves, limits), planner.flush()])
+
+
+def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.float64]) -> None:
+    """Refuse what the firmware would slow down for linear advance, where the plan does not."""
+    limits = cast(list[MarlinLimits], piece.limits)
+    own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
+    which, direction = piece.moves.limits_id, piece.phases.direction
+    xy = np.abs(direction[:, :2])
+    moves = np.any(xy > 0.0, axis=1) & (direction[:, 3] > 0.0) & (direction[:, 3] <= _MOST_FEED)
+    largest = np.min(own[which, :2] / np.maximum(xy, 1e-9), axis=1)
+    accel = np.minimum(largest, own[which, 2])
+    advance = np.where(moves, k_s[which] * direction[:, 3] * accel, 0.0)
+    over = advance > 1.001 * fastest[which]
+    if np.any(over):
+        row = int(np.argmax(over))
+        raise GcodeError(
+            f"linear advance (M900 K{k_s[which[row]]:g}) would drive the extruder by "
+            f"{advance[row]:.1f} mm/s, more than its jerk of {fastest[which[row]]:.1f} mm/s: a "
+            "firmware that has it accelerates less, which is planned where the machine says "
+            "linear_advance true; for one without it say false",
+            line=int(piece.moves.line[row]),
+        )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from gcode.types import Limits
 from models.firmware import Marlin
 
-__all__ = ["MarlinLimits", "initial_limits"]
+__all__ = ["MarlinLimits", "advance_speed_mm_s", "initial_limits", "without_advance"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,8 @@ class MarlinLimits(Limits):
     """M205 T."""
     linear_advance_k_s: float
     """M900 K."""
+    advance_in_filament: float
+    """1 in a stream of a K above 0: the firmware has M900 K0, and the filament is ahead by K."""
 
 
 def initial_limits(firmware: Marlin) -> MarlinLimits:
@@ -72,4 +75,22 @@ def initial_limits(firmware: Marlin) -> MarlinLimits:
         min_feedrate_mm_s=planner.min_feedrate_mm_s,
         min_travel_feedrate_mm_s=planner.min_travel_feedrate_mm_s,
         linear_advance_k_s=firmware.linear_advance_k_s,
+        advance_in_filament=0.0,
     )
+
+
+def without_advance(own: MarlinLimits) -> MarlinLimits:
+    """Return limits under which the firmware's linear advance is off, and what K stays known."""
+    return replace(own, advance_in_filament=1.0) if own.linear_advance_k_s > 0.0 else own
+
+
+def advance_speed_mm_s(own: MarlinLimits, *, classic_jerk: bool) -> float:
+    """Return how fast linear advance moves the extruder at most, on top of what the file feeds.
+
+    The firmware lowers accelerations so that it is no more than the extruder's jerk
+    (Marlin/src/module/planner.cpp, `_populate_block`: MAX_E_JERK; 2.0.8, 2.1.2.5).
+    """
+    if classic_jerk:
+        return own.jerk_e_mm_s
+    half = math.sqrt(0.5)
+    return math.sqrt(own.junction_deviation_mm * half / (1.0 - half) * own.accel_e_mm_s2)

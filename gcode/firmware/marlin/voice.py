@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import cast
 
-from gcode.firmware.marlin.limits import MarlinLimits
+from gcode.firmware.marlin.limits import MarlinLimits, without_advance
 from gcode.types import Limits
 from models.firmware import Marlin
 
@@ -19,7 +19,7 @@ class MarlinVoice:
     """Lines that Marlin understands; see `gcode.firmware.base.Voice`.
 
     Sources: Marlin/src/gcode/config/M200-M205.cpp, gcode/feature/input_shaping/M593.cpp,
-    gcode/geometry/G92.cpp and parser.cpp, release 2.1.2 (2023-01).
+    gcode/geometry/G92.cpp, feature/advance/M900.cpp and parser.cpp, release 2.1.2 (2023-01).
     """
 
     notes = (
@@ -38,6 +38,7 @@ class MarlinVoice:
         self._has_shaper = firmware.variant != "2.0"
         if firmware.shaper is not None:
             self._has_shaper = firmware.shaper.freq_x_hz + firmware.shaper.freq_y_hz > 0.0
+        self._advances = firmware.linear_advance is not False
         self._classic_jerk = firmware.junction == "classic_jerk"
 
     @property
@@ -76,6 +77,8 @@ class MarlinVoice:
             )
         else:
             corner = f"J{own.junction_deviation_mm:.8g}"
+        k_s = 0.0 if own.advance_in_filament else own.linear_advance_k_s
+        advance = f"M900 K{k_s:.8g}\n" if self._advances and own.linear_advance_k_s else ""
         return (
             f"M201 X{own.accel_x_mm_s2:.8g} Y{own.accel_y_mm_s2:.8g} "
             f"Z{own.accel_z_mm_s2:.8g} E{own.accel_e_mm_s2:.8g}\n"
@@ -84,7 +87,7 @@ class MarlinVoice:
             f"M204 P{own.print_accel_mm_s2:.8g} R{own.retract_accel_mm_s2:.8g} "
             f"T{own.travel_accel_mm_s2:.8g}\n"
             f"M205 B{own.min_segment_time_us:.8g} S{own.min_feedrate_mm_s:.8g} "
-            f"T{own.min_travel_feedrate_mm_s:.8g} {corner}\n"
+            f"T{own.min_travel_feedrate_mm_s:.8g} {corner}\n{advance}"
         ).encode()
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
@@ -92,5 +95,9 @@ class MarlinVoice:
         return f"M204 P{accel_mm_s2:g} T{accel_mm_s2:g}\n".encode()
 
     def in_stream(self, limits: Limits) -> Limits:
-        """Return the limits as they are: Marlin has no macros that could read a mark."""
-        return limits
+        """Return the limits with linear advance off: a rest's own moves know none.
+
+        M900 makes the firmware stand still where K changes. Marlin has no macros that could read a
+        mark.
+        """
+        return without_advance(cast(MarlinLimits, limits))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
+from gcode.firmware.advance import feed_at_ends, final_segments
 from gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -155,7 +156,7 @@ class RepRapEncoder:
         if len(segments) < half:
             return segments
         begin_s = timeline.start_s[segments.group]
-        final = _final(segments)
+        final = final_segments(segments)
         before_s = np.append(0.0, segments.end_s[:-1])
         fresh = np.append(True, final[:-1])
         lasts = segments.end_s - np.where(fresh, begin_s, before_s)
@@ -171,16 +172,10 @@ class RepRapEncoder:
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Segments with pressure advance in their filament."""
-        final = _final(segments)
         end_mm = segments.end_mm.copy()
-        rows = np.searchsorted(timeline.row_start_s, segments.end_s, "right") - 1
-        rows = np.maximum(rows, 0)
+        rows, fed, _ = feed_at_ends(piece, timeline, segments)
         advance_s = np.array([x.pressure_advance_s for x in cast(list[RepRapLimits], piece.limits)])
-        phases = piece.phases
-        speed = _speed_at(phases, rows, segments.end_s - timeline.row_start_s[rows])
-        direction = phases.direction[rows]
-        prints = (direction[:, 3] > 0.0) & np.any(direction[:, :2] != 0.0, axis=1)
-        fed = np.where(prints & ~final, direction[:, 3] * speed, 0.0)
+        fed = np.where(final_segments(segments), 0.0, fed)
         end_mm[3] += advance_s[piece.moves.limits_id[rows]] * fed
         return replace(segments, end_mm=end_mm)
 
@@ -189,7 +184,7 @@ class RepRapEncoder:
         end_mm, end_s = segments.end_mm.copy(), segments.end_s.copy()
         if len(end_s) == 0:
             return segments
-        final = _final(segments)
+        final = final_segments(segments)
         end_mm[:3] = on_steps(end_mm[:3].T, self._firmware, self._kinematics).T
         end_mm[:, final] = segments.end_mm[:, final]
         fresh = np.append(True, final[:-1])
@@ -270,21 +265,3 @@ class RepRapEncoder:
         planner = RepRapPlanner(self._firmware, self._kinematics)
         planner.queue_moves(as_moves(start_mm, end_mm, speed_mm_s, limits_id), limits)
         return planner.flush()
-
-
-def _final(segments: Segments) -> NDArray[np.bool_]:
-    """Which segments end their stretch."""
-    return np.append(segments.group[1:] != segments.group[:-1], True)
-
-
-def _speed_at(
-    phases: Phases, rows: NDArray[np.int64], after_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Speed along the path of each row, so long after its start."""
-    up = np.minimum(after_s, phases.accel_s[rows])
-    down = np.clip(
-        after_s - phases.accel_s[rows] - phases.cruise_s[rows], 0.0, phases.decel_s[rows]
-    )
-    ends = after_s > phases.accel_s[rows] + phases.cruise_s[rows] + phases.decel_s[rows] + 1e-9
-    speed = phases.start_mm_s[rows] + phases.accel_mm_s2[rows] * (up - down)
-    return np.where(ends, 0.0, np.maximum(speed, 0.0))

@@ -1,0 +1,56 @@
+"""Pressure advance in the filament of a stream, where the firmware's own cannot be used.
+
+A firmware that adds advance during its ramps finds none in a stream of short segments, whose ramps
+last a part of a step. There its own is off, and the stream's filament is ahead by as much.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.pieces import Piece
+from gcode.segments import Segments
+from gcode.timeline import Timeline
+from gcode.types import Phases
+
+__all__ = ["feed_at_ends", "final_segments"]
+
+
+def feed_at_ends(
+    piece: Piece, timeline: Timeline, segments: Segments
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return what the plan feeds where each segment ends.
+
+    Returns
+    -------
+    row : ndarray of int64, shape (n,)
+        Row of the piece that the plan is in by then.
+    feed_mm_s : ndarray, shape (n,)
+        Speed of the extruder there; 0 in rows that do not print.
+    prints : ndarray of bool, shape (n,)
+        Whether the row moves X or Y and feeds forward.
+    """
+    rows = np.maximum(np.searchsorted(timeline.row_start_s, segments.end_s, "right") - 1, 0)
+    speed = _speed_at(piece.phases, rows, segments.end_s - timeline.row_start_s[rows])
+    direction = piece.phases.direction[rows]
+    prints = (direction[:, 3] > 0.0) & np.any(direction[:, :2] != 0.0, axis=1)
+    return rows, np.where(prints, direction[:, 3] * speed, 0.0), prints
+
+
+def final_segments(segments: Segments) -> NDArray[np.bool_]:
+    """Tell which segments end their stretch."""
+    return np.append(segments.group[1:] != segments.group[:-1], True)
+
+
+def _speed_at(
+    phases: Phases, rows: NDArray[np.int64], after_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Speed along the path of each row, so long after its start."""
+    up = np.minimum(after_s, phases.accel_s[rows])
+    down = np.clip(
+        after_s - phases.accel_s[rows] - phases.cruise_s[rows], 0.0, phases.decel_s[rows]
+    )
+    ends = after_s > phases.accel_s[rows] + phases.cruise_s[rows] + phases.decel_s[rows] + 1e-9
+    speed = phases.start_mm_s[rows] + phases.accel_mm_s2[rows] * (up - down)
+    return np.where(ends, 0.0, np.maximum(speed, 0.0))

@@ -1,0 +1,215 @@
+"""Linear advance: what the firmware's own does in a stream, and what the filament does instead."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcode.firmware.marlin._encoder_kernels import spread_advance
+from gcode.firmware.marlin.encoder import STREAM_ACCEL_MM_S2, stream_limits
+from gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
+from gcode.firmware.marlin.planner import Planner
+from gcode.firmware.marlin.voice import MarlinVoice
+from gcode.sampler import sample_phases
+from models.firmware import Marlin
+from models.firmware.marlin import MarlinPlanner, PerAxis
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.compensating import CompensatedPiece, PieceCompensator, Unfit
+from service.pipeline.options import Options
+from service.pipeline.yardstick import BestShaper
+from tests.gcode.cutting import HEAD, pieces_of
+
+K_S = 0.05
+PER_MM, E_PER_MM, FED = 80.0, 400.0, 0.033
+PRINTED = "G1 X90 E2 F6000\nG1 X90 Y60 E1\nG1 X20 E3.5 F3000\nG1 Y20 E2\n"
+
+
+# The firmware's own, block by block: a twin of its interrupts
+
+
+def lead_steps(blocks: list[tuple[float, float, float, float]], accel: float, release: str) -> Any:
+    """Extruder steps that it is ahead by at the end of each block.
+
+    Parameters
+    ----------
+    blocks : list of (mm, entry, cruise and exit speed)
+    release : "2.0" (stepper.cpp, `advance_isr`, with a timer of its own) or "2.1" (la_advance_rate,
+        on top of the block's own steps)
+    """
+    lead, leads = 0.0, []
+    rate = K_S * FED * accel * E_PER_MM
+    for length, entry, cruise, leave in blocks:
+        steps = round(length * PER_MM)
+        first, nominal, final = (v * PER_MM for v in (entry, cruise, leave))
+        rising = math.ceil((nominal**2 - first**2) / (2.0 * accel * PER_MM))
+        falling = math.floor((nominal**2 - final**2) / (2.0 * accel * PER_MM))
+        most, least = (K_S * FED * v * E_PER_MM for v in (cruise, leave))
+        now, clock = first, 0.0
+        for done in range(1, steps + 1):
+            wait = 1.0 / now
+            brakes = done > steps - falling
+            grows = not brakes if release == "2.0" else done <= rising + 1
+            if grows and lead < most:
+                more = rate * wait
+                lead += min(more, most - lead) if release == "2.0" else more
+            elif brakes and lead > least:
+                lead -= min(rate * wait, lead - least) if release == "2.0" else rate * wait
+            clock += wait
+            if done <= rising:
+                now = min(first + accel * PER_MM * clock, nominal)
+            elif done >= steps - falling:
+                now = max(math.sqrt(max(now**2 - 2.0 * accel * PER_MM, 0.0)), final)
+            else:
+                now = nominal
+        leads.append(lead)
+    return np.array(leads)
+
+
+@pytest.mark.parametrize("release", ["2.0", "2.1"])
+def test_the_firmwares_own_follows_a_ramp_and_not_a_stream(release: str) -> None:
+    full = K_S * FED * 100.0 * E_PER_MM
+    ramp = [(5.0, 2.0, 100.0, 100.0), (5.0, 100.0, 100.0, 2.0)]
+    leads = lead_steps(ramp, 3000.0, release)
+    assert leads[0] == pytest.approx(full, rel=0.05)
+    assert leads[1] == pytest.approx(0.02 * full, abs=3.0)
+    # The same as a stream: 5 mm/s slower every .2 mm. No block has a step in which it brakes.
+    speeds = np.arange(100.0, 4.0, -5.0)
+    stream = [(0.2, 5.0, 100.0, 100.0)]
+    stream += [(0.2, v, v, max(v - 5.0, 5.0)) for v in speeds]
+    leads = lead_steps(stream, STREAM_ACCEL_MM_S2, release)
+    assert leads[-1] >= full
+
+
+# The filament
+
+
+def spread(wanted: Any, end_s: Any, fastest: float, keeps: Any = None, group: Any = None) -> Any:
+    n = len(wanted)
+    lead = np.zeros(n)
+    groups = np.zeros(n, np.int64) if group is None else np.asarray(group)
+    starts = np.array([0.0, *np.asarray(end_s)[np.flatnonzero(np.diff(groups))]])
+    still = np.zeros(n, np.bool_) if keeps is None else np.asarray(keeps)
+    spread_advance(
+        np.asarray(wanted), still, np.full(n, fastest), np.asarray(end_s), groups, starts, lead
+    )
+    return lead
+
+
+def test_the_lead_is_built_up_kept_and_given_back() -> None:
+    end_s = 0.01 * np.arange(1, 9)
+    wanted = [0.03, 0.03, 0.03, 0.03, 0.0, 0.0, 0.0, 0.0]
+    keeps = [False] * 4 + [True] * 4
+    assert spread(wanted, end_s, 1.0, keeps) == pytest.approx(
+        [0.01, 0.02, 0.03, 0.03, 0.03, 0.02, 0.01, 0.0]
+    )
+    group = [0] * 4 + [1] * 4
+    assert spread([0.03] * 8, end_s, 2.0, None, group) == pytest.approx(
+        [0.02, 0.03, 0.02, 0.0, 0.02, 0.03, 0.02, 0.0]
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 50.0))
+@settings(max_examples=50, deadline=None)
+def test_the_lead_is_never_faster_than_the_extruder_may(seed: int, fastest: float) -> None:
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 80))
+    lasts = rng.uniform(1e-4, 2e-2, n)
+    group = np.sort(rng.integers(0, 3, n))
+    group -= group[0]
+    _, group = np.unique(group, return_inverse=True)
+    wanted, keeps = rng.uniform(0.0, 0.3, n), rng.random(n) < 0.3
+    lead = spread(wanted, np.cumsum(lasts), fastest, keeps, group)
+    fresh = np.append(True, np.diff(group) != 0)
+    change = lead - np.where(fresh, 0.0, np.append(0.0, lead[:-1]))
+    assert np.all(np.abs(change) <= fastest * lasts + 1e-12)
+    assert np.all((lead >= 0.0) & (lead <= np.max(wanted)))
+    assert np.all(lead[np.append(fresh[1:], True)] == 0.0)
+
+
+def machine_of(**changes: Any) -> Machine:
+    firmware = Marlin(
+        min_steps_per_segment=1,
+        home_mm=(0.0, 0.0, 0.0),
+        steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=400.0),
+        planner=MarlinPlanner(
+            max_accel_mm_s2=PerAxis(x=3000.0, y=3000.0, z=200.0, e=5000.0),
+            max_feedrate_mm_s=PerAxis(x=500.0, y=500.0, z=20.0, e=100.0),
+            accel_mm_s2=2000.0,
+            travel_accel_mm_s2=2000.0,
+            junction_deviation_mm=0.02,
+        ),
+    )
+    own = firmware.model_copy(update={"linear_advance": True, **changes})
+    return load_machine("ender3").model_copy(update={"firmware": own})
+
+
+def compensated(machine: Machine) -> CompensatedPiece:
+    piece = pieces_of(HEAD + PRINTED, machine)[1]
+    work = PieceCompensator(machine, Options(), BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0))
+    work.compensator.reset(piece.moves.start_mm[0, :2])
+    return work.compensate(piece)
+
+
+def test_the_filament_holds_what_the_firmware_has_switched_off() -> None:
+    made = compensated(machine_of(linear_advance_k_s=K_S))
+    t = made.timeline.dt_s * np.arange(made.command_mm.shape[1])
+    # From rest the first step takes 1/120 s, and everything is later by that.
+    delay_s = made.encoded.group_start_s[0] - made.timeline.start_s[0]
+    executed, _ = sample_phases(made.encoded.phases, t + delay_s)
+    planned = made.command_mm[3]
+    wanted = planned + K_S * np.gradient(planned, made.timeline.dt_s)
+    # It reaches K v = .05 * 100 * .067 = .33 mm, and is kept to some hundredths of that.
+    assert np.max(wanted - planned) > 0.15
+    assert np.sqrt(np.mean((executed[3] - wanted) ** 2)) < 1e-2
+    # It is given back, and places and times are those of a stream without it.
+    plain = compensated(machine_of(linear_advance_k_s=0.0))
+    assert made.encoded.position[-1, 3] == plain.encoded.position[-1, 3]
+    gap = executed[:2] - made.command_mm[:2]
+    assert np.quantile(np.hypot(*gap)[made.extruding], 0.99) <= 5e-3 + 1.0 / PER_MM
+
+
+def test_where_nobody_says_that_there_is_advance_nothing_is_slower_for_it() -> None:
+    # K .2 s, .1 of E per mm, 2000 mm/s2: 40 mm/s of the extruder; its jerk is 15.5 mm/s.
+    with pytest.raises(Unfit, match=r"M900 K0\.2.*15\.5 mm/s.*linear_advance true"):
+        compensated(machine_of(linear_advance=None, linear_advance_k_s=0.2))
+    made = compensated(machine_of(linear_advance=None, linear_advance_k_s=0.07))
+    assert made.encoded.limits.advance_in_filament == 1.0  # type: ignore[attr-defined]
+
+
+# Words and plans
+
+
+def test_advance_is_off_in_a_stream_and_in_its_rests() -> None:
+    firmware = Marlin(linear_advance=True, linear_advance_k_s=K_S)
+    own, voice = initial_limits(firmware), MarlinVoice(firmware)
+    stream = stream_limits(own, 500.0)
+    assert voice.limits(own).splitlines()[-1] == b"M900 K0.05"
+    assert voice.limits(stream).splitlines()[-1] == b"M900 K0"
+    assert voice.limits(voice.in_stream(own)).splitlines()[-1] == b"M900 K0"
+    # The extruder must be free for twice the feed and the advance.
+    assert stream.feedrate_e_mm_s > 2.0 * own.feedrate_e_mm_s + advance_speed_mm_s(
+        own, classic_jerk=False
+    )
+    for none in (Marlin(linear_advance=True), Marlin(linear_advance=False)):
+        limits = initial_limits(none)
+        assert b"M900" not in MarlinVoice(none).limits(stream_limits(limits, 500.0))
+
+
+def test_a_stream_is_not_slowed_down_by_advance() -> None:
+    firmware = Marlin(linear_advance=True, linear_advance_k_s=1.0, junction="classic_jerk")
+    own = initial_limits(firmware)
+    piece = pieces_of(HEAD + PRINTED, machine_of(linear_advance_k_s=1.0))[1]
+    durations = []
+    for limits in (own, stream_limits(own, 500.0)):
+        planner = Planner(firmware)
+        tables = [limits] * len(piece.limits)
+        planner.push_moves(piece.moves, tables)
+        planner.flush()
+        durations.append(planner.time_s)
+    assert durations[1] < 0.8 * durations[0]
