@@ -15,6 +15,8 @@ from gcode.types import Limits, Moves, Phases, ProgramBlock
 __all__ = ["QueuePlanner"]
 
 _ROWS = 1024
+_LARGE_TABLE = 64
+"""A file may change limits thousands of times: of so long a table only the rows in use are read."""
 
 
 class QueuePlanner(ABC):
@@ -94,8 +96,8 @@ class QueuePlanner(ABC):
         if n == 0:
             return
         if limits is not self._table or len(limits) != len(self._limits):
-            self._table = limits
-            self._limits = np.array([limit.as_row() for limit in limits])
+            self._table = limits if len(limits) <= _LARGE_TABLE else ()
+            self._limits = _rows_of(limits, moves.limits_id[begun:end])
         if self._count + n > len(self._queue):
             larger = np.empty((2 * (self._count + n), self._queue.shape[1]))
             larger[: self._count] = self._queue[: self._count]
@@ -133,3 +135,13 @@ class QueuePlanner(ABC):
     @abstractmethod
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
         """Say what is wrong with a move."""
+
+
+def _rows_of(limits: Sequence[Limits], used: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Return a table as an array; of a large one only the rows in use, all others are nan."""
+    if len(limits) <= _LARGE_TABLE:
+        return np.array([limit.as_row() for limit in limits])
+    rows = np.full((len(limits), len(limits[0].as_row())), np.nan)
+    for k in np.unique(used).tolist():
+        rows[k] = limits[k].as_row()
+    return rows
