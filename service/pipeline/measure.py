@@ -41,6 +41,8 @@ Array = NDArray[np.float64]
 STRIDE = 6
 """Contour errors are measured at every sixth sample: they change over tens of samples."""
 _TRACK_BINS = 400
+_LEAST_SAMPLES = 4096
+"""Shorter motion waits for more: between two pieces there are often a few moves only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +126,9 @@ class Measurement:
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._streams: dict[str, MachineStream] = {}
-        self._shaper = _ShaperStream(shaper, dt_s)
+        # Plants that change do so where the motion has come to.
+        least = 1 if machine.schedules else _LEAST_SAMPLES
+        self._shaper = _ShaperStream(shaper, dt_s, least)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
         self._spectra = ErrorSpectra(machine, dt_s, self._names)
@@ -433,10 +437,13 @@ class _Shaped:
 
 
 class _ShaperStream:
-    """The best shaper's command for a motion that arrives in blocks, with the delay taken out."""
+    """The best shaper's command for a motion that arrives in blocks, with the delay taken out.
 
-    def __init__(self, shaper: BestShaper, dt_s: float) -> None:
-        self._dt_s = dt_s
+    It comes once there are `least` samples of it.
+    """
+
+    def __init__(self, shaper: BestShaper, dt_s: float, least: int) -> None:
+        self._dt_s, self._least = dt_s, least
         self._pulses = [
             shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
         ]
@@ -453,7 +460,7 @@ class _ShaperStream:
         self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
         self._extruding = np.concatenate([self._extruding, samples.extruding])
         ready = len(self._extruding) - self._reach
-        return self._shape(ready) if ready > 0 else None
+        return self._shape(ready) if ready >= self._least else None
 
     def flush(self) -> _Shaped | None:
         """Return what is held, as if the machine stood still from now on."""
