@@ -26,6 +26,7 @@ from numba.core.caching import (
     IndexDataCacheFile,
     UserProvidedCacheLocator,
 )
+from numba.core.runtime.nrt import rtsys
 
 __all__ = ["kernel", "source_digest"]
 
@@ -70,6 +71,15 @@ class _KernelCache(FunctionCache):
                 source_digest(file, file.parents[function.__module__.count(".")]),
             ),
         )
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """See `numba.core.caching.Cache`, which would import all that compiling needs first.
+
+        To run what was compiled, the memory of arrays (`rtsys`) is enough.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(signature, target_context)  # type: ignore[no-untyped-call]
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """See `numba.core.caching.Cache`."""
