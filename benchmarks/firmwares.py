@@ -72,7 +72,7 @@ def machine_with(
             extruder=RepRapExtruder(max_speed_mm_s=100.0, max_accel_mm_s2=accel, jerk_mm_s=5.0),
             **common,
         )
-    advance = f"-k{advance_k_s:g}" if advance_k_s else ""
+    advance = f"-k{1e3 * advance_k_s:.0f}" if advance_k_s else ""
     changes = {"name": f"{name}-{firmware}-{steps_per_mm:.0f}{advance}", "firmware": other}
     return Machine.model_validate({**machine.model_dump(), **_dumped(changes)})
 
