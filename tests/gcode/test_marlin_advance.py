@@ -167,6 +167,9 @@ def test_the_filament_holds_what_the_firmware_has_switched_off() -> None:
     # It reaches K v = .05 * 100 * .067 = .33 mm, and is kept to some hundredths of that.
     assert np.max(wanted - planned) > 0.15
     assert np.sqrt(np.mean((executed[3] - wanted) ** 2)) < 1e-2
+    # In whole steps, so that it does not matter where the printer counts E from.
+    fed = np.diff(made.encoded.position[:, 3], prepend=made.encoded.begin[3])[:-1] * 400e-6
+    assert np.max(np.abs(fed - np.round(fed))) < 1e-3
     # It is given back, and places and times are those of a stream without it.
     plain = compensated(machine_of(linear_advance_k_s=0.0))
     assert made.encoded.position[-1, 3] == plain.encoded.position[-1, 3]

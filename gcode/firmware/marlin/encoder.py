@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
-from gcode.firmware.advance import feed_at_ends
+from gcode.firmware.advance import feed_at_ends, final_segments
 from gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -217,7 +217,13 @@ class MarlinEncoder:
             timeline.start_s,
             lead_mm,
         )
-        end_mm[3] += lead_mm
+        # Where E leads the steps, times depend on how it is rounded, and a stream counts E from
+        # anywhere: so it takes whole steps, as X and Y do.
+        begin_mm = timeline.group_start_mm[segments.group, 3]
+        per_mm = self._scale[3]
+        whole_mm = begin_mm + np.round((end_mm[3] + lead_mm - begin_mm) * per_mm) / per_mm
+        final = final_segments(segments)
+        end_mm[3] = np.where(final, end_mm[3], whole_mm)
         return replace(segments, end_mm=end_mm)
 
     def _where_the_file_says(
