@@ -7,12 +7,13 @@ become code.
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 
 from service.pipeline.files import replacing
 
@@ -64,11 +65,7 @@ def rendered(
     **values
         Names of the template; a missing one is an error.
     """
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(filters)
-    page = environment.from_string(asset(package, template))
+    page = _compiled(package, template, tuple(filters.items()))
     return page.render(style=style, style_hash=content_hash(style), **values)
 
 
@@ -80,3 +77,14 @@ def content_hash(text: str) -> str:
 def asset(package: str, name: str) -> str:
     """Return a text file of a package."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+@functools.cache  # compiling takes as long as the rest of a page
+def _compiled(
+    package: str, template: str, filters: tuple[tuple[str, Callable[..., str]], ...]
+) -> Template:
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters.update(filters)
+    return environment.from_string(asset(package, template))
