@@ -31,7 +31,7 @@ _IGNORED = frozenset(
 )
 _MOTION = frozenset({"G0", "G1", "G2", "G3", "G92"})
 _MOST_MOVES = 1_000_000
-_COMMENT = re.compile(r"\([^)]*\)")
+_COMMENT = re.compile(r"\([^)]*(?:\)|$)")
 _CODES = re.compile(r"(?<![A-Z_])([GM]) *0*(\d+)")
 
 

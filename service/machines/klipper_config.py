@@ -19,7 +19,7 @@ __all__ = ["Fact", "Option", "PrinterConfig", "facts", "read_printer_config"]
 _LARGEST_BYTES = 4_000_000
 _SAVED = "#*# "
 _SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
-_OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*?)\s*[:=]\s*(?P<value>.*)$")
+_OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
 _COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
 
 
