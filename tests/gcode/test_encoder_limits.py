@@ -45,8 +45,7 @@ def test_limits_of_moves() -> None:
     reach = np.minimum(path[1:] * most[1:], path[:-1] * most[:-1])
     half = np.sqrt(0.5 * (1.0 + cosine))
     turn = np.sqrt((np.sqrt(2.0) - 1.0) * half / np.maximum(1.0 - half, 1e-12))
-    corner = limits[which, 2] * np.sqrt(most / limits[which, 1])
-    corner = turn * np.minimum(corner[1:], corner[:-1])
+    corner = turn * np.minimum(limits[which[1:], 2], limits[which[:-1], 2])
     expected = np.minimum.reduce([by_filament, np.sqrt(0.5 * reach * tangent), corner])
     assert junction[0] == 0.0
     np.testing.assert_allclose(junction[1:], expected, rtol=1e-7)

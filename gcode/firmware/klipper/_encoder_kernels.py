@@ -93,27 +93,20 @@ def assign_speeds(
             late += least - available
             available = least
         v = length_mm[i] / available
-        loss = braking = 0.0
+        loss = 0.0
         for _ in range(3):
             corner = min(v, before, junction_mm_s[i])
             loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
-            braking = 0.0
             if before > corner:
-                braking = (before - corner) ** 2 / (2.0 * before_accel * before)
-            loss = min(loss + braking, 0.8 * available)
-            braking = min(braking, loss)
+                loss += (before - corner) ** 2 / (2.0 * before_accel * before)
+            loss = min(loss, 0.8 * available)
             v = min(length_mm[i] / (available - loss), speed_mm_s[i])
         feedrate[i] = printed_feedrate(60.0 * v)
         v = feedrate[i] / 60.0
-        # Where the loss falls: the move before brakes, this one gathers speed.
-        if i > 0:
-            predicted_s[i - 1] += braking
-        predicted_s[i] = length_mm[i] / v + loss - braking + correction_s[i]
-        now += predicted_s[i] + braking
+        predicted_s[i] = length_mm[i] / v + loss + correction_s[i]
+        now += predicted_s[i]
         before = v
         before_accel = accel_mm_s2[i]
-    if count > 0 and ours[count - 1]:
-        predicted_s[count - 1] += before / (2.0 * before_accel)
 
 
 @kernel

@@ -60,8 +60,6 @@ def move_limits(
             most = min(most, e_accel / abs(ratio))
             velocity = min(velocity, e_speed / abs(ratio))
         accel[i], speed[i] = most, velocity
-        # Junction deviation comes from the acceleration in force, which Z may not reach.
-        corner *= sqrt(most / own[1])
         junction[i] = 0.0
         if i > 0:
             step = abs(ratio - ratio0)
