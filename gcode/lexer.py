@@ -91,8 +91,16 @@ def _split_klipper(text: str) -> tuple[str, Mapping[str, str]]:
 
 def _split_standard(text: str, dialect: Dialect) -> list[Command]:
     """Cut a line as Marlin and RepRapFirmware do."""
-    line = text.rstrip("\r\n")
-    code = _without_comments(line, dialect)
+    first, *others = _without_comments(text.rstrip("\r\n"), dialect).split("\0")
+    commands = _commands_of(first, text, dialect)
+    if dialect.expressions:  # NUL ends a line; Marlin reads no further
+        for other in others:
+            if other.strip():
+                commands += _commands_of(other, text, dialect)
+    return commands or [Command("", {}, text)]
+
+
+def _commands_of(code: str, text: str, dialect: Dialect) -> list[Command]:
     if dialect.cut_long_commands:
         code = code[: dialect.longest_command]
     number = _LINE_NUMBER.match(code)
@@ -118,7 +126,7 @@ def _split_standard(text: str, dialect: Dialect) -> list[Command]:
     while code:
         command, code = _next_command(code, dialect, text, dropped)
         commands.append(command)
-    return commands or [Command("", {}, text, dropped)]
+    return commands
 
 
 def _without_comments(line: str, dialect: Dialect) -> str:
@@ -188,7 +196,8 @@ def _next_command(code: str, dialect: Dialect, text: str, dropped: str) -> tuple
         name, p = "", 0
     else:
         return Command(code.split()[0], {}, text, dropped), ""
-    if name in dialect.raw_text:
+    quoted = dialect.quoted_text and code[p:].lstrip(" \t").startswith('"')
+    if name in dialect.raw_text and not quoted:
         return Command(name, {}, text, dropped), ""
     found: dict[str, str] = {}
     uncertain = False

@@ -343,7 +343,7 @@ class TextMotion:
             yield from self._parts(samples)
         self.time_s = planner.time_s
         if moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code?")
+            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):

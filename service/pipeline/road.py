@@ -277,7 +277,7 @@ class _Job:
             self._operation.passed(item.moves)
             self._say("compensating", self._source.tell() / size)
         if self._sum.moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code?")
+            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
         if self._changes:
             self._emit(self._writer.end(self._sum.newline, self._checker.extruder_mm))
         self._measurement.finish()

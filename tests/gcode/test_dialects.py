@@ -188,6 +188,18 @@ CASES = {
         'M117 "G1 X9"\nM118 P0 S"G1 X9"\nG1 X1 F600\n',
         {"reprapfirmware": (1, 0, 0, 0)},
     ),
+    "a command behind quoted text": (
+        'M117 "G1 X9" G1 X1 F600\nM117 G1 X9 "G1 X9"\n',
+        {"reprapfirmware": (1, 0, 0, 0)},
+    ),
+    "NUL ends what is read": (
+        "G1 X5\0 Y3 F600\nG1\0\0X7\n\0G1 Z1\n",
+        same(FAMILY, 5, 0, 0, 0),
+    ),
+    "NUL ends a line": (
+        "G1 X5 F600\0 Y3\nG1 X6\0\0G1 Y1\n\0\0\n\0G1 Z1\n",
+        {"reprapfirmware": (6, 1, 1, 0)},
+    ),
 }  # fmt: skip
 
 
