@@ -140,12 +140,16 @@ class PieceCompensator:
             command = timeline.position_mm.copy()
             command[:2] = self.compensator.compensate(command[:2], extruding, timeline.rests)
             _retract_along(command, timeline, phases)
-            self._check_travel(command)
+            self._check_travel(command[:2], timeline.row, piece)
             segments, encoded = self._fit(piece, timeline, command)
             change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
             if change < _REST_TOLERANCE_S:
                 break
             rest_s = np.where(resting, encoded.rest_s, rest_s)
+        # Vertices are rounded, and moved on where they would coincide.
+        at = np.rint(encoded.start_s / DT_S).astype(np.int64)
+        row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
+        self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
         return CompensatedPiece(timeline, command, extruding, segments, encoded)
 
     def _fit(
@@ -193,14 +197,19 @@ class PieceCompensator:
         step = np.maximum(*np.abs(np.diff(velocity.T)))
         return float(np.max(step - rounding[:-1] - rounding[1:], initial=0.0))
 
-    def _check_travel(self, command: NDArray[np.float64]) -> None:
+    def _check_travel(
+        self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
+    ) -> None:
+        """See that places (2, n), each of a row of the piece's phases, lie within the travel."""
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
-            low, high = float(command[i].min()), float(command[i].max())
-            if low < travel.min_mm or high > travel.max_mm:
+            beyond = np.maximum(travel.min_mm - place_mm[i], place_mm[i] - travel.max_mm)
+            worst = int(np.argmax(beyond))
+            if beyond[worst] > 0.0:
+                line = int(piece.moves.line[piece.phases.move_index[row[worst]]])
                 raise Unfit(
-                    f"the command would take {axis} to {low if low < travel.min_mm else high:.3f} "
-                    f"mm, outside {travel.min_mm:g} to {travel.max_mm:g} mm"
+                    f"line {line}: the command would take {axis} to {place_mm[i, worst]:.4f} mm, "
+                    f"outside {travel.min_mm:.7g} to {travel.max_mm:.7g} mm"
                 )
 
 

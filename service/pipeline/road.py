@@ -339,8 +339,10 @@ class _Job:
             try:
                 made, executed, gap, text = self._attempt(piece, paced)
                 break
-            except (Unfit, GcodeError) as error:
+            except Unfit as error:
                 reason = str(error)
+            except GcodeError as error:  # its line is one of what was written
+                reason = f"the firmware would refuse what was made of it: {error.message}"
         else:
             self._put_back(piece, original_s, reason)
             return

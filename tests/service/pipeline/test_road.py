@@ -19,6 +19,7 @@ from models.machine import AxisTravel, Machine
 from models.plants import plant_set
 from models.reference_motion import reference_motion
 from models.store import load_machine
+from service.pipeline.compensating import PieceCompensator, Unfit
 from service.pipeline.measure import STRIDE, Measurement, MotionSamples
 from service.pipeline.options import Options
 from service.pipeline.progress import Cancelled, Progress
@@ -27,7 +28,7 @@ from service.pipeline.road import compensate_file, plan_file
 from service.pipeline.yardstick import BestShaper
 from simulation.measures import contour_error
 from simulation.response import response
-from tests.gcode.cutting import HEAD
+from tests.gcode.cutting import HEAD, pieces_of
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, states, tagged
 
@@ -176,6 +177,17 @@ BAD = {
     "outside": (HEAD.encode() + b"G1 X90 Y3\nG1 X311\n", 8),
     "late": (SMALL * 20 + b"G1 X5000\n", 20 * SMALL.count(b"\n") + 1),
 }
+
+
+def test_a_command_beyond_the_bed_names_the_file_s_line() -> None:
+    """A wall stands on the edge; its vertices' whole thousandths would be beyond."""
+    machine = load_machine("ender3")
+    travel = machine.travel | {"x": AxisTravel(min_mm=0, max_mm=100.0006)}
+    machine = machine.model_copy(update={"travel": travel})
+    wall = "G1 X100.0006 Y60 E2 F6000\nG1 Y90 E2\nG1 X60 E2\n"
+    piece = pieces_of((HEAD + wall).encode(), machine)[-1]
+    with pytest.raises(Unfit, match=r"line [78]: .* x to 100.0010 mm, outside 0 to 100.0006 mm"):
+        PieceCompensator(machine, Options()).compensate(piece)
 
 
 @pytest.mark.parametrize("name", BAD)
