@@ -10,8 +10,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from models.document import Document, Finite, NonNegative, Positive
 from models.errors import ModelError
 
 __all__ = [
@@ -27,16 +28,9 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SensorSpec(_Document):
+class SensorSpec(Document):
     """What a controller sees of the output.
 
     Attributes
@@ -54,7 +48,7 @@ class SensorSpec(_Document):
     quantum: NonNegative = 0.0
 
 
-class Tone(_Document):
+class Tone(Document):
     """amplitude * sin(2 pi f t + phase)."""
 
     f_hz: Positive
@@ -62,14 +56,14 @@ class Tone(_Document):
     phase_rad: Finite = 0.0
 
 
-class Narrowband(_Document):
+class Narrowband(Document):
     """A few tones at once."""
 
     kind: Literal["narrowband"] = "narrowband"
     tones: Annotated[tuple[Tone, ...], Field(min_length=1, max_length=64)]
 
 
-class Switched(_Document):
+class Switched(Document):
     """Tones that change at once at given times: from `start_s[i]` on, `parts[i]`.
 
     An empty part is silence. The phase of every tone counts from t = 0.
@@ -80,7 +74,7 @@ class Switched(_Document):
     parts: tuple[tuple[Tone, ...], ...]
 
 
-class Peak(_Document):
+class Peak(Document):
     """A hump of the spectrum: Gaussian in frequency, `width_hz` at half its power density."""
 
     f_hz: Positive
@@ -88,7 +82,7 @@ class Peak(_Document):
     rms: NonNegative
 
 
-class Wideband(_Document):
+class Wideband(Document):
     """Random, with humps in the spectrum and a white floor."""
 
     kind: Literal["wideband"] = "wideband"
@@ -96,7 +90,7 @@ class Wideband(_Document):
     floor_rms: NonNegative = 0.0
 
 
-class Periodic(_Document):
+class Periodic(Document):
     """Harmonics of one frequency; the period need not be a whole number of samples.
 
     Attributes

@@ -20,10 +20,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from models.diagrams import Block, polynomial_response
 from models.disturbances import SensorSpec
+from models.document import Document, Finite, Positive
 from models.errors import ModelError
 
 __all__ = [
@@ -39,8 +40,6 @@ __all__ = [
 
 Coefficients = tuple[float, ...]
 Complex = NDArray[np.complex128]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Polynomial = Annotated[tuple[Finite, ...], Field(min_length=1, max_length=64)]
 _LIBRARY = Path(__file__).parent / "library_loops"
 
@@ -264,11 +263,7 @@ class Loop:
         return (self.error_num, self.error_den) if self.fed_back else ((1.0,), (1.0,))
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ServoLoop(_Document):
+class ServoLoop(Document):
     """An identified closed servo T0 = num/den, rising powers of z^-1.
 
     Attributes
@@ -291,7 +286,7 @@ class ServoLoop(_Document):
         return Loop(self.num, self.den, self.dt_s, error_num=(0.0,), name=name)
 
 
-class PidLoop(_Document):
+class PidLoop(Document):
     """A plant with kp + ki dt/(1 - z^-1) and a filtered velocity.
 
     v = (kp + ki dt/(1 - z^-1)) (r - ym) - kv (1 - p)(1 - z^-1)/(1 - p z^-1) x, with
@@ -342,14 +337,14 @@ class PidLoop(_Document):
         return replace(bare, error_num=num, error_den=den, rate_num=(0.0,), rate_den=(1.0,))
 
 
-class Variation(_Document):
+class Variation(Document):
     """A member of the plant set: gain and delay of the plant changed."""
 
     gain: Positive = 1.0
     delay_samples: Annotated[float, Field(ge=0, le=64, allow_inf_nan=False)] = 0.0
 
 
-class LoopSpec(_Document):
+class LoopSpec(Document):
     """A closed-loop machine as a document.
 
     Attributes

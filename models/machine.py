@@ -12,9 +12,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from models.document import Document, Finite, NonNegative, Positive
 from models.errors import ModelError
 from models.firmware import Firmware, Klipper
-from models.firmware.common import Document, Finite, NonNegative, Positive
 from models.plants import PlantSetSpec
 from models.ripple import AxisRipple, MachineRipple, RippleAxis
 from models.schedule import AxisSchedule

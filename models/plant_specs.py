@@ -10,8 +10,9 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from models.document import Document, Finite, Positive
 from models.errors import ModelError
 from models.provenance import Provenance
 from models.roots import Roots, check_stable, dc_gain, normalise_dc, scaled_roots
@@ -31,19 +32,13 @@ __all__ = [
     "ZpkSpec",
 ]
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Damping = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 SamplingTime = Annotated[float, Field(gt=1e-6, le=1.0, allow_inf_nan=False)]
 Complex = tuple[Finite, Finite]
 """Real and imaginary part."""
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class _Plant(_Document):
+class _Plant(Document):
     """What every kind of plant can say about itself."""
 
     @property
@@ -84,7 +79,7 @@ class _Plant(_Document):
         return self
 
 
-class Mode(_Document):
+class Mode(Document):
     """One resonance: gain / (1 + 2 zeta s/w + s^2/w^2) with w = 2 pi f_hz."""
 
     f_hz: Positive
@@ -130,14 +125,14 @@ class ModesSpec(_Plant):
         return Roots(_complex(zeros), _complex(poles), sum(m.gain for m in self.modes), None)
 
 
-class PolePair(_Document):
+class PolePair(Document):
     """1 + 2 zeta s/w + s^2/w^2 in the denominator, w = 2 pi f_hz."""
 
     f_hz: Positive
     zeta: Damping
 
 
-class ZeroPair(_Document):
+class ZeroPair(Document):
     """1 + 2 zeta s/w + s^2/w^2 in the numerator; zeta < 0 is non-minimum phase."""
 
     f_hz: Positive
@@ -272,21 +267,21 @@ PlantSpec = Annotated[
 ]
 
 
-class WeightedMember(_Document):
+class WeightedMember(Document):
     """One plant the axis may turn into, with its share of the design."""
 
     plant: PlantSpec
     weight: Positive = 1.0
 
 
-class ParametricMembers(_Document):
+class ParametricMembers(Document):
     """Members = the nominal plant with every frequency scale x every damping scale."""
 
     frequency_scale: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=15)] = (1.0,)
     damping_scale: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=15)] = (1.0,)
 
 
-class PlantSetSpec(_Document):
+class PlantSetSpec(Document):
     """The plant of one axis (commanded to actual position) and what it may turn into.
 
     Attributes

@@ -5,7 +5,9 @@ from __future__ import annotations
 from datetime import date
 from typing import Annotated, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from models.document import Document, Finite, NonNegative, Positive
 
 __all__ = ["Kind", "MeasuredMode", "Provenance", "SourceFile"]
 
@@ -14,23 +16,15 @@ Kind: TypeAlias = Literal[
 ]
 """What a model was made of."""
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
-
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class SourceFile(_Document):
+class SourceFile(Document):
     """A file that was read: its name (no folder) and the SHA-256 of its bytes."""
 
     name: str
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
-class MeasuredMode(_Document):
+class MeasuredMode(Document):
     """A resonance with the standard deviations of its fit; None where the fit has none."""
 
     f_hz: Positive
@@ -39,7 +33,7 @@ class MeasuredMode(_Document):
     zeta_sd: NonNegative | None = None
 
 
-class Provenance(_Document):
+class Provenance(Document):
     """How the plants of an axis were found.
 
     Attributes

@@ -26,8 +26,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from models.document import Document, Finite, NonNegative
 from models.errors import ModelError
 
 __all__ = [
@@ -46,19 +47,12 @@ RippleSide = Literal["input", "output"]
 RippleAxis = Literal["x", "y", "a", "b"]
 """X and Y, and the motors of CoreXY: a (x + y) and b (x - y)."""
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 STEEPEST = 0.5
 """Largest slope |d delta / d s|: beyond 1 the motor would have to turn back to move on."""
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RippleHarmonic(_Document):
+class RippleHarmonic(Document):
     """amplitude_um sin(2 pi number s / pitch + phase_deg), s from the machine's zero."""
 
     number: Annotated[int, Field(ge=1, le=400)]
@@ -68,7 +62,7 @@ class RippleHarmonic(_Document):
     """Standard deviation of the amplitude, if it was measured."""
 
 
-class RippleSource(_Document):
+class RippleSource(Document):
     """One periodic part of the drive.
 
     Attributes
@@ -94,7 +88,7 @@ class RippleSource(_Document):
         return self
 
 
-class AxisRipple(_Document):
+class AxisRipple(Document):
     """Ripple of one axis.
 
     Attributes
@@ -155,11 +149,6 @@ class RippleTable:
     def steepest(self) -> float:
         """Bound of |d delta / d s|."""
         return float(self.wavenumber @ np.abs(self.coefficient_mm))
-
-    @property
-    def largest_mm(self) -> float:
-        """Bound of |delta|."""
-        return float(np.sum(np.abs(self.coefficient_mm)))
 
     def deviation_mm(self, position_mm: ArrayLike, weight: Array | None = None) -> Array:
         """Return delta at the positions, shape (n,).

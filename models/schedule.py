@@ -18,8 +18,9 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from models.document import Document, Finite, Positive
 from models.errors import ModelError
 from models.plant_specs import (
     FirSpec,
@@ -49,8 +50,6 @@ __all__ = [
     "resonances_hz",
 ]
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 Coordinate = Literal["x", "y", "z"]
 COORDINATES: tuple[Coordinate, ...] = ("x", "y", "z")
 
@@ -77,11 +76,7 @@ class MovingMass:
     sd_kg: float
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class MassSchedule(_Document):
+class MassSchedule(Document):
     """The axis moves the bed, and the print on it.
 
     Attributes
@@ -125,7 +120,7 @@ class MassSchedule(_Document):
             )
 
 
-class GridNode(_Document):
+class GridNode(Document):
     """The plant at one point; coordinates that do not matter are left out."""
 
     x_mm: Finite | None = None
@@ -134,7 +129,7 @@ class GridNode(_Document):
     plant: Annotated[ModesSpec | PairsSpec, Field(discriminator="kind")]
 
 
-class GridSchedule(_Document):
+class GridSchedule(Document):
     """Plants at the points of a full grid: every x with every y and z that occurs.
 
     All plants have the same structure, and number i of one is number i of all: mode with mode, pole
@@ -194,7 +189,7 @@ class GridSchedule(_Document):
         return self
 
 
-class AxisSchedule(_Document):
+class AxisSchedule(Document):
     """What changes the plants of one axis: the mass on the bed, the position, or both.
 
     A grid takes the place of the axis's nominal plant; the mass then works on what the grid gives.

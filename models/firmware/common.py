@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from models.document import Document, Finite, NonNegative, Positive
 
 __all__ = [
-    "Document",
-    "Finite",
     "FirmwareFacts",
     "FirmwareRetraction",
     "Hotend",
-    "NonNegative",
-    "Positive",
 ]
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class Document(BaseModel):
-    """Part of a machine document: unknown names are refused, nothing changes afterwards."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Hotend(Document):

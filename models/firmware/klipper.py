@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from models.firmware.common import Document, FirmwareFacts, Hotend, NonNegative, Positive
+from models.document import Document, NonNegative, Positive
+from models.firmware.common import FirmwareFacts, Hotend
 
 __all__ = ["Extruder", "FirmwareShaper", "Klipper", "PlannerLimits"]
 

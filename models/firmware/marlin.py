@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from models.firmware.common import Document, FirmwareFacts, Hotend, NonNegative, Positive
+from models.document import Document, NonNegative, Positive
+from models.firmware.common import FirmwareFacts, Hotend
 
 __all__ = ["Marlin", "MarlinPlanner", "MarlinShaper", "PerAxis", "PerAxisLimit"]
 

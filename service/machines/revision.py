@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import (
     AwareDatetime,
     BaseModel,
-    ConfigDict,
     Field,
     ValidationError,
     model_validator,
 )
 
+from models.document import Document
 from models.errors import ModelError
 from models.machine import Machine
 from models.provenance import SourceFile
@@ -49,11 +49,7 @@ class NotApproved(ModelError):
     """Only approved revisions may be used, and the machine has none."""
 
 
-class _Document(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Revision(_Document):
+class Revision(Document):
     """One state of a machine; written once, never changed.
 
     How its plants were found (residuals, modes with intervals) stands in the machine document, at
@@ -109,7 +105,7 @@ class Revision(_Document):
         return _checked(cls, {**fields, "machine": document, "content_sha256": _digest(document)})
 
 
-class Approval(_Document):
+class Approval(Document):
     """Somebody's word that a revision may be used."""
 
     number: Number

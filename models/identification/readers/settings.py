@@ -7,8 +7,9 @@ import re
 from datetime import date
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from models.document import Document, NonNegative, Positive
 from models.errors import ModelError
 from models.identification.types import AccelerationLog, Excitation, Spectrum
 
@@ -20,8 +21,6 @@ __all__ = [
     "excitation_notes",
 ]
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Column = str | Annotated[int, Field(ge=0)]
 """By name, or counted from 0."""
 
@@ -42,7 +41,7 @@ _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?!\d)")
 
 
-class ReadSettings(BaseModel):
+class ReadSettings(Document):
     """What a file leaves open; None means: as the file, its name or the firmware's date says.
 
     Attributes
@@ -71,8 +70,6 @@ class ReadSettings(BaseModel):
     dc_gain : float, optional
         The DC gain that the model may have: the steps per mm are off by this factor.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     axis: str | None = None
     accel_per_hz_mm_s: Positive | None = None
