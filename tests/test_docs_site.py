@@ -91,6 +91,24 @@ def test_commands_in_new_pages_exist():
         assert set(called) <= commands, page
 
 
+def test_the_page_of_the_command_line_names_every_command_and_no_option_that_is_missing():
+    from typer.main import get_command
+
+    from service.cli import app
+
+    def options(command: Any) -> Iterator[str]:
+        for parameter in command.params:
+            yield from (*parameter.opts, *parameter.secondary_opts)
+        for inner in getattr(command, "commands", {}).values():
+            yield from options(inner)
+
+    root = get_command(app)
+    page = (DOCS / "cli.md").read_text()
+    for name in root.commands:  # type: ignore[attr-defined]
+        assert re.search(rf"(`|^stillpath ){name}\b", page, re.MULTILINE), name
+    assert set(re.findall(r"--[a-z][a-z-]*", page)) <= {"--help", *options(root)}
+
+
 @pytest.mark.slow
 def test_the_site_builds_and_is_whole_in_itself(tmp_path: Path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
