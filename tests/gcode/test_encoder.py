@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from gcode.firmware._encoding_kernels import merge_still
 from gcode.firmware._writing_kernels import format_moves
+from gcode.firmware.klipper import encoder as encoder_module
 from gcode.firmware.planning import plan_moves
 from gcode.firmware.registry import kit
 from gcode.interpreter import interpret_bytes
@@ -88,6 +89,19 @@ def test_rests_pass_as_they_came(machine: Machine, work: PieceCompensator, name:
     assert len(own) == 0
     assert np.all(np.diff(encoded.start_s) > 0)
     assert np.all(encoded.feedrate_mm_min[encoded.row < 0] > 0)
+
+
+@pytest.mark.parametrize("name", sorted(BODIES))
+def test_law_of_losses_is_klippers(
+    machine: Machine, work: PieceCompensator, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the planner makes of the first feedrates leaves nothing to correct."""
+    piece = pieces_of(HEAD + BODIES[name], machine)[1]
+    corrected = made(work, piece).encoded
+    monkeypatch.setattr(encoder_module, "_PASSES", 1)
+    np.testing.assert_array_equal(
+        made(work, piece).encoded.feedrate_mm_min, corrected.feedrate_mm_min
+    )
 
 
 def test_rest_durations_are_klippers(machine: Machine) -> None:

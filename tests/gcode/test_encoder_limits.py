@@ -34,8 +34,13 @@ def test_limits_of_moves() -> None:
     alone = (travel[:, 0] == 0.0) & (travel[:, 1] == 0.0)
     pull = np.where(alone | (ratio < 0.0), np.abs(ratio), 0.0)
     with np.errstate(divide="ignore"):
-        most = np.minimum.reduce([limits[which, 1], z_accel / climb, e_accel / pull])
-        fastest = np.minimum.reduce([limits[which, 0], z_speed / climb, e_speed / pull])
+        # The extruder alone has limits of its own; the cruise ratio caps its peak.
+        given = np.where(stops, np.inf, limits[which, 1])
+        most = np.minimum.reduce([given, z_accel / climb, e_accel / pull])
+        given = np.where(stops, np.inf, limits[which, 0])
+        smooth = np.minimum(limits[which, 1] * (1.0 - limits[which, 3]), most)
+        peak = np.where(stops, np.sqrt(path * smooth), np.inf)
+        fastest = np.minimum.reduce([given, z_speed / climb, e_speed / pull, peak])
         by_filament = e_corner / np.abs(np.diff(ratio))
     np.testing.assert_allclose(accel, most, rtol=1e-9)
     np.testing.assert_allclose(speed, fastest, rtol=1e-9)
@@ -45,7 +50,8 @@ def test_limits_of_moves() -> None:
     reach = np.minimum(path[1:] * most[1:], path[:-1] * most[:-1])
     half = np.sqrt(0.5 * (1.0 + cosine))
     turn = np.sqrt((np.sqrt(2.0) - 1.0) * half / np.maximum(1.0 - half, 1e-12))
-    corner = turn * np.minimum(limits[which[1:], 2], limits[which[:-1], 2])
+    corner = limits[which, 2] * np.sqrt(accel / limits[which, 1])
+    corner = turn * np.minimum(corner[1:], corner[:-1])
     expected = np.minimum.reduce([by_filament, np.sqrt(0.5 * reach * tangent), corner])
     assert junction[0] == 0.0
     np.testing.assert_allclose(junction[1:], expected, rtol=1e-7)

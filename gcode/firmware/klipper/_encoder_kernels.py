@@ -26,6 +26,7 @@ def assign_speeds(
     junction_mm_s: NDArray[np.float64],
     correction_s: NDArray[np.float64],
     start_s: float,
+    braking_s: NDArray[np.float64],
     feedrate: NDArray[np.float64],
     predicted_s: NDArray[np.float64],
 ) -> None:
@@ -36,8 +37,10 @@ def assign_speeds(
     `junction_mm_s[i]` limits the speed between i - 1 and i.
 
     The time still to spend is the target minus the time predicted so far. Klipper loses
-    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. A
-    stretch starts when the rest before it is over: its times move with that.
+    (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. What
+    is lost by braking at the end of a segment hangs on the next one: `braking_s` holds it from
+    the run before and is renewed. A stretch starts when the rest before it is over: its times
+    move with that.
     """
     now = start_s
     before = 0.0
@@ -52,9 +55,10 @@ def assign_speeds(
             if not stops[i] and i > 0 and not stops[i - 1]:
                 entry = min(before, junction_mm_s[i], speed_mm_s[i])
             if i > 0 and ours[i - 1]:
-                loss = (before - entry) ** 2 / (2.0 * before_accel * before)
-                predicted_s[i - 1] += loss
-                now += loss
+                braking = (before - entry) ** 2 / (2.0 * before_accel * before)
+                predicted_s[i - 1] += braking - braking_s[i - 1]
+                now += braking - braking_s[i - 1]
+                braking_s[i - 1] = braking
             if not stops[i] and i + 1 < count and ours[i + 1]:
                 pending = i
                 pending_entry = entry
@@ -87,26 +91,40 @@ def assign_speeds(
         if i > 0 and not ours[i - 1]:
             # The stretch starts when its rest is over, whenever that is.
             late = now + planned_s[i] - end_s[i]
-        available = end_s[i] + late - now - correction_s[i]
+        available = end_s[i] + late - now - correction_s[i] - braking_s[i]
         least = max(length_mm[i] / speed_mm_s[i], RUSH * planned_s[i])
         if available < least:
             late += least - available
             available = least
         v = length_mm[i] / available
-        loss = 0.0
+        loss = braking = 0.0
+        behind = i > 0 and ours[i - 1]
         for _ in range(3):
             corner = min(v, before, junction_mm_s[i])
             loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
             if before > corner:
-                loss += (before - corner) ** 2 / (2.0 * before_accel * before)
-            loss = min(loss, 0.8 * available)
-            v = min(length_mm[i] / (available - loss), speed_mm_s[i])
+                braking = (before - corner) ** 2 / (2.0 * before_accel * before)
+            # Time that the segment before it was not given.
+            more = loss + (braking - braking_s[i - 1] if behind else braking)
+            v = min(length_mm[i] / (available - min(more, 0.8 * available)), speed_mm_s[i])
         feedrate[i] = printed_feedrate(60.0 * v)
         v = feedrate[i] / 60.0
-        predicted_s[i] = length_mm[i] / v + loss + correction_s[i]
+        corner = min(v, before, junction_mm_s[i])
+        loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
+        braking = (before - corner) ** 2 / (2.0 * before_accel * before) if before > 0.0 else 0.0
+        if behind:
+            predicted_s[i - 1] += braking - braking_s[i - 1]
+            now += braking - braking_s[i - 1]
+            braking_s[i - 1] = braking
+        else:
+            loss += braking
+        predicted_s[i] = length_mm[i] / v + loss + correction_s[i] + braking_s[i]
         now += predicted_s[i]
         before = v
         before_accel = accel_mm_s2[i]
+    if count > 0 and ours[count - 1]:
+        predicted_s[count - 1] += before / (2.0 * before_accel) - braking_s[count - 1]
+        braking_s[count - 1] = before / (2.0 * before_accel)
 
 
 @kernel

@@ -53,13 +53,20 @@ def move_limits(
         x, y, z, ratio = dx / safe, dy / safe, dz / safe, de / safe
         own = limits[limits_id[i]]
         velocity, most, corner = own[0], own[1], own[2]
+        if stops[i]:
+            velocity = most = inf  # no limit but the extruder's own
         if z != 0.0:
             most = min(most, z_accel / abs(z))
             velocity = min(velocity, z_speed / abs(z))
         if ratio < 0.0 or (dx == 0.0 and dy == 0.0 and ratio != 0.0):
             most = min(most, e_accel / abs(ratio))
             velocity = min(velocity, e_speed / abs(ratio))
+        if stops[i]:
+            # From rest to rest; the minimum cruise ratio caps the peak as a gentler acceleration.
+            velocity = min(velocity, sqrt(path * min(own[1] * (1.0 - own[3]), most)))
         accel[i], speed[i] = most, velocity
+        # The deviation belongs to the limits, the acceleration to the move: Z's is lower.
+        corner *= sqrt(most / own[1])
         junction[i] = 0.0
         if i > 0:
             step = abs(ratio - ratio0)

@@ -1,9 +1,9 @@
 """From a compensated command to the G1 lines that make Klipper execute it.
 
 Klipper re-plans every line. Under limits far above the motion's own the re-planned motion is the
-written one but for small losses at speed steps; these are predicted by their law, taken off the
-feedrate, and what the law misses is measured with the firmware's own planner and corrected in a
-second pass (docs/emission.md).
+written one but for small losses at speed steps; these are predicted by their law and taken off the
+feedrate. The firmware's own planner then says whether that was right; what the law misses, which is
+rare, is corrected in another pass (docs/emission.md).
 """
 
 from __future__ import annotations
@@ -115,9 +115,9 @@ class KlipperEncoder:
         length, accel, limit, junction, stops = self._motion(start_mm, end_mm, limits_id, limits)
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 
-        correction = np.zeros(len(rows))
-        feedrate, predicted = np.zeros(len(rows)), np.zeros(len(rows))
-        for _ in range(_PASSES):
+        correction, braking, feedrate, predicted = np.zeros((4, len(rows)))
+        # The first run finds what is lost by braking at each end, those behind it know.
+        for turn in range(1 + _PASSES):
             assign_speeds(
                 ours,
                 stops,
@@ -129,9 +129,12 @@ class KlipperEncoder:
                 junction,
                 correction,
                 float(timeline.start_s[0]),
+                braking,
                 feedrate,
                 predicted,
             )
+            if turn == 0:
+                continue
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
