@@ -197,6 +197,8 @@ def compensate(
     options = _options(**{k: v for k, v in chosen.items() if v is not None})
     _check_input(source)
     target = _check_output(output or source)
+    if output is not None and target.exists() and target.samefile(source):
+        raise _Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
     _check_folder(report)
     if server:
         compensate_on_server(

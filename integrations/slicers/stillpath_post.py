@@ -100,7 +100,7 @@ def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
     # A link is followed, so that what it points to is replaced and not the link.
     path = settings.file.resolve()
     if not path.is_file():
-        raise Failure(f"there is no file {path}")
+        raise Failure(f"{path} is a folder" if path.is_dir() else f"there is no file {path}")
     if not path.stat().st_size:
         raise Failure(f"{path} is empty")
     job = PrintJob(settings.file, settings.printer)
@@ -278,7 +278,7 @@ TEMPLATE = """\
 
 # What the slicer calls the printer, and the machine of Stillpath; * stands for anything.
 [machines]
-# "Original Prusa MK4 *" = "mk4"
+# "Creality Ender-3 *" = "mine"
 # "Voron 2.4 250" = "voron-v24-250"
 """
 

@@ -65,6 +65,10 @@ def compensate_in_place(
     except ValidationError as error:
         first = error.errors()[0]
         field = ".".join(str(part) for part in first["loc"])
+        if field == "method":
+            raise Refused(
+                f"unknown method {first['input']!r}; `stillpath compensate --help` lists them"
+            ) from None
         raise Refused(f"{field}: {first['msg']} (given: {first['input']!r})") from None
     except (GcodeError, ModelError, DesignError) as error:
         raise Refused(str(error)) from error

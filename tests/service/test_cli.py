@@ -147,6 +147,7 @@ def test_a_link_is_followed(road, source, tmp_path):
         ("-o {out} -m ender3 --tolerance-um wide", ["tolerance-um"]),
         ("-o {out} -m ender3 --in-place", ["either"]),
         ("-m ender3", ["either"]),
+        ("-o {source} -m ender3", ["is the input", "--in-place"]),
         ("-o {out}", ["machine"]),
         ("-o {folder} -m ender3", ["folder"]),
         ("-o {folder}/no/out.gcode -m ender3", ["does not exist"]),
