@@ -170,6 +170,7 @@ class PieceCompensator:
                 step_mm_s=step_mm_s,
                 grid_mm=self.encoder.grid_mm,
             )
+            self._keep_inside(segments)
             encoded = self.encoder.encode(piece, timeline, segments)
             step = self._speed_step(encoded.phases)
             if step <= limit:
@@ -179,6 +180,16 @@ class PieceCompensator:
             f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
             f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
         )
+
+    def _keep_inside(self, segments: Segments) -> None:
+        """Bring vertices back that the fit's tolerance or the grid would put off the bed."""
+        grid_mm = self.encoder.grid_mm
+        for i, axis in enumerate(("x", "y")):
+            travel = self._machine.travel[axis]  # type: ignore[index]
+            # The last lines of the grid on the bed, but for the rounding of decimals.
+            low = np.ceil(travel.min_mm / grid_mm - 1e-6) * grid_mm
+            high = np.floor(travel.max_mm / grid_mm + 1e-6) * grid_mm
+            np.clip(segments.end_mm[i], low, high, out=segments.end_mm[i])
 
     def _speed_step(self, phases: Phases) -> float:
         """Largest step of a motor's speed beyond what rounding to whole steps may bring."""

@@ -95,8 +95,8 @@ def test_stream_limits_are_what_z_leaves() -> None:
     own = kit(machine).initial_limits()
     stream = kit(machine).stream_limits(own)
     assert stream.accel_mm_s2 == pytest.approx(planner.max_z_accel_mm_s2 / SLOPE)
-    assert stream.velocity_mm_s == min(
-        machine.command.velocity_mm_s, planner.max_z_velocity_mm_s / SLOPE
+    assert stream.velocity_mm_s == pytest.approx(
+        min(2**0.5 * machine.command.velocity_mm_s, planner.max_z_velocity_mm_s / SLOPE)
     )
 
 

@@ -35,7 +35,9 @@ class KlipperKit:
     def __init__(self, machine: Machine, firmware: Klipper) -> None:
         self._machine = machine
         self._firmware = firmware
-        self._stream = stream_limits(firmware, machine.command.velocity_mm_s, machine.mesh_slope)
+        # The command keeps its speed axis by axis, Klipper its limit along the path.
+        fastest = math.hypot(machine.command.velocity_mm_s, machine.command.velocity_mm_s)
+        self._stream = stream_limits(firmware, fastest, machine.mesh_slope)
 
     @property
     def refusal(self) -> str | None:
