@@ -104,7 +104,8 @@ def commands_page() -> str:
     posting = subprocess.run(
         [sys.executable, ROOT / "integrations" / "slicers" / "stillpath_post.py", "--help"],
         check=True, capture_output=True, text=True, env=os.environ | {"COLUMNS": "96"},
-    ).stdout.replace("stillpath_post.py", "stillpath-post").replace(str(Path.home()), "~")  # fmt: skip
+    ).stdout  # fmt: skip
+    posting = posting.replace("stillpath_post.py", "stillpath-post").replace(str(Path.home()), "~")
     parts += ["## stillpath-post", f"```text\n{posting.strip()}\n```"]
     return "\n\n".join(parts) + "\n"
 
