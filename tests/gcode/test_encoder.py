@@ -209,7 +209,8 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
 def test_stream_limits_are_the_machines(machine: Machine) -> None:
     firmware = kit(machine)
     stream = firmware.stream_limits(firmware.initial_limits())
-    assert stream.as_row() == (machine.command.velocity_mm_s, 300_000.0, 500.0, 0.0)
+    diagonal = pytest.approx(2**0.5 * machine.command.velocity_mm_s)
+    assert stream.as_row() == (diagonal, 300_000.0, 500.0, 0.0)
     piece = pieces_of(HEAD + BODIES["corners"], machine)[1]
     moves = piece.moves
     phases = plan_moves(moves, piece.limits, machine)

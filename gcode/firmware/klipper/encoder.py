@@ -39,6 +39,8 @@ STREAM_ACCEL_MM_S2 = 300_000.0
 that a command of somebody else that slips in is no disaster (docs/emission.md)."""
 STREAM_CORNER_MM_S = 500.0
 
+_Z_GRID = 10
+"""A slow climb, a vase's, on steps of a um is flat and then too steep for Z's low acceleration."""
 _PASSES = 4
 _TIME_TOLERANCE_S = 2e-6
 
@@ -78,13 +80,14 @@ class KlipperEncoder:
     limits : KlipperLimits
         What the stream runs under.
     decimals : int
-        Decimals of X, Y and Z; the last point of every stretch keeps all the file's digits.
+        Decimals of X and Y (Z has 5); the last point of every stretch keeps all the file's digits.
     """
 
     def __init__(self, firmware: Klipper, limits: KlipperLimits, *, decimals: int = 3) -> None:
         self._firmware = firmware
         self._grid = 10 ** (6 - decimals)
         self.grid_mm = self._grid / UNITS_PER_MM
+        self._grids = np.array([self._grid, self._grid, min(self._grid, _Z_GRID)])
         self._limits = limits
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
@@ -106,7 +109,7 @@ class KlipperEncoder:
         GcodeError
             When the firmware would refuse a move.
         """
-        moves = interleave(piece, timeline, segments, self._grid)
+        moves = interleave(piece, timeline, segments, self._grids)
         rows, position = moves.row, moves.position
         start = np.concatenate([moves.begin[None], position[:-1]])
         start_mm, end_mm = start / UNITS_PER_MM, position / UNITS_PER_MM
