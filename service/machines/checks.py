@@ -19,6 +19,7 @@ __all__ = [
     "differences",
     "machine_from_config",
     "not_followed",
+    "typed_in",
 ]
 
 _DEFAULT_HZ = 50.0
@@ -160,7 +161,7 @@ def machine_from_config(
         "title": title or name,
         "source": config.name,
         "axes": {
-            axis: _typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
+            axis: typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
             for axis, given in zip("xy", f_hz, strict=True)
         },
     }
@@ -181,7 +182,11 @@ def not_followed(config: PrinterConfig) -> list[str]:
     ]
 
 
-def _typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
+def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
+    """Return an axis of one resonance with a wide set around it, which nobody measured.
+
+    Without a frequency (0) it is 50 Hz.
+    """
     mode = {"f_hz": f_hz or _DEFAULT_HZ, "zeta": zeta}
     return {
         "nominal": {"kind": "modes", "modes": [mode]},

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "data_dir", "open_documents", "open_machines", "who"]
 
+_LARGEST_LOG_BYTES = 10_000_000
+
 _Made = TypeVar("_Made")
 
 
@@ -360,6 +362,66 @@ def from_config(
         typer.echo(f"note: {line}")
 
 
+@app.command("from-m503")
+def from_m503(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What Marlin answers to M503.")],
+    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
+    travel: Annotated[
+        str, typer.Option(metavar="XxYxZ", help="How far the axes reach, mm: 235x235x250.")
+    ],
+    kinematics: Annotated[str, typer.Option(help="cartesian or corexy.")] = "cartesian",
+    title: Annotated[str, typer.Option(help="What people call it.")] = "",
+    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
+    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
+    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
+    fields: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="FIELD=VALUE",
+            help="What M503 does not say, from Configuration.h and _adv.h: "
+            "min_steps_per_segment=1, variant=2.0, s_curve=true, ... (docs/machines.md).",
+        ),
+    ] = None,
+    by: By = None,
+) -> None:
+    """Make a machine from Marlin's M503: limits and steps, with plants still to be measured."""
+    from service.machines import marlin_settings
+    from service.machines.revision import source_file
+
+    content = _m503(file)
+    machine = marlin_settings.machine_from_m503(
+        content.decode(errors="replace"),
+        file.name,
+        name,
+        travel_mm=marlin_settings.read_travel(travel),
+        kinematics=kinematics,
+        title=title,
+        f_hz=(fx, fy),
+        zeta=zeta,
+        fields=fields or (),
+    )
+    revision = open_machines().store.add_revision(
+        name,
+        machine,
+        author=who(by),
+        message=f"M503 in {file.name}; plants typed in",
+        sources=[source_file(file.name, content)],
+        expected=0,
+    )
+    _told(revision)
+    said = {field.partition("=")[0].strip() for field in fields or ()}
+    assumed = [
+        f"{field}={str(value).lower()}"
+        for field, value in marlin_settings.ASSUMED.items()
+        if field not in said
+    ]
+    if assumed:
+        typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
+    for line in _refused(machine):
+        typer.echo(line)
+
+
 def who(by: str | None) -> str:
     """Return the author that was named, else the user of this computer."""
     if by is not None:
@@ -409,6 +471,15 @@ def _leading(revision: Revision, axis: Any) -> str:
 
     mode = leading(revision.machine.axes[axis].nominal)
     return "" if mode is None else f"{mode[0]:.1f}"
+
+
+def _m503(file: Path) -> bytes:
+    try:
+        if file.stat().st_size > _LARGEST_LOG_BYTES:
+            raise ModelError(f"{file}: over {_LARGEST_LOG_BYTES} bytes; keep M503's answer only")
+        return file.read_bytes()
+    except OSError as error:
+        raise ModelError(f"cannot read {file}: {error.strerror}") from None
 
 
 def _told(revision: Revision) -> None:
