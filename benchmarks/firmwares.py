@@ -32,7 +32,11 @@ _LEAST_WITHIN = 0.99
 
 
 def machine_with(
-    name: str, firmware: str, steps_per_mm: float, advance_k_s: float = 0.0
+    name: str,
+    firmware: str,
+    steps_per_mm: float,
+    advance_k_s: float = 0.0,
+    min_steps: int = 1,
 ) -> Machine:
     """Return a printer with another firmware, under the limits of golden/klipper/README.md."""
     machine = load_machine(name)
@@ -54,7 +58,7 @@ def machine_with(
                 jerk_mm_s=PerAxisLimit(x=8.0, y=8.0, z=0.4, e=5.0),
                 junction_deviation_mm=0.013,
             ),
-            min_steps_per_segment=1,
+            min_steps_per_segment=min_steps,
             linear_advance=True if advance_k_s > 0.0 else None,
             linear_advance_k_s=advance_k_s,
             **common,
@@ -73,7 +77,8 @@ def machine_with(
             **common,
         )
     advance = f"-k{1e3 * advance_k_s:.0f}" if advance_k_s else ""
-    changes = {"name": f"{name}-{firmware}-{steps_per_mm:.0f}{advance}", "firmware": other}
+    least = f"-least{min_steps}" if min_steps > 1 else ""
+    changes = {"name": f"{name}-{firmware}-{steps_per_mm:.0f}{advance}{least}", "firmware": other}
     return Machine.model_validate({**machine.model_dump(), **_dumped(changes)})
 
 
@@ -132,6 +137,9 @@ def main() -> None:
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--steps-per-mm", nargs="+", type=float, default=[80.0, 160.0])
     parser.add_argument("--advance-k-s", type=float, default=0.0, help="Marlin's M900 K")
+    parser.add_argument(
+        "--min-steps", nargs="+", type=int, default=[1], help="Marlin's MIN_STEPS_PER_SEGMENT"
+    )
     parser.add_argument("--tolerance-um", nargs="+", type=float, default=[5.0])
     parser.add_argument("--tables", choices=("readback", "quality", "both"), default="both")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
@@ -149,13 +157,14 @@ def main() -> None:
         cases = [
             (
                 source,
-                machine_with(name, given.firmware, steps, given.advance_k_s),
+                machine_with(name, given.firmware, steps, given.advance_k_s, least),
                 steps,
                 tolerance_um,
             )
             for source in sources
             for name in given.machines
             for steps in given.steps_per_mm
+            for least in given.min_steps
             for tolerance_um in given.tolerance_um
         ]
         if given.tables != "quality":

@@ -57,7 +57,7 @@ _BLOCK = 200_000
 _READ_BYTES = 1 << 20
 _SAME_MM, _SAME_E_MM = 1e-4, 5e-3
 _LOST = 3
-_JUMP_MM = 0.05
+_JUMP_MM = 0.2
 """Places that are whole motor steps are not jumps."""
 _SHAPER_REACH_S = 0.15
 _STOPPING = np.array([int(kind) for kind in sorted(STOPPING)])

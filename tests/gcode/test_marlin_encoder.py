@@ -74,10 +74,19 @@ def test_a_turn_straight_back_gets_a_step_to_the_side() -> None:
     # Also across a vertex where nothing moves.
     steps = np.array([[10, 0, 0], [10, 0, 0], [2, 0, 0], [-5, 0, 0]], np.int64)
     wish = steps[:, :2] + np.array([0.0, -0.3])
-    bend_reversals(steps, np.zeros((1, 3), np.int64), np.zeros(4, np.int64), wish)
+    bend_reversals(steps, np.zeros((1, 3), np.int64), np.zeros(4, np.int64), wish, 1, False)
     assert steps[:, 0].tolist() == [10, 10, 2, -5]
     assert steps[2, 1] == -1
     assert steps[3].tolist() == [-5, 0, 0]
+
+
+def test_no_turn_is_bent_into_a_move_that_is_swallowed() -> None:
+    # Back along X, then 6 steps along Y: a step towards them would leave 5.
+    steps = np.array([[20, 0, 0], [8, 0, 0], [8, 6, 0], [30, 6, 0]], np.int64)
+    for least, y in ((1, 1), (6, -1)):
+        bent, group = steps.copy(), np.zeros(4, np.int64)
+        bend_reversals(bent, np.zeros((1, 3), np.int64), group, steps[:, :2] + 0.2, least, False)
+        assert bent[1].tolist() == [8, y, 0]
 
 
 # Rates
@@ -161,7 +170,7 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
         ({"s_curve": True}, "S_CURVE"),
-        ({"min_steps_per_segment": 6}, "MIN_STEPS_PER_SEGMENT 1"),
+        ({"min_steps_per_segment": 20}, "MIN_STEPS_PER_SEGMENT 1"),
         ({"planner": MarlinPlanner(junction_deviation_mm=0.005)}, "M205 J takes 0.01 to 0.3 mm"),
     ],
 )
@@ -173,8 +182,13 @@ def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) ->
     assert "--method advise" in refusal
 
 
-def test_a_stock_machine_can() -> None:
-    assert MarlinKit(with_firmware(), FIRMWARE).refusal is None
+@pytest.mark.parametrize("per_mm", [80.0, 160.0])
+def test_a_stock_machine_can(per_mm: float) -> None:
+    """With the 6 steps that nearly every configuration has, which is our default too."""
+    assert Marlin().min_steps_per_segment == 6
+    facts = {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=per_mm, y=per_mm, z=400, e=93)}
+    for firmware in (FIRMWARE, FIRMWARE.model_copy(update=facts)):
+        assert MarlinKit(with_firmware(firmware), firmware).refusal is None
 
 
 # The road

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gcode.firmware._writing_kernels import printed_feedrate
+from gcode.firmware.marlin._vertex_kernels import hop
 from models.jit import kernel
 
 __all__ = ["assign_rates", "bend_reversals", "spread_advance", "thin"]
@@ -78,11 +79,12 @@ def thin(
 
 
 @kernel
-def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any) -> None:
+def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any, least: int, corexy: bool) -> None:
     """Make no vertex an exact turn back: by junction deviation the releases would stop there.
 
     They begin at 120 steps/s behind it, which takes 1/120 s for the first step. A step to the side
-    at the next vertex, towards where it was meant to be, is angle enough.
+    at the next vertex, towards where it was meant to be, is angle enough; away from there, where
+    the firmware would swallow a move of fewer than `least` steps otherwise.
 
     Parameters
     ----------
@@ -109,7 +111,12 @@ def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any) -> None:
                 break
             at = near if final and near >= 0 else k
             axis = 1 if abs(bx) >= abs(by) else 0
-            steps[at, axis] += 1 if wish[at, axis] >= steps[at, axis] else -1
+            aside = 1 if wish[at, axis] >= steps[at, axis] else -1
+            steps[at, axis] += aside
+            if least > 1 and not _far_enough(steps, begin, group, at, least, corexy):
+                steps[at, axis] -= 2 * aside
+                if not _far_enough(steps, begin, group, at, least, corexy):
+                    steps[at, axis] += aside
             near_x, near_y = (steps[at, 0], steps[at, 1]) if at == near else (near_x, near_y)
         if steps[k, 0] != near_x or steps[k, 1] != near_y:
             far_x, far_y = near_x, near_y
@@ -160,12 +167,19 @@ def spread_advance(
 
 
 @kernel
-def _hop(a: Any, b: Any, corexy: bool) -> int:
-    """Count the steps of the motor that makes the most of them."""
-    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-    if corexy:
-        dx, dy = dx + dy, dx - dy
-    return int(max(abs(dx), abs(dy), abs(dz)))
+def _far_enough(steps: Any, begin: Any, group: Any, k: int, least: int, corexy: bool) -> bool:
+    """Tell whether a vertex is `least` steps from both of its neighbours."""
+    first = k == 0 or group[k - 1] != group[k]
+    before = begin[group[k]] if first else steps[k - 1]
+    if _hop(steps[k], before, corexy) < least:
+        return False
+    final = k + 1 == len(group) or group[k + 1] != group[k]
+    return final or _hop(steps[k + 1], steps[k], corexy) >= least
+
+
+@kernel(inline=True)
+def _hop(a: Any, b: Any, corexy: bool) -> Any:
+    return hop(a[0] - b[0], a[1] - b[1], a[2] - b[2], corexy)
 
 
 @kernel(inline=True)

@@ -9,6 +9,7 @@ the filament (docs/marlin.md).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -35,6 +36,7 @@ from gcode.firmware.marlin._encoder_kernels import (
     spread_advance,
     thin,
 )
+from gcode.firmware.marlin._vertex_kernels import choose_vertices
 from gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from gcode.firmware.marlin.planner import Planner
 from gcode.firmware.planning import join_phases
@@ -104,12 +106,22 @@ class MarlinEncoder:
     velocity_mm_s : float
         Highest speed of the command.
     corexy : bool
+    speed_step_mm_s : float
+        Largest step of a motor's speed.
     """
 
-    def __init__(self, firmware: Marlin, velocity_mm_s: float, *, corexy: bool) -> None:
+    def __init__(
+        self,
+        firmware: Marlin,
+        velocity_mm_s: float,
+        *,
+        corexy: bool,
+        speed_step_mm_s: float = np.inf,
+    ) -> None:
         self._firmware = firmware
         self._velocity = velocity_mm_s
         self._corexy = corexy
+        self._speed_step = speed_step_mm_s
         self._releases = firmware.variant in ("2.0", "2.1")
         scale = firmware.steps_per_mm
         self._scale = np.array([scale.x, scale.y, scale.z, scale.e])
@@ -250,6 +262,12 @@ class MarlinEncoder:
         scale = self._scale[:3]
         steps = np.round(segments.end_mm[:3].T * scale).astype(np.int64)
         begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
+        if self._firmware.min_steps_per_segment > 1:
+            chosen = self._chosen(timeline, segments, steps, begin)
+            steps = steps[chosen]
+            segments = Segments(
+                segments.end_s[chosen], segments.end_mm[:, chosen], segments.group[chosen]
+            )
         keep = np.ones(len(segments), np.bool_)
         thin(
             steps,
@@ -265,10 +283,46 @@ class MarlinEncoder:
         )
         steps, group, end_mm = steps[keep], segments.group[keep], segments.end_mm[:, keep]
         if self._releases and self._firmware.junction == "deviation":
-            bend_reversals(steps, begin, group, (end_mm[:2].T * scale[:2]))
+            wish = end_mm[:2].T * scale[:2]
+            least = self._firmware.min_steps_per_segment
+            bend_reversals(steps, begin, group, wish, least, self._corexy)
         last = np.append(group[1:] != group[:-1], True)
         end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
         return Segments(segments.end_s[keep], end_mm, group)
+
+    def _chosen(
+        self,
+        timeline: Timeline,
+        segments: Segments,
+        steps: NDArray[np.int64],
+        begin: NDArray[np.int64],
+    ) -> NDArray[np.bool_]:
+        """Tell which vertices to keep, and move them in place, so that none is swallowed."""
+        scale, dt_s = self._scale, timeline.dt_s
+        keep = np.ones(len(segments), np.bool_)
+        firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
+        for first, stop in itertools.pairwise((*firsts, len(segments))):
+            group = segments.group[first]
+            start_s, start_mm = timeline.start_s[group], timeline.group_start_mm[group, :2]
+            at_s = np.append(0.0, segments.end_s[first:stop] - start_s)
+            place = np.vstack([begin[group], steps[first:stop]])
+            fitted = np.column_stack([start_mm, segments.end_mm[:2, first:stop]])
+            t_s = dt_s * np.arange(int(at_s[-1] / dt_s) + 1)
+            command = np.column_stack([np.interp(t_s, at_s, fitted[i]) * scale[i] for i in (0, 1)])
+            kept = np.ones(len(place), np.bool_)
+            if choose_vertices(
+                place,
+                at_s,
+                command,
+                dt_s,
+                self._firmware.min_steps_per_segment,
+                (scale[0] / scale[1]) ** 2,
+                self._speed_step * scale[:2],
+                self._corexy,
+                kept,
+            ):
+                steps[first:stop], keep[first:stop] = place[1:], kept[1:]
+        return keep
 
     def _blocks(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]

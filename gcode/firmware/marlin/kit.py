@@ -25,9 +25,9 @@ __all__ = ["LONGEST_LEAST_MM", "MIN_STREAM_ACCEL_MM_S2", "MarlinKit"]
 MIN_STREAM_ACCEL_MM_S2 = 30_000.0
 """Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
 
-LONGEST_LEAST_MM = 0.02
-"""Longest of the shortest moves that a firmware may execute: where a command turns back within
-20 mm/s and 1 ms, vertices lie that near."""
+LONGEST_LEAST_MM = 0.1
+"""Longest of the shortest moves that a firmware may execute: a turn straight back is cut off by a
+quarter of it, and a stand in the middle of a stretch is crossed by half of it (docs/marlin.md)."""
 
 JUNCTION_DEVIATION_MM = (0.01, 0.3)
 """What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
@@ -49,6 +49,7 @@ class MarlinKit:
         self._firmware = firmware
         self._corexy = machine.kinematics == "corexy"
         self._velocity = machine.command.velocity_mm_s
+        self._speed_step = machine.command.speed_step_mm_s
         self._mesh_slope = machine.mesh_slope
         scale = firmware.steps_per_mm
         self.step_mm = (1.0 / scale.x, 1.0 / scale.y, 1.0 / scale.z, 1.0 / scale.e)
@@ -102,9 +103,10 @@ class MarlinKit:
         if firmware.min_steps_per_segment > 1 and least_mm > LONGEST_LEAST_MM:
             return (
                 f"it swallows moves below {firmware.min_steps_per_segment} steps "
-                f"({1e3 * least_mm:.0f} um), and a stream has such: build it with "
-                "MIN_STEPS_PER_SEGMENT 1 (Configuration_adv.h) and say so in "
-                "min_steps_per_segment, or " + _ALTERNATIVE
+                f"({1e3 * least_mm:.0f} um), and a stream can do without moves of up to "
+                f"{1e3 * LONGEST_LEAST_MM:.0f} um: build it with MIN_STEPS_PER_SEGMENT 1 "
+                "(Configuration_adv.h) and say so in min_steps_per_segment, set finer "
+                "microsteps, or " + _ALTERNATIVE
             )
         slope = self._mesh_slope
         if slope > 0.0 and slope * MIN_STREAM_ACCEL_MM_S2 > STREAM_Z_ACCEL_MM_S2:
@@ -148,7 +150,12 @@ class MarlinKit:
 
     def encoder(self) -> MarlinEncoder:
         """Return an encoder of the stream."""
-        return MarlinEncoder(self._firmware, self._velocity, corexy=self._corexy)
+        return MarlinEncoder(
+            self._firmware,
+            self._velocity,
+            corexy=self._corexy,
+            speed_step_mm_s=self._speed_step,
+        )
 
     def voice(self) -> MarlinVoice:
         """Return Marlin's words."""

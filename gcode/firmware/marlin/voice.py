@@ -11,6 +11,12 @@ from models.firmware import Marlin
 
 __all__ = ["MarlinVoice"]
 
+_NOTES = (
+    "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",
+    "are raised and every move is timed: leave the speed at 100 %. To stop in there,",
+    "stop at once (M112) or let the print end: a pause would park at raised limits.",
+)
+
 _FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*[A-Z]", re.IGNORECASE)
 _FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0*(?![\d.])", re.IGNORECASE)
 
@@ -22,11 +28,6 @@ class MarlinVoice:
     gcode/geometry/G92.cpp, feature/advance/M900.cpp and parser.cpp, release 2.1.2 (2023-01).
     """
 
-    notes = (
-        "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",
-        "are raised and every move is timed: leave the speed at 100 %. To stop in there,",
-        "stop at once (M112) or let the print end: a pause would park at raised limits.",
-    )
     stand_still = b"M400 ; stand still\n"
     positioning_sets_extruder = True
     coarse_extruder = True
@@ -40,6 +41,20 @@ class MarlinVoice:
             self._has_shaper = firmware.shaper.freq_x_hz + firmware.shaper.freq_y_hz > 0.0
         self._advances = firmware.linear_advance is not False
         self._classic_jerk = firmware.junction == "classic_jerk"
+        self._least_steps = firmware.min_steps_per_segment
+        self._least_mm = firmware.min_steps_per_segment / firmware.steps_per_mm.x
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Lines of the header: what to mind in a stream, and what short moves cost."""
+        if self._least_steps <= 1:
+            return _NOTES
+        least = f"{self._least_steps} steps ({1e3 * self._least_mm:.0f} um)"
+        return (
+            *_NOTES,
+            f"this firmware swallows moves below {least}: slow turns are",
+            "cut off; a build with MIN_STEPS_PER_SEGMENT 1 follows them.",
+        )
 
     @property
     def shaper_off(self) -> bytes:
