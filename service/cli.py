@@ -14,9 +14,21 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from service import commands_serve
-from service.advice import register as register_advice
 from service.backup import commands as backup
+from service.commands import advice, serve, trajectories, warm
+from service.commands.arguments import (
+    METHODS,
+    DialectOption,
+    Input,
+    MachineOption,
+    PlateOption,
+    Refused,
+    ReportOption,
+    check_folder,
+    check_input,
+    check_output,
+    chosen_options,
+)
 from service.controllers import commands as controllers
 from service.deliveries import commands as deliveries
 from service.environment import prepare_environment
@@ -29,8 +41,6 @@ from service.remote import KeyOption, ServerOption, compensate_on_server
 from service.remote import register as register_jobs
 from service.scanning import commands as scanning
 from service.security import commands as security
-from service.trajectories import register as register_trajectories
-from service.warm import register as register_warm
 
 __all__ = ["app", "main", "run"]
 
@@ -46,39 +56,6 @@ app.add_typer(machines.app, name="machines")
 _INTERRUPTED = 130
 _WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
 """Commands that compute in processes of their own."""
-_METHODS = (
-    "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
-    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
-    "it undoes the machine's ripple too; or advise: leave all moves as they are and add firmware "
-    "commands for shaper and acceleration"
-)
-
-Input = Annotated[
-    Path, typer.Argument(metavar="IN", help="The sliced file: .gcode, .bgcode or .gcode.3mf.")
-]
-PlateOption = Annotated[
-    int | None,
-    typer.Option("--plate", metavar="N", min=1, help="Which plate of a .gcode.3mf with several."),
-]
-MachineOption = Annotated[
-    str,
-    typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
-]
-DialectOption = Annotated[
-    str | None,
-    typer.Option(
-        "--dialect",
-        metavar="NAME",
-        help="How the file is read: klipper, marlin, prusa, bambu or reprapfirmware. [default: "
-        "as the machine's firmware reads it]",
-    ),
-]
-ReportOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--report", metavar="DIR", help="Folder for report.html and .json, layers.json and .bin."
-    ),
-]
 
 
 def main() -> NoReturn:
@@ -102,7 +79,7 @@ def run(arguments: list[str]) -> int:
         return _fail("interrupted; nothing was written", interruption.exit_code)
     except typer.TyperException as error:
         return _fail(f"{error.format_message()} (stillpath COMMAND --help lists the options)", 2)
-    except _Refused as error:
+    except Refused as error:
         return _fail(str(error), 2)
     except MemoryError:
         return _fail("out of memory; close other programs or use a larger machine", 1)
@@ -142,7 +119,7 @@ def compensate(
     in_place: Annotated[
         bool, typer.Option("--in-place", help="Write over IN, as slicers ask of their scripts.")
     ] = False,
-    method: Annotated[str, typer.Option(help=_METHODS)] = "fbf",
+    method: Annotated[str, typer.Option(help=METHODS)] = "fbf",
     basis: Annotated[
         str, typer.Option(help="Basis of fbf: ce-opt, robust, bspline or dct.")
     ] = "ce-opt",
@@ -182,24 +159,23 @@ def compensate(
 ) -> None:
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
-        raise _Refused("give either -o OUT or --in-place")
-    chosen = {
-        "method": method,
-        "basis": basis,
-        "robust": robust,
-        "along": along,
-        "tolerance_um": tolerance_um,
-        "budget_um": budget_um,
-        "plate": plate,
-        "dialect": dialect,
-        "times": "kept" if keep_times else None,
-    }
-    options = _options(**{k: v for k, v in chosen.items() if v is not None})
-    _check_input(source)
-    target = _check_output(output or source)
+        raise Refused("give either -o OUT or --in-place")
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        plate=plate,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
+    check_input(source)
+    target = check_output(output or source)
     if output is not None and target.exists() and target.samefile(source):
-        raise _Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
-    _check_folder(report)
+        raise Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
+    check_folder(report)
     if server:
         compensate_on_server(
             source, target, machine, options, server=server, key=key, report=report
@@ -229,11 +205,11 @@ def plan(
     dialect: DialectOption = None,
 ) -> None:
     """Write the motion the machine will make. Columns t, x, y, z, e."""
-    _check_input(source)
-    target = _check_output(output)
+    check_input(source)
+    target = check_output(output)
     if target == source.resolve():
-        raise _Refused("OUT must not be IN: the motion is no G-code")
-    read_as = _options(dialect=dialect).dialect
+        raise Refused("OUT must not be IN: the motion is no G-code")
+    read_as = chosen_options(dialect=dialect).dialect
     found = _machine(machine)
 
     from service.console import print_planned, progress_shown
@@ -268,9 +244,9 @@ def simulate(
     dialect: DialectOption = None,
 ) -> None:
     """Report how far the nozzle will be from its path. No G-code is written."""
-    _check_input(source)
-    _check_folder(report)
-    read_as = _options(dialect=dialect).dialect
+    check_input(source)
+    check_folder(report)
+    read_as = chosen_options(dialect=dialect).dialect
     found = _machine(machine)
 
     from service.console import print_result, progress_shown
@@ -301,7 +277,7 @@ def design(
     ] = None,
 ) -> None:
     """Look at the design for one axis. Plant, metrics, ladder, and what errors of it cost."""
-    _check_folder(report)
+    check_folder(report)
     found = machines.open_machines().to_look_at(machine, files=True).machine
 
     from service.design.design import design_report
@@ -318,67 +294,20 @@ identification.register(app)
 proof.register(app)
 controllers.register(app)
 scanning.register(app)
-register_trajectories(app)
-register_advice(app)
+trajectories.register(app)
+advice.register(app)
 security.register(app)
 farm.register(app)
-commands_serve.register(app)
+serve.register(app)
 backup.register(app)
 deliveries.register(app)
 register_jobs(app)
-register_warm(app)
-
-
-def _options(**values: Any) -> Any:
-    from pydantic import ValidationError
-
-    from service.pipeline.options import Options
-
-    try:
-        return Options(**values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        if first["loc"] == ("method",):
-            raise _Refused(f"unknown method {values['method']!r}; there is {_METHODS}") from None
-        raise _Refused(_first_field(error)) from None
-
-
-def _first_field(error: Any) -> str:
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"])
-    return f"{place}: {first['msg']} (given: {first['input']!r})"
+warm.register(app)
 
 
 def _machine(name: str) -> Any:
     """Find the machine for a job, with warnings about it."""
     return machines.open_machines().for_job(name, files=True)
-
-
-def _check_input(source: Path) -> None:
-    if source.is_dir():
-        raise _Refused(f"{source} is a folder, not a G-code file")
-    if not source.exists():
-        raise _Refused(f"there is no file {source}")
-    if not source.is_file():
-        # The road reads a file twice, and opening a pipe waits for somebody to write.
-        raise _Refused(f"{source} is a pipe or a device; save it as a file first")
-
-
-def _check_output(target: Path) -> Path:
-    if target.is_dir():
-        raise _Refused(f"{target} is a folder; name the file to write")
-    if target.exists() and not target.is_file():
-        raise _Refused(f"{target} is a pipe or a device; name a file to write")
-    # A link is followed, so that what it points to is replaced and not the link.
-    target = target.resolve()
-    if not target.parent.is_dir():
-        raise _Refused(f"the folder {target.parent} does not exist; make it first")
-    return target
-
-
-def _check_folder(folder: Path | None) -> None:
-    if folder is not None and folder.exists() and not folder.is_dir():
-        raise _Refused(f"--report {folder} is a file; name a folder")
 
 
 def _write_report(result: Any, folder: Path | None) -> None:
@@ -406,7 +335,3 @@ def _of_system(error: OSError) -> str:
 def _fail(message: str, code: int) -> int:
     sys.stderr.write(f"stillpath: error: {' '.join(message.split())}\n")
     return code
-
-
-class _Refused(Exception):
-    """The request cannot be met as it was put."""

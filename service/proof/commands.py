@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from service.commands.arguments import MachineOption, check_output
 from service.machines.commands import open_machines
 
 if TYPE_CHECKING:
@@ -14,10 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
-MachineOption = Annotated[
-    str,
-    typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
-]
 Output = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", dir_okay=False, help="The file to write.")
 ]
@@ -67,7 +64,7 @@ def coupon(
     from service.proof.tables import print_proof
 
     with progress_shown("stillpath") as progress:
-        made = write_coupon(found.machine, _target(output), settings, progress=progress)
+        made = write_coupon(found.machine, check_output(output), settings, progress=progress)
     print_proof(made, found.warnings)
 
 
@@ -94,7 +91,7 @@ def tower(
 
     with progress_shown("stillpath") as progress:
         made = write_tower(
-            found.machine, axis, _target(output), settings, count=bands, progress=progress
+            found.machine, axis, check_output(output), settings, count=bands, progress=progress
         )
     print_proof(made.written, found.warnings, lines=3)
     print_tower(made)
@@ -162,11 +159,3 @@ def _point(text: str) -> tuple[float, float]:
     except ValueError:
         raise typer.BadParameter(f"--at {text}: two numbers are needed, as in 110,110") from None
     return x, y
-
-
-def _target(output: Path) -> Path:
-    # A link is followed, so that what it points to is replaced and not the link.
-    target = output.resolve()
-    if not target.parent.is_dir():
-        raise typer.BadParameter(f"the folder {target.parent} does not exist; make it first")
-    return target

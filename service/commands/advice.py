@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from service.commands.arguments import PlateOption, Refused, check_input, check_output
+
 __all__ = ["register"]
 
 
@@ -21,19 +23,13 @@ def remove_advice(
         Path | None, typer.Option("--output", "-o", metavar="OUT", help="The file to write.")
     ] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Write over IN.")] = False,
-    plate: Annotated[
-        int | None,
-        typer.Option("--plate", metavar="N", min=1, help="Which plate of several."),
-    ] = None,
+    plate: PlateOption = None,
 ) -> None:
     """Take out the lines that `compensate --method advise` has added."""
     if in_place == (output is not None):
-        raise typer.BadParameter("give either -o OUT or --in-place")
-    if not source.is_file():
-        raise typer.BadParameter(f"there is no file {source}")
-    target = (output or source).resolve()
-    if not target.parent.is_dir():
-        raise typer.BadParameter(f"the folder {target.parent} does not exist; make it first")
+        raise Refused("give either -o OUT or --in-place")
+    check_input(source)
+    target = check_output(output or source)
 
     from service.pipeline.advising.removing import remove_advice as remove
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from service.commands.arguments import MachineOption, check_input
+
 __all__ = ["register"]
 
 
@@ -20,20 +22,14 @@ def warm(
     source: Annotated[
         Path, typer.Argument(metavar="IN", help="A sliced file, as they will come: .gcode, ..")
     ],
-    machine: Annotated[
-        str,
-        typer.Option(
-            "--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."
-        ),
-    ],
+    machine: MachineOption,
 ) -> None:
     """Compile the kernels that a job needs, by doing one; nothing of the job is kept.
 
     Compiled code lasts until the next version: in the installed package where it may be written,
     else in the user's cache folder (or NUMBA_CACHE_DIR).
     """
-    if not source.is_file():
-        raise typer.TyperException(f"there is no file {source}")
+    check_input(source)
 
     from service.console import progress_shown
     from service.machines.commands import open_machines

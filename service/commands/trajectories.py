@@ -7,6 +7,17 @@ from typing import Annotated
 
 import typer
 
+from service.commands.arguments import (
+    DialectOption,
+    Input,
+    MachineOption,
+    PlateOption,
+    Refused,
+    check_input,
+    check_output,
+    chosen_options,
+)
+
 __all__ = ["register"]
 
 
@@ -16,15 +27,8 @@ def register(app: typer.Typer) -> None:
 
 
 def trajectories(
-    source: Annotated[
-        Path, typer.Argument(metavar="IN", help="The sliced file: .gcode, .bgcode or .gcode.3mf.")
-    ],
-    machine: Annotated[
-        str,
-        typer.Option(
-            "--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."
-        ),
-    ],
+    source: Input,
+    machine: MachineOption,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="The table.")],
     form: Annotated[
         str, typer.Option("--format", help="csv or npz. [default: as OUT is called, else csv]")
@@ -40,45 +44,23 @@ def trajectories(
     budget_um: Annotated[
         float | None, typer.Option("--budget-um", help="As `compensate` has it.")
     ] = None,
-    plate: Annotated[
-        int | None,
-        typer.Option("--plate", metavar="N", min=1, help="Which plate of several."),
-    ] = None,
-    dialect: Annotated[
-        str | None, typer.Option("--dialect", metavar="NAME", help="How the file is read.")
-    ] = None,
+    plate: PlateOption = None,
+    dialect: DialectOption = None,
 ) -> None:
     """Write planned, commanded and simulated motion with the errors, 1000 rows a second."""
     chosen = form or ("npz" if output.suffix == ".npz" else "csv")
     if chosen not in ("csv", "npz"):
         raise typer.BadParameter(f"--format {form}: there is csv and npz")
-    if not source.is_file():
-        raise typer.BadParameter(f"there is no file {source}")
-    target = output.resolve()
-    if target.is_dir() or (target.exists() and target.samefile(source)):
-        raise typer.BadParameter(f"{output} is a folder or IN; name the file to write")
-    if not target.parent.is_dir():
-        raise typer.BadParameter(f"the folder {target.parent} does not exist; make it first")
-
-    from pydantic import ValidationError
+    check_input(source)
+    target = check_output(output)
+    if target.exists() and target.samefile(source):
+        raise Refused(f"{output} is IN; name the file to write")
+    options = chosen_options(
+        method=method, robust=robust, budget_um=budget_um, plate=plate, dialect=dialect
+    )
 
     from service.machines.commands import open_machines
-    from service.pipeline.options import Options
 
-    try:
-        options = Options.model_validate(
-            {
-                "method": method,
-                "robust": robust,
-                "budget_um": budget_um,
-                "plate": plate,
-                "dialect": dialect,
-            }
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise typer.BadParameter(f"{place}: {first['msg']} (given: {first['input']!r})") from None
     found = open_machines().for_job(machine, files=True)
 
     from service.console import progress_shown
