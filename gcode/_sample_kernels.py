@@ -11,7 +11,7 @@ from models.jit import kernel
 __all__ = ["distances", "sweep"]
 
 
-@kernel
+@kernel(allocates=False)
 def sweep(
     times: Any,
     t0_s: float,
@@ -72,7 +72,7 @@ def sweep(
         k = stop
 
 
-@kernel
+@kernel(allocates=False)
 def distances(
     times: Any,
     points: Any,
@@ -113,7 +113,7 @@ def distances(
         out[k] = np.sqrt(gap_x * gap_x + gap_y * gap_y)
 
 
-@kernel(inline=True)
+@kernel(inline=True, allocates=False)
 def _way(
     left: float,
     accel: float,
@@ -143,7 +143,7 @@ def _way(
     return path
 
 
-@kernel(inline=True)
+@kernel(inline=True, allocates=False)
 def _eased(v_mm_s: float, accel_mm_s2: float, whole_s: float, part_s: float) -> float:
     """Way after `part_s` of a change of speed by ``accel * whole_s`` along the Bezier curve."""
     u = part_s / whole_s if whole_s > 0.0 else 0.0

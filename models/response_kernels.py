@@ -17,7 +17,7 @@ _CHUNK = 1024
 _TINY = 1e-150
 
 
-@kernel
+@kernel(allocates=False)
 def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array, y: Array) -> None:
     """Add up first-order complex recurrences, three at a time to hide their latency.
 

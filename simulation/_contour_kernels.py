@@ -19,7 +19,7 @@ _STRAIGHT_MM = 1e-11
 """A vertex so near to the line on which a run has come goes straight on: rounding is less."""
 
 
-@kernel
+@kernel(allocates=False)
 def path_tables(
     path: Array, first: NDArray[np.int64], last: NDArray[np.int64], boxes: Array
 ) -> None:
@@ -57,7 +57,7 @@ def path_tables(
         boxes[b, 0], boxes[b, 1], boxes[b, 2], boxes[b, 3] = left, right, below, above
 
 
-@kernel(inline=True)
+@kernel(inline=True, allocates=False)
 def _squared(path: Array, j: int, k: int, px: float, py: float) -> float:
     """Squared distance from a point to the straight line between the vertices j and k."""
     ax, ay = path[0, j], path[1, j]
@@ -72,7 +72,7 @@ def _squared(path: Array, j: int, k: int, px: float, py: float) -> float:
     return squared
 
 
-@kernel
+@kernel(allocates=False)
 def contour_distances(
     path: Array,
     first: NDArray[np.int64],
@@ -133,7 +133,7 @@ def contour_distances(
     return looked
 
 
-@kernel
+@kernel(allocates=False)
 def group_sums(
     values: Array,
     groups: NDArray[np.int32],
@@ -157,7 +157,7 @@ def group_sums(
                 largest[c, row] = max(largest[c, row], value)
 
 
-@kernel
+@kernel(allocates=False)
 def motion_sums(
     path: Array,
     points: Array,

@@ -48,7 +48,7 @@ _SAGITTA_MM, _TURN = 0.02, 0.35
 _SAME_HEIGHT_MM = 0.04
 
 
-@kernel
+@kernel(allocates=False)
 def follow(
     xy: Array,
     z: Array,
@@ -178,7 +178,7 @@ def follow(
     return -1
 
 
-@kernel(inline=True)
+@kernel(inline=True, allocates=False)
 def _add(
     x: float,
     y: float,

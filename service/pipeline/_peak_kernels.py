@@ -10,7 +10,7 @@ from models.jit import kernel
 __all__ = ["peaks"]
 
 
-@kernel
+@kernel(allocates=False)
 def peaks(command: NDArray[np.float64]) -> tuple[float, float]:
     """Return the longest step of X and Y together, and the largest second difference of either.
 

@@ -45,7 +45,7 @@ _E_ONLY_ACCEL = 99999999.9  # no limit but the extruder's own
 _SQRT2_MINUS_1 = sqrt(2.0) - 1.0
 
 
-@kernel
+@kernel(allocates=False)
 def append(
     start: Any,
     end: Any,
@@ -120,7 +120,7 @@ def append(
     return count, OK, 0
 
 
-@kernel
+@kernel(allocates=False)
 def _junction(before: Any, row: Any, e_corner: float) -> None:
     """Highest speed at which the corner between two moves may be passed."""
     v2 = min(row[Q_CRUISE2], before[Q_CRUISE2], before[Q_JUNCTION2] + before[Q_GAIN2])
@@ -147,7 +147,7 @@ def _junction(before: Any, row: Any, e_corner: float) -> None:
     row[Q_SMOOTH_JUNCTION2] = min(v2, before[Q_SMOOTH_JUNCTION2] + before[Q_SMOOTH_GAIN2])
 
 
-@kernel
+@kernel(allocates=False)
 def look_ahead(queue: Any, count: int, final: bool) -> int:
     """Plan the queue as if it ended at rest; return how many moves are settled.
 
@@ -195,7 +195,7 @@ def look_ahead(queue: Any, count: int, final: bool) -> int:
     return settled
 
 
-@kernel
+@kernel(allocates=False)
 def emit(
     queue: Any,
     settled: int,
@@ -243,7 +243,7 @@ def emit(
     return t_s
 
 
-@kernel
+@kernel(allocates=False)
 def drop(queue: Any, settled: int, count: int) -> None:
     """Move the unsettled rows to the front."""
     for m in range(settled, count):
