@@ -45,6 +45,11 @@ _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
 """What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
 moves of a micrometre it would have millions."""
 
+_CHANGES = np.isin([kind.value for kind in EventKind], [EventKind.LIMITS, EventKind.MODE])
+"""By the number of an event's kind: those that may end a piece."""
+_SOUGHT = 64
+"""Events that are looked at together."""
+
 
 @dataclass(frozen=True, slots=True)
 class Passage:
@@ -182,27 +187,43 @@ class Splitter:
             self._events = replace(events, limits_id=limits_id[n:], modal_id=modal_id[n:])
         return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
-    def _barriers(self, events: Events) -> NDArray[np.bool_]:
-        """Mark lines that end a piece: stops, G92 of more than E, M221, a stream's other limits."""
-        found = events.kind >= EventKind.STOP
-        stream_limits, limits = self._kit.stream_limits, self._tables[0]
-        before = self._limits_id
-        rows = np.flatnonzero(events.kind == EventKind.LIMITS)
-        for k, after in zip(rows.tolist(), events.limits_id[rows].tolist(), strict=True):
-            if after != before and stream_limits(limits[after]) != stream_limits(limits[before]):
-                found[k] = True
-            before = after
-        rows = np.flatnonzero(events.kind == EventKind.MODE)
-        firsts = (events.byte_start[rows] - self._text_offset).tolist()
-        ends = (events.byte_end[rows] - self._text_offset).tolist()
-        modal, was = self._tables[1], self._tables[1][self._modal_id]
-        ids = events.modal_id[rows].tolist()
-        for k, first, end, now in zip(rows.tolist(), firsts, ends, ids, strict=True):
-            # Where E counts differently from here on, it must be where the file says.
-            found[k] = modal[now].extrude_factor != was.extrude_factor
-            found[k] |= _shifts_origin(self._text[first:end])
-            was = modal[now]
-        return found
+    def _first_barrier(self, events: Events) -> int | None:
+        """Return the first move behind which a piece cannot go on, by the number held; None: none.
+
+        A stop ends a piece, G92 of more than E, M221, or a stream's other limits. What lies before
+        the first move does not. Blocks hold thousands of events and pieces often a few, so the
+        search ends with the first that is found.
+        """
+        limits, modal = self._tables
+        limits_id, was = self._limits_id, modal[self._modal_id]
+        kind = events.kind
+        rows = np.flatnonzero((kind >= EventKind.STOP) | _CHANGES[kind])
+        for first in range(0, len(rows), _SOUGHT):
+            some = rows[first : first + _SOUGHT]
+            columns = (kind, events.move_index, events.limits_id, events.modal_id)
+            starts, ends = (
+                (at[some] - self._text_offset).tolist()
+                for at in (events.byte_start, events.byte_end)
+            )
+            for what, move, after, now, start, end in zip(
+                *(column[some].tolist() for column in columns), starts, ends, strict=True
+            ):
+                found = what >= EventKind.STOP
+                if what == EventKind.LIMITS:
+                    found |= self._other_stream(limits[limits_id], limits[after])
+                    limits_id = after
+                elif what == EventKind.MODE:
+                    # Where E counts differently from here on, it must be where the file says.
+                    found |= modal[now].extrude_factor != was.extrude_factor
+                    found |= _shifts_origin(self._text[start:end])
+                    was = modal[now]
+                if found and move > 0:
+                    return int(move)
+        return None
+
+    def _other_stream(self, before: Limits, after: Limits) -> bool:
+        stream_limits = self._kit.stream_limits
+        return after is not before and stream_limits(after) != stream_limits(before)
 
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
@@ -247,12 +268,11 @@ class Splitter:
             if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
                 yield self._take(int(moves.byte_start[head]))
                 continue
-            barriers = events.move_index[self._barriers(events)]
-            stops = np.concatenate([barriers[barriers > 0], np.flatnonzero(self._raw), [count]])
-            end = int(stops.min())
+            barrier = self._first_barrier(events)
+            kept = np.flatnonzero(self._raw)
             most = self._most_moves(moves, events)
-            closed = final or len(stops) > 1 or most < count
-            end = min(end, most)
+            closed = final or barrier is not None or len(kept) > 0 or most < count
+            end = min(count if barrier is None else barrier, most, *kept[:1].tolist())
             if not closed and _shortest_s(moves) < self._longest_s:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
