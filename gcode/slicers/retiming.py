@@ -8,8 +8,12 @@ place the delay that has come up so far. A shift of the last second changes no l
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import BinaryIO
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from heapq import merge
+from typing import BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,17 +33,10 @@ _BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", 
 """Bytes with which a line that tells times may begin, and the first one behind its semicolon."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """A line of the written text that tells times."""
-
-    offset: int
-    line: bytes
-    delay_s: float
-
-
 class Retiming:
     """Take note of a text while it is written, then copy it with new times.
+
+    A line that tells times is kept as three numbers, and read again when the text is copied.
 
     Parameters
     ----------
@@ -53,8 +50,9 @@ class Retiming:
     def __init__(self, head: bytes = b"", tail: bytes = b"", *, keep_times: bool = False) -> None:
         self._head, self._tail = head, tail
         self._keeps = keep_times
-        self._places: list[_Place] = []
-        self._stops: list[tuple[int, float]] = []
+        self._places, self._stops = _Places(), _Places()
+        self._told_s: dict[tuple[TimeKind, bool], float] = {}
+        """The longest time of every kind, and whether it is of the silent mode."""
         self._size = 0
         self._head_end: int | None = None
         self._tail_start = 0
@@ -101,15 +99,20 @@ class Retiming:
         int
             Bytes written.
         """
-        layer_delay_s = delay_s if self._layer_delay_s is None else self._layer_delay_s
-        times = _Times(self._places, self._stops, layer_delay_s, delay_s)
-        edits = [(place.offset, len(place.line), times.line(place)) for place in self._places]
-        edits.append((self._size if self._head_end is None else self._head_end, 0, self._head))
-        edits.append((self._tail_start, 0, self._tail_lead + self._tail if self._tail else b""))
+        times = _Times(self._told_s, self._stops, self._layer_delay_s, delay_s)
+        ours: list[tuple[int, int, bytes | float]] = [
+            (self._size if self._head_end is None else self._head_end, 0, self._head),
+            (self._tail_start, 0, self._tail_lead + self._tail if self._tail else b""),
+        ]
         done = written = 0
-        for offset, length, line in sorted(edits, key=lambda edit: edit[:2]):
-            written += _copy(source, target, offset - done) + target.write(line)
-            source.seek(offset + length)
+        for offset, length, what in merge(
+            sorted(ours, key=lambda edit: edit[:2]), self._places, key=lambda edit: edit[:2]
+        ):
+            written += _copy(source, target, offset - done)
+            if isinstance(what, bytes):
+                written += target.write(what)
+            else:
+                written += target.write(times.line(source.read(length), offset, what))
             done = offset + length
         return written + _copy(source, target, self._size - done)
 
@@ -121,21 +124,34 @@ class Retiming:
         at = 0
         for row in _candidates(item):
             line = item.line_text(int(item.events.byte_start[row]), int(item.events.byte_end[row]))
-            fields = read_times(line) if may_tell_time(line) else []
-            mark = None if fields or line[:1] != b";" else read_mark(line.decode("latin-1"))
-            if not fields and (mark is None or mark.kind not in _STOPS):
+            kind = _what_it_tells(line)
+            if kind is None:
                 continue
             found = _find_line(text, line, at)
             if found < 0:
                 continue
             at = found + len(line)
-            place = _Place(
-                self._size + found, line, float(delay_s[int(item.events.move_index[row])])
-            )
-            if fields:
-                self._places.append(place)
-            else:
-                self._stops.append((place.offset, place.delay_s))
+            into = self._stops if kind == "stop" else self._places
+            late_s = float(delay_s[int(item.events.move_index[row])])
+            into.append(self._size + found, len(line), late_s)
+            for field in read_times(line) if kind == "time" else ():
+                key = field.kind, field.silent
+                self._told_s[key] = max(self._told_s.get(key, 0.0), field.seconds)
+
+
+class _Places:
+    """Lines of the written text: where each begins, its bytes, how much later it comes."""
+
+    def __init__(self) -> None:
+        self.offset, self._length, self.delay_s = array("q"), array("l"), array("d")
+
+    def append(self, offset: int, length: int, delay_s: float) -> None:
+        self.offset.append(offset)
+        self._length.append(length)
+        self.delay_s.append(delay_s)
+
+    def __iter__(self) -> Iterator[tuple[int, int, float]]:
+        return zip(self.offset, self._length, self.delay_s, strict=True)
 
 
 class _Times:
@@ -143,46 +159,45 @@ class _Times:
 
     def __init__(
         self,
-        places: list[_Place],
-        stops: list[tuple[int, float]],
+        told_s: Mapping[tuple[TimeKind, bool], float],
+        stops: _Places,
         second_layer_delay_s: float | None,
         delay_s: float,
     ) -> None:
-        self._stop_offsets = [offset for offset, _ in stops]
-        self._stop_delays = [delay for _, delay in stops]
+        self._stops = stops
         self._delay_s = delay_s
         self._first_layer_delay_s = (
             delay_s if second_layer_delay_s is None else second_layer_delay_s
         )
-        fields = [field for place in places for field in read_times(place.line)]
-        self._total_s = {silent: _total(fields, silent=silent) for silent in (False, True)}
+        self._total_s = {silent: _total(told_s, silent=silent) for silent in (False, True)}
 
-    def line(self, place: _Place) -> bytes:
-        line, done = b"", 0
-        for field in read_times(place.line):
-            line += place.line[done : field.start] + field.written(self._time(field, place))
+    def line(self, line: bytes, offset: int, late_s: float) -> bytes:
+        """Return a line that stands at `offset` and comes so much later than in the original."""
+        written, done = b"", 0
+        for field in read_times(line):
+            written += line[done : field.start] + field.written(self._time(field, offset, late_s))
             done = field.end
-        return line + place.line[done:]
+        return written + line[done:]
 
-    def _time(self, field: TimeField, place: _Place) -> float:
+    def _time(self, field: TimeField, offset: int, late_s: float) -> float:
         match field.kind:
             case TimeKind.TOTAL:
                 return field.seconds + self._delay_s
             case TimeKind.FIRST_LAYER:
                 return field.seconds + self._first_layer_delay_s
             case TimeKind.ELAPSED:
-                return field.seconds + place.delay_s
+                return field.seconds + late_s
             case TimeKind.REMAINING:
-                return field.seconds + self._delay_s - place.delay_s
+                return field.seconds + self._delay_s - late_s
             case TimeKind.UNTIL_STOP:
-                stop = int(np.searchsorted(self._stop_offsets, place.offset))
-                if stop == len(self._stop_delays):
+                stop = bisect_left(self._stops.offset, offset)
+                if stop == len(self._stops.offset):
                     return field.seconds
-                return field.seconds + self._stop_delays[stop] - place.delay_s
+                return field.seconds + self._stops.delay_s[stop] - late_s
         total_s = self._total_s[field.silent] or self._total_s[not field.silent]
         if not total_s or total_s + self._delay_s <= 0.0:
             return field.seconds
-        elapsed_s = 0.01 * field.seconds * total_s + place.delay_s
+        elapsed_s = 0.01 * field.seconds * total_s + late_s
         return min(100.0 * elapsed_s / (total_s + self._delay_s), 100.0)
 
 
@@ -199,13 +214,21 @@ def retimed(text: bytes, delay_s: float) -> bytes:
     return b"".join(lines)
 
 
-def _total(fields: list[TimeField], *, silent: bool) -> float:
+def _total(told_s: Mapping[tuple[TimeKind, bool], float], *, silent: bool) -> float:
     """Return how long the slicer thinks the print takes; 0 where it says nothing."""
     for wanted in (TimeKind.TOTAL, TimeKind.ELAPSED, TimeKind.REMAINING):
-        found = [f.seconds for f in fields if f.kind is wanted and f.silent == silent]
-        if found:
-            return max(found)
+        if (wanted, silent) in told_s:
+            return told_s[wanted, silent]
     return 0.0
+
+
+@lru_cache(maxsize=256)
+def _what_it_tells(line: bytes) -> Literal["time", "stop"] | None:
+    """Whether a line tells times or marks a stop; slicers repeat theirs thousands of times."""
+    if may_tell_time(line) and read_times(line):
+        return "time"
+    mark = read_mark(line.decode("latin-1")) if line[:1] == b";" else None
+    return "stop" if mark is not None and mark.kind in _STOPS else None
 
 
 def _candidates(item: Passage) -> NDArray[np.int64]:
