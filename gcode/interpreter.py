@@ -420,6 +420,8 @@ class Interpreter:
         if mark is None or kind is None:
             state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
         elif kind == MarkKind.STAMP:
+            # What is read back has thousands of lines of ours.
+            state.remember(command, at.MEMO_EVENT, int(EventKind.STAMP))
             return state.event(EventKind.STAMP)
         elif kind in (MarkKind.OFF, MarkKind.ON):
             state.settle()

@@ -159,10 +159,8 @@ class MachineState:
         """Return a state that goes on from here, whatever becomes of this one."""
         other = copy.copy(self)
         for name, value in vars(self).items():
-            if isinstance(value, np.ndarray | dict):
+            if isinstance(value, np.ndarray | dict | Names):
                 setattr(other, name, value.copy())
-            elif isinstance(value, Names):
-                setattr(other, name, copy.deepcopy(value))
         other.rows = Rows.empty(0)
         copies = {name: table.copy() for name, table in self.tables._asdict().items()}
         other.tables = Tables(**copies)
@@ -386,6 +384,12 @@ class Names:
         if number == len(self.names):
             self.names.append(name)
         return number
+
+    def copy(self) -> Names:
+        """Return the same names, to go on from."""
+        other = Names()
+        other.names, other._numbers = self.names.copy(), self._numbers.copy()
+        return other
 
 
 def _nobody(command: Command) -> int:
