@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from service.commands.arguments import check_folder, check_output
+
 if TYPE_CHECKING:
     from service.controllers.options import ControllerOptions
 
@@ -103,9 +105,9 @@ def controller(
     }
     chosen = _options(options, {key: value for key, value in given.items() if value is not None})
     for file in (json_file, c_header):
-        check_target(file)
-    if report is not None and report.exists() and not report.is_dir():
-        raise typer.BadParameter(f"--report {report} is a file; name a folder")
+        if file is not None:
+            check_output(file)
+    check_folder(report)
 
     from models.loops import load_loop
     from service.controllers.design import design_controller
@@ -130,16 +132,6 @@ def loops() -> None:
     from service.controllers.tables import print_loops
 
     print_loops(loop_figures())
-
-
-def check_target(file: Path | None) -> None:
-    """Refuse a file that cannot be written, before anything is computed."""
-    if file is None:
-        return
-    if file.is_dir():
-        raise typer.BadParameter(f"{file} is a folder; name the file to write")
-    if not file.resolve().parent.is_dir():
-        raise typer.BadParameter(f"the folder {file.parent} does not exist; make it first")
 
 
 def _options(file: Path | None, given: dict[str, Any]) -> ControllerOptions:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import ModelError
+from service.commands.arguments import chosen_options
 
 if TYPE_CHECKING:
     from service.farm.crew import Crew
@@ -90,7 +91,16 @@ def batch(
     from service.farm.summary import print_summary, write_summary
     from service.interruption import Interrupted
 
-    options = _options(method, basis, robust, along, tolerance_um, budget_um, dialect, keep_times)
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
     items = items_of(sources, parse_map(machine, machine_map or []), output=output)
     outcomes: list[Outcome] = []
 
@@ -147,7 +157,16 @@ def watch(
     from service.farm.watching import Watcher, run_watch
     from service.interruption import Interrupted
 
-    options = _options(method, basis, robust, along, tolerance_um, budget_um, dialect, keep_times)
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
     group = parse_map(machine, machine_map or [])
     if output.resolve() == folder.resolve():
         raise ModelError(f"--output {output} is the watched folder; name one in it or elsewhere")
@@ -192,38 +211,6 @@ def _at_work(
         crew(works, folder, options, jobs) as made,
     ):
         yield made, folder, check
-
-
-def _options(
-    method: str,
-    basis: str,
-    robust: str,
-    along: float | None,
-    tolerance_um: float | None,
-    budget_um: float | None,
-    dialect: str | None,
-    keep_times: bool,
-) -> Any:
-    from pydantic import ValidationError
-
-    from service.pipeline.options import Options
-
-    chosen = {
-        "method": method,
-        "basis": basis,
-        "robust": robust,
-        "along": along,
-        "tolerance_um": tolerance_um,
-        "budget_um": budget_um,
-        "dialect": dialect,
-        "times": "kept" if keep_times else None,
-    }
-    try:
-        return Options(**{name: value for name, value in chosen.items() if value is not None})
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ModelError(f"{place}: {first['msg']} (given: {first['input']!r})") from None
 
 
 def _line(outcome: Outcome, count: str = "") -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import ModelError
+from service.commands.arguments import check_folder, check_output
 from service.machines.commands import By, Message, open_documents, open_machines, who
 
 if TYPE_CHECKING:
@@ -146,7 +147,9 @@ def run(
         sampling_s=sampling_s,
         **_columns(columns),
     )
-    _check_targets(output, report)
+    if output is not None:
+        check_output(output)
+    check_folder(report)
     machines = open_machines()
     start, expected = _start(machines, machine, base)
     if ripple:
@@ -205,14 +208,6 @@ def _write(output: Path | None, machine: Machine) -> None:
     if output is not None:
         with replacing(output.resolve()) as temporary:
             temporary.write_text(machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
-
-
-def _check_targets(output: Path | None, report: Path | None) -> None:
-    """Refuse what could not be written before the work is done."""
-    if output is not None and (output.is_dir() or not output.resolve().parent.is_dir()):
-        raise ModelError(f"--output {output} is a folder or lies in none; name a file to write")
-    if report is not None and report.exists() and not report.is_dir():
-        raise ModelError(f"--report {report} is a file; name a folder")
 
 
 def _settings(**given: Any) -> ReadSettings:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from service.controllers.commands import check_target
+from service.commands.arguments import check_folder, check_output
 
 if TYPE_CHECKING:
     from service.controllers.options import Disturbance
@@ -81,9 +81,8 @@ def scan(
         raise typer.BadParameter(f"{output}: the command is written as .csv or .npz")
     if output.resolve() == source.resolve():
         raise typer.BadParameter("OUT must not be IN")
-    check_target(output)
-    if report is not None and report.exists() and not report.is_dir():
-        raise typer.BadParameter(f"--report {report} is a file; name a folder")
+    check_output(output)
+    check_folder(report)
 
     from gcode.hatches import Timing
     from models.loops import load_loop
