@@ -25,7 +25,7 @@ from gcode.firmware.registry import kit
 from gcode.lexer import Command, split_line
 from gcode.meta import META_WORDS, held_back, meta_command
 from gcode.slicers.marks import MarkKind, read_mark
-from gcode.state import MachineState
+from gcode.state import MachineState, nobody
 from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from models.machine import Machine
 
@@ -77,7 +77,6 @@ class Interpreter:
         dialect = dialect or dialect_of(machine.firmware)
         limits = kit(machine).initial_limits()
         self.state = MachineState(machine, dialect, limits, strict=strict_bounds)
-        self.state.carry_out = self._command
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []
         self._carry: list[bytes] = []
@@ -151,7 +150,6 @@ class Interpreter:
         """Return an interpreter that goes on from here, whatever this one reads next."""
         other = copy.copy(self)
         other.state = self.state.snapshot()
-        other.state.carry_out = other._command
         for name in ("_modal", "_limits", "_carry"):
             setattr(other, name, getattr(self, name).copy())
         return other
@@ -177,6 +175,14 @@ class Interpreter:
 
     def _read(self, text: bytes) -> list[ProgramBlock]:
         """Read whole lines; behind them is the padding."""
+        # Only meanwhile: snapshots that hold themselves would wait for the garbage collector.
+        self.state.carry_out = self._command
+        try:
+            return self._read_lines(text)
+        finally:
+            self.state.carry_out = nobody
+
+    def _read_lines(self, text: bytes) -> list[ProgramBlock]:
         state, i = self.state, self.state.i
         stop = len(text) - PADDING
         self._text = text

@@ -33,7 +33,7 @@ from gcode.types import OF_STATE, EventKind, Limits
 from models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
 from models.machine import Machine
 
-__all__ = ["MachineState", "Names", "Retraction", "Saved"]
+__all__ = ["MachineState", "Names", "Retraction", "Saved", "nobody"]
 
 _MEMOS = 8192
 _FIRST_ROWS = 256
@@ -106,7 +106,7 @@ class MachineState:
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
-        self.carry_out: Callable[[Command], int] = _nobody
+        self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
         self.memos = 0
@@ -392,7 +392,8 @@ class Names:
         return other
 
 
-def _nobody(command: Command) -> int:
+def nobody(command: Command) -> int:
+    """Carry out commands while nothing is read: there are none."""
     raise RuntimeError(f"nobody carries out {command.name}")
 
 

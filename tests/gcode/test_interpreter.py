@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gzip
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -282,6 +283,19 @@ def test_bom_and_line_ends(golden_machine: Machine) -> None:
     assert first.text + last.text == data
     assert last.moves.end_mm[0, 0] == 3
     assert (last.moves.byte_start[0], last.moves.byte_end[0]) == (len(data) - 5, len(data))
+
+
+def test_a_snapshot_is_gone_with_its_last_user(golden_machine: Machine) -> None:
+    """Each has buffers; a file is read with one a line in tests, and one a piece on the road."""
+    reader = Interpreter(golden_machine)
+    reader.push(b"G28\nG1 X1 F600\n")
+    other = reader.snapshot()
+    other.push(b"G1 X2\n")
+    with pytest.raises(GcodeError):
+        other.push(b"G1 X1 F0\n")
+    gone = weakref.ref(other)
+    del other
+    assert gone() is None
 
 
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
