@@ -96,13 +96,7 @@ def design_report(
         For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
         error: the report says which and why.
     """
-    for what, given, known in (
-        ("axis", axis, AXES),
-        ("basis", basis, tuple(BASES)),
-        ("robust mode", robust, ROBUST),
-    ):
-        if given not in known:
-            raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
+    _check_names(axis, basis, robust)
     row = AXES.index(axis)
     plants = plant_set(machine.axes["x" if axis == "x" else "y"], dt_s)
     settings = {"basis": basis, "along": along, "window_s": window_s, "update_s": update_s}
@@ -122,8 +116,7 @@ def design_report(
 
     trial = Trial(machine, axis, dt_s, motion, errors_percent)
     missing += trial.notes
-    curves = [trial.uncompensated()]
-    chosen = None
+    curves, chosen = [trial.uncompensated()], None
     for name, designer in designers.items():
         try:
             curves.append(trial.compensated(designer, name, names))
@@ -132,10 +125,9 @@ def design_report(
             continue
         if name == mode:
             chosen = designer.rungs[row]
-    best = (
-        tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers) if tuned is None else tuned
-    )
-    curves += [trial.shaped(best[kind]) for kind in shapers]
+    if tuned is None:
+        tuned = tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers)
+    curves += [trial.shaped(tuned[kind]) for kind in shapers]
     guarded = lifted.weights if mode == "minimax" else plants.weights
     limit = next((d.accel_limit_mm_s2(trial.y_d_mm) for d in designers.values()), None)
     path_peak, path_rms = trial.path_acceleration()
@@ -165,6 +157,16 @@ def design_report(
             ),
         }
     )
+
+
+def _check_names(axis: str, basis: str, robust: str) -> None:
+    for what, given, known in (
+        ("axis", axis, AXES),
+        ("basis", basis, tuple(BASES)),
+        ("robust mode", robust, ROBUST),
+    ):
+        if given not in known:
+            raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
 
 
 def _designers(
