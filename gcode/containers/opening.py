@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gcode.containers.bgcode import BinaryGcode
-from gcode.containers.sniff import Kind, kind_named, sniff
+from gcode.containers.sniff import Kind, foreign, kind_named, sniff
 from gcode.containers.threemf import ThreeMf
 from gcode.errors import GcodeError
 from gcode.slicers.facts import SlicerFacts, read_facts
@@ -125,12 +125,15 @@ def open_text(
     Raises
     ------
     GcodeError
-        The container is damaged, of an unknown kind, or lacks the plate.
+        The file is something else, or the container is damaged, of an unknown kind, or lacks the
+        plate.
     """
     kind = sniff(path)
     if plate is not None and kind is not Kind.THREEMF:
         raise GcodeError(f"a plate was chosen, but the file is {_NAMES[kind]} and has no plates")
     if kind is Kind.TEXT:
+        if (what := foreign(path)) is not None:
+            raise GcodeError(f"the file is {what}, no G-code; give the file that the slicer wrote")
         with path.open("rb") as text:
             yield Container(kind, path, text, None)
         return

@@ -8,7 +8,7 @@ from __future__ import annotations
 from enum import Enum
 from pathlib import Path
 
-__all__ = ["Kind", "kind_named", "kind_of", "sniff"]
+__all__ = ["Kind", "foreign", "kind_named", "kind_of", "sniff"]
 
 
 class Kind(Enum):
@@ -23,6 +23,17 @@ _MAGICS = {
     b"GCDE": Kind.BGCODE,
     b"PK\x03\x04": Kind.THREEMF,
     b"PK\x05\x06": Kind.THREEMF,
+}
+_FOREIGN = {
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"%PDF": "a PDF document",
+    b"solid": "an STL model, not sliced yet",
+    b"<?xml": "an XML file",
+    b"\x1f\x8b\x08": "compressed by gzip",
+    b"7z\xbc\xaf": "a 7z archive",
+    b"Rar!": "a RAR archive",
+    b"\x7fELF": "a program",
 }
 _SUFFIXES = {
     ".gcode": Kind.TEXT,
@@ -44,6 +55,13 @@ def sniff(path: Path) -> Kind:
 def kind_of(head: bytes) -> Kind:
     """Return what a file is that begins with these four bytes; text if they are no magic number."""
     return _MAGICS.get(head[:4], Kind.TEXT)
+
+
+def foreign(path: Path) -> str | None:
+    """Return what a file is that is known and certainly no print file; None of any other."""
+    with path.open("rb") as file:
+        head = file.read(max(map(len, _FOREIGN)))
+    return next((what for magic, what in _FOREIGN.items() if head.startswith(magic)), None)
 
 
 def kind_named(path: Path) -> Kind | None:
