@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["command_of", "constraints_at", "extremes", "tied_command", "tied_problem"]
+__all__ = ["command_of", "constraints_at", "extremes", "tied_window"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -15,7 +15,70 @@ Flags = NDArray[np.bool_]
 
 
 @kernel
-def tied_problem(
+def tied_window(
+    basis: Array,
+    summed: Array,
+    effort: Array,
+    filtered: Array,
+    free: Array,
+    reach: Array,
+    stop: Array,
+    price: float,
+    z: Array,
+    path: Array,
+    targets: Array,
+    weight: Array,
+    moving: Ints,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    """Command of a window that stands on the path in its rests, without bounds.
+
+    Parameters
+    ----------
+    path : ndarray, shape (window,)
+        On which the command stands in the rests.
+
+    Others as in `_tied_problem`.
+
+    Returns
+    -------
+    command : ndarray, shape (window,)
+    fixed : ndarray, shape (window,)
+        The command without functions.
+    factor, wish, ends
+        As in `_tied_problem`, the factor as its transpose.
+    pinned, values : ndarray, shapes (pins, n) and (pins,)
+        Where the command stands on the path: pinned w = values.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        When the problem is singular, or the rests contradict each other.
+    """
+    last, previous = z[-2], z[-1]
+    factor, wish, ends = _tied_problem(
+        basis, summed, effort, filtered, free, reach, stop, price, z, targets, weight, moving
+    )
+    fixed = tied_command(np.zeros(len(basis)), moving, last, previous)
+    first = 1 if len(ends) > 0 and moving[0, 1] == 0 else 0
+    pinned = ends[first:].copy()
+    values = np.empty(len(pinned))
+    found = wish
+    if len(pinned) > 0:
+        # The nearest w for which the command stands on the path in the rests.
+        lacking = np.empty(len(pinned))
+        for i in range(len(pinned)):
+            at = moving[first + i, 1] - 1
+            values[i] = path[at] - fixed[at]
+            forward(factor, pinned[i])
+            lacking[i] = np.dot(pinned[i], wish) - values[i]
+        pull = np.linalg.solve(np.dot(pinned, pinned.T), lacking)
+        found = wish - np.dot(pull, pinned)
+    command = command_of(factor, found, basis, moving, last, previous)
+    return command, fixed, factor, wish, ends, pinned, values
+
+
+@kernel
+def _tied_problem(
     basis: Array,
     summed: Array,
     effort: Array,
@@ -48,7 +111,7 @@ def tied_problem(
     reach : ndarray, shape (nz - 2, window)
         From commands to states at the window's end.
     stop : ndarray, shape (components, window)
-        Response to a step of the command's speed at the first rest.
+        Response to a step of the command's speed.
     price : float
         Of squared increments.
     z, targets, weight
@@ -59,7 +122,7 @@ def tied_problem(
     Returns
     -------
     factor : ndarray, shape (n, n)
-        L with w = L' c; the upper half is 0.
+        The triangle L', upper, with w = L' c.
     wish : ndarray, shape (n,)
     ends : ndarray, shape (k - 1, n)
         Where the functions' commands stand in each rest.
@@ -84,35 +147,49 @@ def tied_problem(
         count += 1
         if m == 0:
             _add(-price * speed, step, right)
+    first_stop = moving[0, 1]
     for c in range(len(filtered)):
-        error = weight * (targets[c] - np.dot(free[c], z) + speed * stop[c])
+        error = weight * (targets[c] - np.dot(free[c], z))
+        for r in range(first_stop, window):
+            error[r] += weight[r] * speed * stop[c, r - first_stop]
         square, pull = np.zeros((rests * left, rests * left)), np.zeros(rests * left)
         gain = np.zeros(rests * left)
         for m in range(rests + 1):
             s, e = moving[m]
-            begun = _states(summed, reach, 0, s) if e > s else behind
-            for r in range(s, moving[m + 1, 0] if m < rests else window):
+            following = moving[m + 1, 0] if m < rests else window
+            # What the functions did before s: left behind, and what they would go on to do.
+            known = m * left if s > 0 else 0
+            sources = np.empty((known + (states if s > 0 else 0), n))
+            sources[:known] = behind[:known]
+            if e > s > 0:
+                sources[known:] = _states(summed, reach, 0, s)
+            shares = np.empty((e - s, len(sources)))
+            for r in range(s, following):
                 for before in range(m + 1 if r >= e else m):
-                    at = free[c, r - moving[before, 1]]
+                    at = r - moving[before, 1]
                     for i in range(left):
-                        gain[before * left + i] = weight[r] * at[i]
+                        gain[before * left + i] = weight[r] * free[c, at, i]
                     # Both last commands are the same from now on.
-                    gain[(before + 1) * left - 1] += weight[r] * at[left]
-                if r >= e:
-                    for i in range((m + 1) * left):
-                        pull[i] += gain[i] * error[r]
-                        for j in range(i + 1):
-                            square[i, j] += gain[i] * gain[j]
+                    gain[(before + 1) * left - 1] += weight[r] * free[c, at, left]
+                if r < e:
+                    for i in range(known):
+                        shares[r - s, i] = gain[i]
+                    for i in range(known, len(sources)):
+                        shares[r - s, i] = -weight[r] * free[c, r - s, i - known]
                     continue
-                row = rows[count]
-                count += 1
-                _add(weight[r], filtered[c, r], row)
+                for i in range((m + 1) * left):
+                    pull[i] += gain[i] * error[r]
+                    for j in range(i + 1):
+                        square[i, j] += gain[i] * gain[j]
+            if e > s:
+                part = rows[count : count + e - s]
+                for r in range(s, e):
+                    for j in range(n):
+                        part[r - s, j] = weight[r] * filtered[c, r, j]
                 if s > 0:
-                    for i in range(m * left):
-                        _add(gain[i], behind[i], row)
-                    for i in range(states):
-                        _add(-weight[r] * free[c, r - s, i], begun[i], row)
-                _add(error[r], row, right)
+                    part += np.dot(shares, sources)
+                right += np.dot(error[s:e], part)
+                count += e - s
         for i in range(len(pull)):
             _add(pull[i], behind[i], right)
             for j in range(i):
@@ -120,7 +197,7 @@ def tied_problem(
         if rests:
             normal += np.dot(behind.T, np.dot(square, behind))
     normal += np.dot(rows[:count].T, rows[:count])
-    factor = np.linalg.cholesky(normal)
+    factor = np.linalg.cholesky(normal).T.copy()
     forward(factor, right)
     return factor, right, ends
 
@@ -178,22 +255,22 @@ def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
 
 @kernel
 def forward(factor: Array, values: Array) -> None:
-    """Solve factor x = values in place, for a lower triangle."""
+    """Solve factor' x = values in place, for an upper triangle."""
     for j in range(len(values)):
         values[j] /= factor[j, j]
         for i in range(j + 1, len(values)):
-            values[i] -= factor[i, j] * values[j]
+            values[i] -= factor[j, i] * values[j]
 
 
 @kernel
 def command_of(
     factor: Array, w: Array, basis: Array, moving: Ints, last: float, previous: float
 ) -> Array:
-    """Command of the coefficients c with factor' c = w."""
+    """Command of the coefficients c with factor c = w."""
     c = w.copy()
     for j in range(len(c) - 1, -1, -1):
         for i in range(j + 1, len(c)):
-            c[j] -= factor[i, j] * c[i]
+            c[j] -= factor[j, i] * c[i]
         c[j] /= factor[j, j]
     return tied_command(np.dot(basis, c), moving, last, previous)
 
@@ -271,7 +348,7 @@ def constraints_at(
         For increments, steps and positions: lowest and highest value, by how much a constraint is
         tighter, and what rows are scaled by.
     factor, summed, moving, ends
-        As in `tied_problem`.
+        As in `tied_window`.
     taken : ndarray of bool, shape (3, window)
         Samples that have a constraint; those found are added.
 

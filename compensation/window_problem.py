@@ -18,23 +18,19 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgesv, dtrtrs
 
 from compensation._window_kernels import (
     command_of,
     constraints_at,
     extremes,
-    tied_command,
-    tied_problem,
+    tied_window,
 )
 from compensation.base import DesignError
-from compensation.lifted_window import LiftedWindow
 from compensation.preview import PreviewDesign
 
 __all__ = ["EFFORT_PRICE", "TRAVEL_SLACK_MM", "Bounds", "Extremes", "solve_window"]
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 EFFORT_PRICE = 0.5
 """Price of squared increments (mm/sample^2)^2 against squared error mm^2 at rests."""
@@ -141,37 +137,27 @@ def solve_window(
     edges = [0, *(edge for span in spans for edge in span), window]
     moving = np.array(edges, dtype=np.int64).reshape(-1, 2)
     lifted, summed = design.lifted, design.summed
-    # In the coordinates w = L' c, normal = L L', the cost is |w - wish|^2: well conditioned even
-    # where a rest leaves few samples.
     try:
-        factor, wish, ends = tied_problem(
+        # In the coordinates w = L' c, normal = L L', the cost is |w - wish|^2: well conditioned
+        # even where a rest leaves few samples.
+        command, fixed, factor, wish, ends, pinned, values = tied_window(
             design.basis,
             summed,
             design.effort,
             design.filtered,
             lifted.from_state,
             lifted.reach,
-            _stop(lifted, moving),
+            lifted.integrated[:, :, 0],
             max(EFFORT_PRICE, design.price) if len(rests) else design.price,
             z,
+            path_mm,
             targets_mm,
             weight,
             moving,
         )
     except np.linalg.LinAlgError as error:
         raise DesignError(f"the window problem at a rest is singular ({error})") from error
-    pins = [a - 1 for a, _ in spans if a > 0]
-    fixed = tied_command(np.zeros(window), moving, last, previous)
-    values = path_mm[pins] - fixed[pins]
-    found = wish
-    pinned = dtrtrs(factor, ends[len(spans) - len(pins) :].T, lower=1)[0].T
-    if pins:
-        # The nearest w for which the command stands on the path in the rests.
-        *_, pull, flaw = dgesv(pinned @ pinned.T, pinned @ wish - values)
-        if flaw:
-            raise DesignError(f"rests contradict each other in a window (LAPACK dgesv: {flaw})")
-        found = wish - pull @ pinned
-    command = untied = command_of(factor, found, design.basis, moving, last, previous)
+    untied = command
     rows, low, high = pinned, values, values
     taken = np.zeros((3, window), bool)
     while not all(bounds.kept(Extremes.of(command, last, previous))):
@@ -183,22 +169,13 @@ def solve_window(
             break
         rows, low, high = map(np.concatenate, zip((rows, low, high), more, strict=True))
         kinds = np.zeros(len(rows), np.int32)
-        kinds[: len(pins)] = _EQUAL
+        kinds[: len(values)] = _EQUAL
         found, _, flag, _ = daqp.solve(np.eye(design.n), -wish, rows, high, low, kinds)
         if flag <= 0:
             command = untied  # nothing keeps them; the caller sees that and takes a gentler design
             break
         command = command_of(factor, found, design.basis, moving, last, previous)
-    command[pins] = path_mm[pins]
-    for a, b in rests:
+    for a, b in spans:
         # Rounding must not move a resting axis.
-        command[max(a, 0) : b] = last if a <= 0 else command[a - 1]
+        command[max(a - 1, 0) : b] = last if a <= 0 else path_mm[a - 1]
     return np.asarray(command)
-
-
-def _stop(lifted: LiftedWindow, moving: Ints) -> Array:
-    """Response to the increment that stops a motion of 1 mm/sample at the first rest."""
-    window, first = lifted.window, int(moving[0, 1])
-    response = np.zeros((len(lifted.integrated), window))
-    response[:, first:] = lifted.integrated[:, : window - first, 0]
-    return response
