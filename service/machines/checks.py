@@ -8,7 +8,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from models.errors import ModelError
-from models.machine import Machine
+from models.firmware.common import FirmwareFacts
+from models.machine import CommandLimits, Machine
 from models.store import explain
 from service.machines.klipper_config import Fact, PrinterConfig, facts
 
@@ -26,6 +27,8 @@ _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
 _FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
 _DAMPING_SCALE = (0.5, 1.0, 1.5)
+_COMMAND_ROOM = 1.4
+"""A command may ask for so many times the acceleration of its path (`compensation.fbf`)."""
 _RELATIVE = 1e-6
 
 
@@ -168,10 +171,11 @@ def machine_from_config(
     for fact in facts(config):
         _put(document, fact)
     try:
-        return Machine.model_validate(document)
+        machine = Machine.model_validate(document)
     except ValidationError as error:
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
+    return machine.model_copy(update={"command": _with_room(machine.firmware)})
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
@@ -193,6 +197,15 @@ def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
         "members": {"frequency_scale": _FREQUENCY_SCALE, "damping_scale": _DAMPING_SCALE},
         "provenance": {"kind": "typed in"},
     }
+
+
+def _with_room(firmware: FirmwareFacts) -> CommandLimits:
+    """Return limits of the command that leave it room above what the printer allows a file."""
+    usual = CommandLimits()
+    return CommandLimits(
+        velocity_mm_s=max(usual.velocity_mm_s, _COMMAND_ROOM * firmware.fastest_mm_s),
+        accel_mm_s2=max(usual.accel_mm_s2, _COMMAND_ROOM * firmware.largest_accel_mm_s2),
+    )
 
 
 def _at(document: Any, place: str) -> Any:

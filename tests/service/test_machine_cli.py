@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 from models.store import builtin_machines
 from service.cli import run
 from service.machines.checks import check_before_job, differences
@@ -240,6 +240,17 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
     assert differences(machine, read_printer_config(config)) == []
     assert machines("from-config", config, "--name", "mine") == 2
     assert "already" in one_line(capsys)
+
+
+def test_the_command_of_a_fast_printer_has_room(store: MachineStore, config: Path):
+    assert machines("from-config", config, "--name", "slow") == 0
+    assert store.current("slow").machine.command == CommandLimits()
+    fast = CONFIG.replace("max_velocity: 300", "max_velocity: 600")
+    config.write_text(fast.replace("max_accel = 4000", "max_accel = 30000"))
+    assert machines("from-config", config, "--name", "fast") == 0
+    command = store.current("fast").machine.command
+    assert command.velocity_mm_s == pytest.approx(1.4 * 600)
+    assert command.accel_mm_s2 == pytest.approx(1.4 * 30_000)
 
 
 def test_typed_in_resonances(store: MachineStore, config: Path):
