@@ -19,7 +19,11 @@ export function confirmed({ title, text, yes, no = "Keep it", danger = true, fie
         h("div.actions", null,
           h(danger ? "button.danger" : "button.main", { type: "submit", value: "yes" }, yes),
           h("button", { type: "button", autofocus: fields.length === 0, onclick: () => dialog.close("") }, no))));
+    // Back, on a phone the way out of everything, means no, and leads to another page.
+    const left = () => dialog.close("");
+    addEventListener("hashchange", left);
     dialog.addEventListener("close", () => {
+      removeEventListener("hashchange", left);
       dialog.remove();
       if (before?.isConnected) before.focus();
       resolve(dialog.returnValue === "yes");
