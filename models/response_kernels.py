@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["dense_response", "modal_response"]
+__all__ = ["block_states", "dense_response", "in_blocks", "modal_response"]
 
 Array = NDArray[np.float64]
 _CHUNK = 1024
@@ -58,6 +58,43 @@ def modal_response(modes: Array, d: float, origin: float, state: Array, u: Array
         state[m, 0], state[m, 1] = p, q
         state[m + 1, 0], state[m + 1, 1] = r, s
         state[m + 2, 0], state[m + 2, 1] = v, w
+
+
+@kernel(allocates=False)
+def block_states(step: Array, drive: Array, state: Array, out: Array) -> None:
+    """Carry the states of modes from block to block.
+
+    Parameters
+    ----------
+    step : ndarray, shape (m, 2)
+        Eigenvalues, re and im, to the power of a block's samples.
+    drive : ndarray, shape (blocks, 2 m)
+        What each block's commands add to the states behind it.
+    state : ndarray, shape (m, 2)
+        Carried on.
+    out : ndarray, shape (blocks, 2 m)
+        Becomes the states in front of each block.
+    """
+    for k in range(len(drive)):
+        for m in range(len(step)):
+            p, q = state[m, 0], state[m, 1]
+            # In a long rest the states decay into denormal numbers, which cost a hundredfold.
+            if abs(p) + abs(q) < _TINY:
+                p = q = 0.0
+            out[k, 2 * m], out[k, 2 * m + 1] = p, q
+            state[m, 0] = (step[m, 0] * p - step[m, 1] * q) + drive[k, 2 * m]
+            state[m, 1] = (step[m, 1] * p + step[m, 0] * q) + drive[k, 2 * m + 1]
+
+
+@kernel(allocates=False)
+def in_blocks(u: Array, origin: float, out: Array) -> None:
+    """Lay a command, less `origin`, (blocks n,), into the first n columns of `out`; origin last."""
+    blocks, last = out.shape[0], out.shape[1] - 1
+    n = len(u) // blocks
+    for k in range(blocks):
+        for i in range(n):
+            out[k, i] = u[k * n + i] - origin
+        out[k, last] = origin
 
 
 @kernel

@@ -114,3 +114,17 @@ def test_bad_shapes() -> None:
     with pytest.raises(ValueError, match="sampling time"):
         PlantStream([plant, discretise(PAIRS, 1e-4)])
     assert PlantStream([plant]).push(np.zeros((1, 0))).shape == (1, 0)
+
+
+def test_blocks_answer_as_sample_after_sample() -> None:
+    modes = Mode(f_hz=41.0, zeta=0.05, gain=0.6), Mode(f_hz=97.0, zeta=0.1, gain=0.4)
+    plant = discretise(ModesSpec(modes=modes), 1e-3)
+    rng = np.random.default_rng(3)
+    u = 150.0 + np.cumsum(rng.normal(0.0, 0.05, (1, 1003)), axis=1)
+    u[0, 300:700] = u[0, 300]
+    stream = PlantStream([plant])
+    one_by_one = np.hstack([stream.push(u[:, k : k + 1]) for k in range(u.shape[1])])
+    np.testing.assert_allclose(PlantStream([plant]).push(u), one_by_one, rtol=0.0, atol=1e-11)
+    cut = PlantStream([plant])
+    parts = [cut.push(u[:, a:b]) for a, b in ((0, 333), (333, 350), (350, 1003))]
+    np.testing.assert_allclose(np.hstack(parts), one_by_one, rtol=0.0, atol=1e-11)
