@@ -131,6 +131,10 @@ def test_a_job_is_cancelled_and_deleted(visitor: Visitor, service: Service):
     dialog.get_by_role("button", name="Let it run").click()
     expect(page.get_by_role("button", name="Cancel", exact=True)).to_be_focused()
     page.get_by_role("button", name="Cancel", exact=True).click()
+    page.evaluate("location.hash = '#/jobs'")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page.go_back()
+    page.get_by_role("button", name="Cancel", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Cancel the job").click()
     expect(page.locator(".badge[data-state=cancelled]")).to_be_visible()
     assert service.finished(job)["state"] == "cancelled"
