@@ -137,26 +137,27 @@ def check_phases(phases: Phases) -> None:
 def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeError]]:
     """Take out the lines that are refused, and those that take minutes, one after the other."""
     refusals: list[GcodeError] = []
-    lines = data.split(b"\n")
     reader = Interpreter(machine, strict_bounds=True)
-    good: list[bytes] = []
-    for number, line in enumerate(lines):
-        ended = line + (b"\n" if number + 1 < len(lines) else b"")
-        if not ended:
-            continue
+    good = bytearray()
+    end = 0
+    while end < len(data):
+        start, end = end, data.find(b"\n", end) + 1 or len(data)
+        ended = data[start:end]
         before = reader.snapshot()
         try:
             blocks = reader.push(ended) + ([] if ended.endswith(b"\n") else reader.flush())
             slow = any(np.any(_lasts_s(b.moves) > _LONGEST_S) for b in blocks)
             slow = slow or any(np.any(b.events.dwell_s > _LONGEST_S) for b in blocks)
         except GcodeError as error:
-            refusals.append(error)
+            # Its frames would hold the reader that is given up here.
+            error.__context__ = None
+            refusals.append(error.with_traceback(None))
             slow = True
         if slow:
             reader = before
         else:
-            good.append(ended)
-    return b"".join(good), refusals
+            good += ended
+    return bytes(good), refusals
 
 
 def through_the_road(
