@@ -169,7 +169,6 @@ def test_the_shaper_of_the_firmware() -> None:
         ({"variant": "bugfix"}, "2.1.2"),
         ({"ft_motion": True}, "M493 S0"),
         ({"board": "avr"}, "8-bit"),
-        ({"s_curve": True}, "S_CURVE"),
         ({"min_steps_per_segment": 20}, "MIN_STEPS_PER_SEGMENT 1"),
         ({"planner": MarlinPlanner(junction_deviation_mm=0.005)}, "M205 J takes 0.01 to 0.3 mm"),
     ],
@@ -187,7 +186,9 @@ def test_a_stock_machine_can(per_mm: float) -> None:
     """With the 6 steps that nearly every configuration has, which is our default too."""
     assert Marlin().min_steps_per_segment == 6
     facts = {"min_steps_per_segment": 6, "steps_per_mm": PerAxis(x=per_mm, y=per_mm, z=400, e=93)}
-    for firmware in (FIRMWARE, FIRMWARE.model_copy(update=facts)):
+    stock = FIRMWARE.model_copy(update=facts)
+    curved = stock.model_copy(update={"s_curve": True})
+    for firmware in (FIRMWARE, stock, curved):
         assert MarlinKit(with_firmware(firmware), firmware).refusal is None
 
 

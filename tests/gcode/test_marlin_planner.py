@@ -384,6 +384,40 @@ def test_s_curve_takes_the_same_time() -> None:
     assert duration(curved).sum() == pytest.approx(duration(straight).sum(), rel=0.03)
 
 
+def test_an_s_curve_within_a_step_is_not_seen() -> None:
+    # A stream: 4000, 8000, 4000 steps/s; 50 mm/s by 300 m/s2 take .17 ms, a step .25 ms.
+    points = np.arange(0.0, 9.0)[:, None]
+    speed = [50, 50, 50, 100, 100, 100, 50, 50]
+    times = [
+        duration(plan(machine(s_curve=s, min_steps_per_segment=1), points, speed, **STREAM))
+        for s in (False, True)
+    ]
+    assert times[1][1:-1] == pytest.approx(times[0][1:-1], abs=1e-9)
+
+
+def test_an_s_curve_is_looked_at_step_by_step() -> None:
+    # .1 mm, 8 steps, from the least rate of 120 steps/s up by 40 000 steps/s2 for 4 steps, to
+    # 578.6 steps/s, and down again. Step 1 comes at 120 steps/s, the next four at the rate of the
+    # curve when the one before came; the first one down still at the highest rate.
+    first, accel = 120.0, 40_000.0
+    peak = np.sqrt(first**2 + 2.0 * accel * 4.0)
+    over_s = (peak - first) / accel
+
+    def rate(begin: float, end: float, t_s: float) -> float:
+        x = min(t_s / over_s, 1.0)
+        return float(begin + (end - begin) * x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+
+    up_s = 1.0 / first
+    for _ in range(4):
+        up_s += 1.0 / rate(first, peak, up_s)
+    down_s = 0.0
+    for _ in range(3):
+        down_s += 1.0 / rate(peak, first, down_s)
+    limits = {"print_accel_mm_s2": 500.0, "travel_accel_mm_s2": 500.0}
+    planned = duration(plan(machine(s_curve=True), [[0], [0.1]], 20.0, **limits))
+    assert planned[0] == pytest.approx(up_s + down_s, rel=1e-5)
+
+
 def test_a_move_needs_a_speed() -> None:
     with pytest.raises(GcodeError, match="give it an F"):
         plan(machine(), [[0], [1]], 0.0)

@@ -29,21 +29,29 @@ DT_S = 1e-3
 
 
 def choose(
-    fit: NDArray[np.float64], at_s: NDArray[np.float64], least: int = 6, **options: Any
+    fit: NDArray[np.float64],
+    at_s: NDArray[np.float64],
+    least: int = 6,
+    *,
+    fed: NDArray[np.float64] | None = None,
+    **options: Any,
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
     """Which vertices of a fit, X Y in steps with its start, are kept, and where they go."""
     place = np.zeros((len(fit), 3), np.int64)
     place[:, :2] = np.round(fit)
     keep = np.ones(len(fit), np.bool_)
     given = {"y_weight": 1.0, "step_hz": np.full(2, np.inf), "corexy": False, **options}
-    command = sampled(fit, at_s)
-    assert choose_vertices(place, at_s, command, DT_S, least, *given.values(), keep)
+    fed = np.zeros(len(fit)) if fed is None else fed
+    command = sampled(np.column_stack([fit, fed]), at_s)
+    assert choose_vertices(place, fed, at_s, command, DT_S, least, *given.values(), keep)
     return keep, place
 
 
 def sampled(points: NDArray[Any], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
     t_s = DT_S * np.arange(int(at_s[-1] / DT_S + 1e-9) + 1)
-    return np.column_stack([np.interp(t_s, at_s, points[:, axis]) for axis in (0, 1)])
+    return np.column_stack(
+        [np.interp(t_s, at_s, points[:, axis]) for axis in range(points.shape[1])]
+    )
 
 
 def hops(place: NDArray[np.int64], *, corexy: bool) -> NDArray[np.int64]:
@@ -53,7 +61,7 @@ def hops(place: NDArray[np.int64], *, corexy: bool) -> NDArray[np.int64]:
 
 
 def squares(fit: NDArray[Any], own: NDArray[Any], at_s: NDArray[np.float64], keep: Any) -> float:
-    gap = sampled(own[keep], at_s[keep]) - sampled(fit, at_s)
+    gap = sampled(own[keep][:, :2], at_s[keep]) - sampled(fit, at_s)
     return float(np.sum(gap**2))
 
 
@@ -128,6 +136,14 @@ def test_a_turn_below_the_least_is_kept_in_place() -> None:
     keep, own = choose(np.column_stack([x - x[0], 0.0 * x]), at_s)
     gap = np.abs(sampled(own[keep], at_s[keep])[:, 0] - (x - x[0]))
     assert gap.max() < 3.0
+
+
+def test_where_the_filament_begins_stays_a_vertex() -> None:
+    # Straight on and then slowly: for X and Y alone, one of the last three is enough.
+    x, at_s = np.array([0.0, 100.0, 200.0, 203.0, 206.0]), DT_S * np.array([0, 10, 20, 23, 26])
+    fit = np.column_stack([x, 0.0 * x])
+    keep, _ = choose(fit, at_s, fed=np.array([0.0, 0.0, 30.0, 31.0, 32.0]))
+    assert keep[1]
 
 
 def test_steps_of_speed_stay_small_where_they_can() -> None:

@@ -50,6 +50,7 @@ from models.jit import kernel
 __all__ = ["drop", "emit", "settle"]
 
 _FEW = 12  # steps that are always counted one by one
+_FEW_CURVED = 100.0  # the same of ramps along curves; longer ones take the time of straight ones
 _SMALL = 0.01  # relative change of the rate in a step, below which a ramp is summed in closed form
 _TINY_S = 1e-12
 
@@ -198,7 +199,21 @@ def _steps(row: Any, entry: float, leave: float, facts: Any, shape: Any) -> None
         rising = min(max(floor(half + 0.5) if bugfix else ceil(half), 0.0), steps)
         falling = steps - rising
         peak = min(sqrt(first * first + 2.0 * accel * rising), nominal)
-    if facts[C_S_CURVE] != 0.0:
+    if facts[C_S_CURVE] != 0.0 and not bugfix and rising + falling <= _FEW_CURVED:
+        duration = _curved_time(
+            steps,
+            first,
+            peak,
+            nominal,
+            final,
+            accel,
+            rising,
+            steps - falling,
+            facts[C_TIMER_HZ],
+            facts[C_SMOOTHING_HZ],
+        )
+        flat = falling <= 1.0
+    elif facts[C_S_CURVE] != 0.0:
         # Along the Bezier curve as along the line: the same time and the same way.
         level = max(steps - rising - falling, 0.0)
         first, final = min(first, peak), min(final, peak)
@@ -245,12 +260,7 @@ def _step_time(
     smoothing_hz: float,
 ) -> float:
     """Time from the start of a block to its last step."""
-    fine = 1.0
-    rate = nominal
-    while rate < smoothing_hz:
-        rate *= 2.0
-        if rate < smoothing_hz:
-            fine *= 2.0
+    fine = _parts_of_a_step(nominal, smoothing_hz)
     steps *= fine
     rising *= fine
     falls_from *= fine
@@ -280,6 +290,64 @@ def _step_time(
         spent, rate = _ramp(rate, -accel, t_down, left, final, fine, timer_hz, not bugfix)
         total += spent
     return total
+
+
+@kernel
+def _curved_time(
+    steps: float,
+    first: float,
+    peak: float,
+    nominal: float,
+    final: float,
+    accel: float,
+    rising: float,
+    falls_from: float,
+    timer_hz: float,
+    smoothing_hz: float,
+) -> float:
+    """Time of a block of the releases with short ramps along Bezier curves, step by step.
+
+    The curve is entered where the first step, at the entry's speed, has come to: a ramp that is
+    shorter than that is not seen, as without S-curve.
+    """
+    fine = _parts_of_a_step(nominal, smoothing_hz)
+    steps, rising, falls_from = fine * steps, fine * rising, fine * falls_from
+    total = _interval(first, fine, timer_hz)
+    up_s, down_s = (peak - first) / accel, (peak - final) / accel
+    t = total
+    accelerated = max(min(rising, steps - 1.0), 0.0)
+    for _ in range(int(accelerated)):
+        wait = _interval(_on_curve(first, peak, t, up_s), fine, timer_hz)
+        t += wait
+        total += wait
+    done = 1.0 + accelerated
+    cruised = max(min(falls_from + 1.0, steps) - done, 0.0)
+    total += cruised * _interval(nominal, fine, timer_hz)
+    t = 0.0
+    for _ in range(int(steps - done - cruised)):
+        wait = _interval(_on_curve(peak, final, t, down_s), fine, timer_hz)
+        t += wait
+        total += wait
+    return total
+
+
+@kernel(inline=True)
+def _parts_of_a_step(nominal: float, smoothing_hz: float) -> float:
+    """Find how many parts of a step ADAPTIVE_STEP_SMOOTHING times for each step."""
+    fine = 1.0
+    rate = nominal
+    while rate < smoothing_hz:
+        rate *= 2.0
+        if rate < smoothing_hz:
+            fine *= 2.0
+    return fine
+
+
+@kernel(inline=True)
+def _on_curve(begin: float, end: float, t: float, over: float) -> float:
+    """Rate on the quintic Bezier curve of three equal points at either end."""
+    x = t / over if t < over else 1.0
+    return begin + (end - begin) * x * x * x * (10.0 - x * (15.0 - 6.0 * x))
 
 
 @kernel

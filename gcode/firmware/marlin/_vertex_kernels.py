@@ -47,6 +47,7 @@ def nearly_back(ax: float, ay: float, bx: float, by: float) -> bool:
 @kernel
 def choose_vertices(
     place: Any,
+    fed: Any,
     at_s: Any,
     command: Any,
     dt_s: float,
@@ -63,9 +64,11 @@ def choose_vertices(
     place : ndarray of int64, shape (n, 3)
         X Y Z in whole steps: where the stretch starts, and the fit's vertices. Those that are kept
         are edited in place; the first and the last stay.
+    fed : ndarray, shape (n,)
+        Filament there, in lengths that count as much as a step of X.
     at_s : ndarray, shape (n,)
-    command : ndarray, shape (m, 2)
-        X Y in steps at the times 0, dt_s, ...
+    command : ndarray, shape (m, 3)
+        X and Y in steps and the filament at the times 0, dt_s, ...
     y_weight : float
         What a squared step of Y counts, one of X being 1.
     step_hz : ndarray, shape (2,)
@@ -94,7 +97,7 @@ def choose_vertices(
     reached = np.zeros(n, np.bool_)
     cost[0, beside], reached[0] = 0.0, True
     gap = np.empty((2, side))
-    moment = np.empty((2, 3))
+    moment, origin = np.empty((3, 3)), np.empty(3)
     for k in range(1, n):
         last = k + 1 == n
         moves_k = near[k] and not last
@@ -116,7 +119,11 @@ def choose_vertices(
             slack = stride * _BESIDE * (int(moves_k) + int(moves_j))
             if not alone and hop(abs(dx) + slack, abs(dy) + slack, dz, corexy) < least:
                 continue
-            u2, uw, w2 = _moments(command, place[j], at_s[j], at_s[k], dt_s, moment)
+            origin[0], origin[1], origin[2] = place[j, 0], place[j, 1], fed[j]
+            u2, uw, w2 = _moments(command, origin, at_s[j], at_s[k], dt_s, moment)
+            fed_gap = moment[2, 2] + (fed[k] - fed[j]) * (
+                (fed[k] - fed[j]) * w2 - 2.0 * moment[2, 1]
+            )
             for d in range(side * side):
                 if cost[j, d] == np.inf:
                     continue
@@ -142,7 +149,7 @@ def choose_vertices(
                 for c in range(side * side):
                     if not moves_k and c != beside:
                         continue
-                    total = cost[j, d] + gap[0, c // side] + y_weight * gap[1, c % side]
+                    total = cost[j, d] + fed_gap + gap[0, c // side] + y_weight * gap[1, c % side]
                     if total >= cost[k, c]:
                         continue
                     bx = dx + stride * (c // side - _BESIDE) - begin[0]
@@ -211,7 +218,7 @@ def _near_ones(place: Any, least: int, corexy: bool) -> Any:
 def _moments(
     command: Any, origin: Any, begin_s: float, end_s: float, dt_s: float, moment: Any
 ) -> tuple[float, float, float]:
-    """Sum up over the samples of a segment: u u, u w, w w; and for X and Y u r, w r, r r.
+    """Sum up over the samples of a segment: u u, u w, w w; and for each axis u r, w r, r r.
 
     w rises from 0 to 1, u = 1 - w, and r is the command as seen from the origin.
     """
@@ -225,7 +232,7 @@ def _moments(
         u2 += u * u
         uw += u * w
         w2 += w * w
-        for axis in range(2):
+        for axis in range(3):
             r = command[s, axis] - origin[axis]
             moment[axis, 0] += u * r
             moment[axis, 1] += w * r

@@ -60,6 +60,10 @@ STREAM_Z_JERK_MM_S = 10.0
 
 _MOST_FEED = 3.0
 """Filament per mm, above which the firmware takes a move for a retraction and advances none."""
+_FILAMENT_MM = 0.01
+"""An error of the filament that counts as much as a step of X, where vertices are left out."""
+_CALM = 0.6
+"""Of the machine's step of speed: what makes up for lost time comes on top."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
@@ -299,25 +303,28 @@ class MarlinEncoder:
     ) -> NDArray[np.bool_]:
         """Tell which vertices to keep, and move them in place, so that none is swallowed."""
         scale, dt_s = self._scale, timeline.dt_s
+        per_mm = np.array([scale[0], scale[1], 1.0 / _FILAMENT_MM])
         keep = np.ones(len(segments), np.bool_)
         firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
         for first, stop in itertools.pairwise((*firsts, len(segments))):
             group = segments.group[first]
-            start_s, start_mm = timeline.start_s[group], timeline.group_start_mm[group, :2]
+            start_s, start_mm = timeline.start_s[group], timeline.group_start_mm[group, [0, 1, 3]]
             at_s = np.append(0.0, segments.end_s[first:stop] - start_s)
             place = np.vstack([begin[group], steps[first:stop]])
-            fitted = np.column_stack([start_mm, segments.end_mm[:2, first:stop]])
+            fitted = np.column_stack([start_mm, segments.end_mm[[0, 1, 3], first:stop]])
+            fitted *= per_mm[:, None]
             t_s = dt_s * np.arange(int(at_s[-1] / dt_s) + 1)
-            command = np.column_stack([np.interp(t_s, at_s, fitted[i]) * scale[i] for i in (0, 1)])
+            command = np.column_stack([np.interp(t_s, at_s, row) for row in fitted])
             kept = np.ones(len(place), np.bool_)
             if choose_vertices(
                 place,
+                fitted[2],
                 at_s,
                 command,
                 dt_s,
                 self._firmware.min_steps_per_segment,
                 (scale[0] / scale[1]) ** 2,
-                self._speed_step * scale[:2],
+                _CALM * self._speed_step * scale[:2],
                 self._corexy,
                 kept,
             ):

@@ -85,11 +85,6 @@ class MarlinKit:
                 "an 8-bit board computes step rates in 16 bits and takes some hundred segments a "
                 "second at most; print from a 32-bit board, or " + _ALTERNATIVE
             )
-        if firmware.s_curve:
-            return (
-                "S_CURVE_ACCELERATION rounds off every change of speed within a step's time in a "
-                "way that is not modelled; build without it, or " + _ALTERNATIVE
-            )
         deviation_mm = firmware.planner.junction_deviation_mm
         low, high = JUNCTION_DEVIATION_MM
         if firmware.junction == "deviation" and not low <= deviation_mm <= high:
