@@ -126,7 +126,7 @@ def _dwell(w: Any, mask: int, f: Any, i: Any, rows: Any) -> int:
     settle(f, i, rows)
     put_event(i, rows, _STOP)
     settle(f, i, rows)
-    rows.real[9 * rows.whole.shape[1] + i[I_EVENTS] - 1] = seconds
+    rows.real[9 * rows.whole.shape[1] + 4 + i[I_EVENTS] - 1] = seconds
     return OK
 
 

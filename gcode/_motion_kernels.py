@@ -118,8 +118,8 @@ def travel(
     for k in range(4):
         if moving or k == 3:
             f[F_TOOL + k] = f[F_LAST + k]
-        real[4 * (room + n) + k] = f[F_TOOL + k]
-    real[8 * room + n] = f[F_SPEED]
+        real[4 * (n + 1) + k] = f[F_TOOL + k]
+    real[8 * room + 4 + n] = f[F_SPEED]
     rows.whole[M_LINE, n] = i[I_LINE]
     rows.whole[M_START, n] = i[I_OFFSET] + i[I_POS]
     rows.whole[M_STOP, n] = i[I_OFFSET] + i[I_END]

@@ -77,7 +77,7 @@ for _pair in ("la", "ty", "ch", "fe", "z:", "z_", "pr", "st", "me", "be", "ob", 
 _MARKS[(ord("'") & 31) << 5 : ((ord("'") & 31) + 1) << 5] = True
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
 def eight_digits(digits: Any) -> Any:
     """Return the number that eight digits (0 to 9, the first in the lowest byte) make."""
     pairs = digits * _TEN + (digits >> _EIGHT)
@@ -86,7 +86,7 @@ def eight_digits(digits: Any) -> Any:
     return np.int64((high + low) >> _32)
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
 def decimal(buf: Any, p: int) -> Any:
     """Read a number; return it and where it ends, or -1 where it is no plain one.
 
@@ -313,12 +313,12 @@ def plain(buf: Any, stop: int, f: Any, i: Any, rows: Any, m_words: Any) -> None:
                 if moving:
                     tool_x, tool_y, tool_z = new_x, new_y, new_z
                 tool_e = new_e
-                at = 4 * (room + n)
+                at = 4 * (n + 1)
                 real[at] = tool_x
                 real[at + 1] = tool_y
                 real[at + 2] = tool_z
                 real[at + 3] = tool_e
-                real[8 * room + n] = speed
+                real[8 * room + 4 + n] = speed
                 whole[M_LINE, n] = line
                 whole[M_START, n] = offset + pos
                 pos = min(p + 1, stop)

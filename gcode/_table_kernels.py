@@ -31,6 +31,7 @@ from gcode._slots import (
     F_UNIT_MM,
     I_ABS_E,
     I_ABS_XYZ,
+    I_APART,
     I_END,
     I_EVENTS,
     I_FEATURE,
@@ -56,6 +57,7 @@ from gcode._slots import (
     M_LIMITS,
     M_MODAL,
     M_OBJECT,
+    M_STOP,
     M_TOOL,
 )
 from models.jit import kernel
@@ -64,11 +66,13 @@ from models.jit import kernel
 class Rows(NamedTuple):
     """The columns that one block of the program is written to, with room for the same number each.
 
-    There are few arrays because kernels hand them on, and every one of them costs time.
+    There are few arrays because kernels hand them on, and every one of them costs time; and they
+    lie in one piece of memory, which is soon had again when a block is forgotten.
     """
 
     real: NDArray[np.float64]
-    """One after the other: start and end of the moves (4 numbers a row), speed, dwell of events."""
+    """One after the other: where the first move starts (4 numbers), end of the moves (4 a row),
+    start of the moves (4 a row, written only if I_APART), speed, dwell of events."""
     whole: NDArray[np.int64]
     """Rows M_LINE, M_START, M_STOP, E_MOVE, E_LINE, E_START, E_STOP."""
     small: NDArray[np.int32]
@@ -79,11 +83,16 @@ class Rows(NamedTuple):
     @classmethod
     def empty(cls, count: int) -> Rows:
         """Return room for so many moves and as many events."""
+        reals, wholes, smalls, tinies = 10 * count + 4, 7 * count, 8 * count, 2 * count
+        memory = np.empty(8 * (reals + wholes) + 4 * smalls + tinies, np.uint8)
+        whole = 8 * reals
+        small = whole + 8 * wholes
+        tiny = small + 4 * smalls
         return cls(
-            np.empty(10 * count),
-            np.empty((7, count), np.int64),
-            np.empty((8, count), np.int32),
-            np.empty((2, count), np.uint8),
+            memory[:whole].view(np.float64),
+            memory[whole:small].view(np.int64).reshape(7, count),
+            memory[small:tiny].view(np.int32).reshape(8, count),
+            memory[tiny:].reshape(2, count),
         )
 
     @property
@@ -92,24 +101,46 @@ class Rows(NamedTuple):
         return int(self.whole.shape[1])
 
     @property
-    def start(self) -> NDArray[np.float64]:
-        """Start of the moves, shape (n, 4)."""
-        return self.real[: 4 * self.room].reshape(-1, 4)
-
-    @property
-    def end(self) -> NDArray[np.float64]:
-        """End of the moves, shape (n, 4)."""
-        return self.real[4 * self.room : 8 * self.room].reshape(-1, 4)
-
-    @property
-    def speed(self) -> NDArray[np.float64]:
-        """Speed of the moves, shape (n,)."""
-        return self.real[8 * self.room : 9 * self.room]
-
-    @property
     def dwell(self) -> NDArray[np.float64]:
         """Dwell of the events, shape (n,)."""
-        return self.real[9 * self.room :]
+        return self.real[9 * self.room + 4 :]
+
+    def moves(self, count: int, *, apart: bool) -> dict[str, NDArray[Any]]:
+        """Return the first rows of the moves' columns."""
+        real, room = self.real, self.room
+        starts = 4 * (room + 1) if apart else 0
+        line, byte_start, byte_end = self.whole[: M_STOP + 1, :count]
+        limits_id, modal_id, layer, feature, object_id, tool = self.small[: M_TOOL + 1, :count]
+        return {
+            "start_mm": real[starts : starts + 4 * count].reshape(count, 4),
+            "end_mm": real[4 : 4 + 4 * count].reshape(count, 4),
+            "speed_mm_s": real[8 * room + 4 : 8 * room + 4 + count],
+            "limits_id": limits_id,
+            "modal_id": modal_id,
+            "known": self.tiny[M_KNOWN, :count],
+            "line": line,
+            "byte_start": byte_start,
+            "byte_end": byte_end,
+            "layer": layer,
+            "feature": feature,
+            "object_id": object_id,
+            "tool": tool,
+        }
+
+    def events(self, count: int) -> dict[str, NDArray[Any]]:
+        """Return the first rows of the events' columns."""
+        move_index, line, byte_start, byte_end = self.whole[E_MOVE:, :count]
+        limits_id, modal_id = self.small[E_LIMITS:, :count]
+        return {
+            "kind": self.tiny[E_KIND, :count].view(np.int8),
+            "move_index": move_index,
+            "modal_id": modal_id,
+            "limits_id": limits_id,
+            "dwell_s": self.dwell[:count],
+            "line": line,
+            "byte_start": byte_start,
+            "byte_end": byte_end,
+        }
 
 
 class Tables(NamedTuple):
@@ -187,6 +218,20 @@ def intern_row(rows: Any, index: Any, count: int) -> int:
 
 
 @kernel(allocates=False)
+def _start_anew(f: Any, i: Any, rows: Any) -> None:
+    """Have the next move start where the tool is; so far each started where the last one ended."""
+    apart = False
+    for k in range(4):
+        apart = apart or f[F_RUN + k] != f[F_TOOL + k]
+        f[F_RUN + k] = f[F_TOOL + k]
+    if apart and i[I_MOVES] > 0 and not i[I_APART]:
+        starts = 4 * (rows.small.shape[1] + 1)
+        for k in range(4 * i[I_MOVES]):
+            rows.real[starts + k] = rows.real[k]
+        i[I_APART] = 1
+
+
+@kernel(allocates=False)
 def settle(f: Any, i: Any, rows: Any) -> None:
     """Fill the slow columns of the rows written since the last time."""
     a, b = i[I_FILLED_MOVES], i[I_MOVES]
@@ -199,12 +244,17 @@ def settle(f: Any, i: Any, rows: Any) -> None:
         known = i[I_KNOWN] | kept
         limits, modal, layer = i[I_LIMITS_ID], i[I_MODAL_ID], i[I_LAYER]
         feature, thing, tool = i[I_FEATURE], i[I_OBJECT], i[I_TOOL]
-        ends = 4 * small.shape[1]
+        if a == 0:
+            for k in range(4):
+                real[k] = f[F_RUN + k]
+        if i[I_APART]:
+            starts = 4 * (small.shape[1] + 1)
+            for k in range(4):
+                real[starts + 4 * a + k] = f[F_RUN + k]
+            for k in range(4 * (a + 1), 4 * b):
+                real[starts + k] = real[k]
         for k in range(4):
-            real[4 * a + k] = f[F_RUN + k]
-            f[F_RUN + k] = real[ends + 4 * (b - 1) + k]
-        for k in range(4 * (a + 1), 4 * b):
-            real[k] = real[ends + k - 4]
+            f[F_RUN + k] = real[4 * b + k]
         for n in range(a, b):
             tiny[M_KNOWN, n] = known
             small[M_LIMITS, n] = limits
@@ -215,11 +265,10 @@ def settle(f: Any, i: Any, rows: Any) -> None:
             small[M_TOOL, n] = tool
         i[I_FILLED_MOVES] = b
     else:
-        for k in range(4):
-            f[F_RUN + k] = f[F_TOOL + k]
+        _start_anew(f, i, rows)
     a, b = i[I_FILLED_EVENTS], i[I_EVENTS]
     if a < b:
-        dwells = 9 * small.shape[1]
+        dwells = 9 * small.shape[1] + 4
         limits, modal = i[I_LIMITS_ID], i[I_MODAL_ID]
         for n in range(a, b):
             small[E_LIMITS, n] = limits

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +29,6 @@ from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, Prog
 from models.machine import Machine
 
 __all__ = ["Interpreter", "interpret_bytes"]
-
-T = TypeVar("T", bound=np.generic)
 
 _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -226,36 +223,16 @@ class Interpreter:
         state.settle()
         n, m = int(i[at.I_MOVES]), int(i[at.I_EVENTS])
         self._note_tables()
-        rows = state.rows
-        moves = Moves(
-            start_mm=_part(rows.start, n),
-            end_mm=_part(rows.end, n),
-            speed_mm_s=_part(rows.speed, n),
-            limits_id=_part(rows.small[at.M_LIMITS], n),
-            modal_id=_part(rows.small[at.M_MODAL], n),
-            known=_part(rows.tiny[at.M_KNOWN], n),
-            line=_part(rows.whole[at.M_LINE], n),
-            byte_start=_part(rows.whole[at.M_START], n),
-            byte_end=_part(rows.whole[at.M_STOP], n),
-            layer=_part(rows.small[at.M_LAYER], n),
-            feature=_part(rows.small[at.M_FEATURE], n),
-            object_id=_part(rows.small[at.M_OBJECT], n),
-            tool=_part(rows.small[at.M_TOOL], n),
-        )
-        events = Events(
-            kind=_part(rows.tiny[at.E_KIND].view(np.int8), m),
-            move_index=_part(rows.whole[at.E_MOVE], m),
-            modal_id=_part(rows.small[at.E_MODAL], m),
-            limits_id=_part(rows.small[at.E_LIMITS], m),
-            dwell_s=_part(rows.dwell, m),
-            line=_part(rows.whole[at.E_LINE], m),
-            byte_start=_part(rows.whole[at.E_START], m),
-            byte_end=_part(rows.whole[at.E_STOP], m),
-        )
+        moves = state.rows.moves(n, apart=bool(i[at.I_APART]))
+        events = state.rows.events(m)
+        if 2 * (n + m) < state.rows.room:
+            # A few rows would keep the room for many.
+            moves = {name: column.copy() for name, column in moves.items()}
+            events = {name: column.copy() for name, column in events.items()}
         block = ProgramBlock(
             first_move=self._first_move,
-            moves=moves,
-            events=events,
+            moves=Moves(**moves),
+            events=Events(**events),
             limits=self._limits,
             modal=self._modal,
             text_offset=self._offset + begun,
@@ -541,9 +518,3 @@ def _height(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-def _part(column: NDArray[T], count: int) -> NDArray[T]:
-    """Return the first rows; a copy where most of the room would be kept for nothing."""
-    part = column[:count]
-    return part if 2 * count > len(column) else part.copy()

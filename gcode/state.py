@@ -338,6 +338,7 @@ class MachineState:
         self.rows = Rows.empty(count)
         i = self.i
         i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0
+        i[at.I_APART] = 0
 
     def grow_tables(self) -> None:
         """Make the tables larger that are full."""

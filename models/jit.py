@@ -79,7 +79,13 @@ class _KernelCache(FunctionCache):
         """
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
-            return self._load_overload(signature, target_context)  # type: ignore[no-untyped-call]
+            try:
+                return self._load_overload(signature, target_context)  # type: ignore[no-untyped-call]
+            except Exception:
+                # Half a file raises whatever its bytes happen to mean. It is written anew.
+                with contextlib.suppress(OSError):
+                    self._cache_file.flush()  # type: ignore[no-untyped-call]
+                return None
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """See `numba.core.caching.Cache`."""
@@ -124,7 +130,11 @@ def kernel(function: Callable[P, R], /) -> Callable[P, R]: ...
 
 @overload
 def kernel(
-    *, inline: bool = False, parallel: bool = False, allocates: bool = True
+    *,
+    inline: bool = False,
+    force_inline: bool = False,
+    parallel: bool = False,
+    allocates: bool = True,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
 
 
@@ -133,6 +143,7 @@ def kernel(
     /,
     *,
     inline: bool = False,
+    force_inline: bool = False,
     parallel: bool = False,
     allocates: bool = True,
 ) -> Any:
@@ -145,6 +156,9 @@ def kernel(
     ----------
     inline : bool
         Paste the body into its callers (for helpers of a few lines in a hot loop).
+    force_inline : bool
+        Put the machine code into its callers, however long it is: a call costs its caller all that
+        it holds in registers.
     parallel : bool
         Allow `numba.prange`.
     allocates : bool
@@ -159,6 +173,7 @@ def kernel(
             parallel=parallel,
             _nrt=allocates,
             inline="always" if inline else "never",
+            forceinline=force_inline,
         )
         dispatcher: Any = decorate(body)
         dispatcher._cache = _KernelCache(body)

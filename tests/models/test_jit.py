@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 from models import jit
 
@@ -21,6 +23,11 @@ from tools.numbers import OFFSET
 @kernel
 def outer(x: float) -> float:
     return double(x) + OFFSET
+
+@kernel(allocates=False)
+def fill(values, out) -> None:
+    for k in range(len(out)):
+        out[k] = double(values[k]) + OFFSET
 """
 INNER = """
 from models.jit import kernel
@@ -63,6 +70,41 @@ def test_a_change_in_what_a_kernel_imports_is_noticed(tools) -> None:
     assert sum(again.outer.stats.cache_hits.values()) == 1
     assert tools(5.0, 1.0).outer(3.0) == 16.0
     assert tools(5.0, 2.0).outer(3.0) == 17.0
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_a_damaged_file_is_compiled_anew(tools, suffix: str) -> None:
+    first = tools(2.0, 1.0)
+    assert first.outer(3.0) == 7.0
+    (file,) = Path(first.outer.stats.cache_path).glob(f"caller.outer*.{suffix}")
+    file.write_bytes(file.read_bytes()[:40])
+    again = tools(2.0, 1.0)
+    assert again.outer(3.0) == 7.0
+    assert sum(again.outer.stats.cache_hits.values()) == 0
+    third = tools(2.0, 1.0)
+    assert third.outer(3.0) == 7.0
+    assert sum(third.outer.stats.cache_hits.values()) == 1
+
+
+def test_a_kernel_that_counts_no_references_cannot_make_arrays() -> None:
+    def room(count: int) -> int:
+        return len(np.empty(count))
+
+    with pytest.raises(NumbaError, match=r"Only accept returning of array passed|NRT"):
+        jit.kernel(allocates=False)(room)(4)
+
+
+def test_a_kernel_from_disk_fills_arrays_as_a_fresh_one(tools) -> None:
+    values = np.linspace(-1.0, 1.0, 9)
+    fresh, loaded = tools(3.0, 0.5), tools(3.0, 0.5)
+    results = []
+    for module in (fresh, loaded):
+        out = np.zeros(9)
+        module.fill(values, out)
+        results.append(out)
+    assert sum(loaded.fill.stats.cache_hits.values()) == 1
+    np.testing.assert_array_equal(*results)
+    np.testing.assert_array_equal(results[0], 3.0 * values + 0.5)
 
 
 def _kernel_modules() -> list[Path]:
