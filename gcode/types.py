@@ -98,7 +98,8 @@ class Moves:
     Attributes
     ----------
     start_mm, end_mm : ndarray, shape (n, 4)
-        x y z in machine axes and e as the firmware's cumulative extruder position.
+        x y z in machine axes and e as the firmware's cumulative extruder position. Not to be
+        written to: as a rule they are the same numbers in memory, one row apart.
     speed_mm_s : ndarray, shape (n,)
         Requested speed: F times the speed factor, before any limit.
     limits_id, modal_id : ndarray of int32, shape (n,)
