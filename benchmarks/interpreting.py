@@ -3,7 +3,8 @@
 Run: python benchmarks/interpreting.py [FILE ...] [--megabytes 64] [--machine ender3]
 
 Every file is read over and over as one long file in pieces of a quarter of a megabyte, as the road
-reads it, the best of three runs counts, and times are CPU times. For comparison: counting newlines,
+reads it and with its settings of the allocator, the best of three runs counts, and times are CPU
+times. For comparison: counting newlines,
 and `gcodeparser` from PyPI (MIT; install it to see it), on the file once. Each row is a process of
 its own, so that the largest memory is the row's.
 """
@@ -23,6 +24,7 @@ from benchmarks.readback import shared_folder
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from models.store import load_machine
+from service.environment import prepare_environment
 
 PIECE = 1 << 18
 ROUNDS = 3
@@ -38,6 +40,7 @@ def main() -> None:
     parser.add_argument("--row", choices=ROWS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.row:
+        prepare_environment()
         data = _text(arguments.files[0])
         print(json.dumps(_measure(arguments.row, data, arguments.megabytes, arguments.machine)))
         return
