@@ -201,6 +201,10 @@ class FirmwareKit(Protocol):
         """
 
     @property
+    def shortest_move_mm(self) -> float:
+        """Length in X Y below which a move is not executed by itself; 0: every move is."""
+
+    @property
     def extruder_alone_stops(self) -> bool:
         """X, Y and Z always come to rest before a move of the extruder alone, and behind it."""
 

@@ -68,7 +68,7 @@ _EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
 _TIME_EXCESS_S = 20e-3
-_WARN_PUT_BACK_SHARE = 0.2
+_WARN_SHARE = 0.2
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 """How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
 
@@ -452,7 +452,12 @@ class _Job:
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
         self._sum.time_s += motion_s
-        self._sum.extruding_s += float(np.sum(duration[_feeding(phases)]))
+        feeding = _feeding(phases)
+        self._sum.extruding_s += float(np.sum(duration[feeding]))
+        if np.any(feeding):
+            self._sum.passed_s += float(np.sum(duration[feeding]))
+            first = phases.move_index[int(np.argmax(feeding))]
+            self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
         samples = max(round(motion_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             n = min(_CHUNK, samples - start)
@@ -522,8 +527,10 @@ class _Job:
     ) -> None:
         """Compare executed with intended motion; raise `Unfit` with the reason."""
         step = np.array(self._kit.step_mm)
-        # Where vertices lie on steps, and when steps come, are off by up to a step each.
-        tolerance = 1e-3 * self._options.tolerance_um + 2.0 * float(np.hypot(*step[:2]))
+        # Where vertices lie on steps, and when steps come, are off by up to a step each; what turns
+        # back within the shortest move is off by up to that.
+        coarse_mm = max(2.0 * float(np.hypot(*step[:2])), self._kit.shortest_move_mm)
+        tolerance = 1e-3 * self._options.tolerance_um + coarse_mm
         worst_print = float(np.max(gap[made.extruding], initial=0.0))
         worst = float(np.max(gap, initial=0.0))
         if worst_print > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
@@ -565,12 +572,20 @@ class _Job:
         if self._changes and self._writer.shaper_note is not None:
             warnings.append(self._writer.shaper_note)
         put_back_share = put_back_s / total.extruding_s if total.extruding_s else 0.0
-        if put_back_share > _WARN_PUT_BACK_SHARE:
+        if put_back_share > _WARN_SHARE:
             longest = max(total.put_back, key=lambda piece: piece.extruding_seconds)
             warnings.append(
                 f"{put_back_share:.0%} of the extruding time left as it came and is not "
                 f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
                 f"{longest.reason}"
+            )
+        elif self._changes and total.passed_s - put_back_s > _WARN_SHARE * total.extruding_s:
+            share = (total.passed_s - put_back_s) / total.extruding_s
+            warnings.append(
+                f"{share:.0%} of the extruding time lies in moves that keep their own lines and is "
+                f"not compensated, from line {total.passed_line} on: they climb faster than Z can "
+                "follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), take long for their "
+                "length, or start where the position is not known"
             )
         shaper, notes, budget = self._shaper, self._operation.notes(), None
         if self._budget is not None and self._pairs is not None:
@@ -626,6 +641,7 @@ class _Sums:
         self.original_s = self.time_s = self.compensated_s = self.extruding_s = 0.0
         self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
         self.gap2 = self.gap_max = self.filament_error = 0.0
+        self.passed_s, self.passed_line = 0.0, 0
         self.gap_count = 0
         self.put_back: list[PutBack] = []
         self.warnings: list[str] = []

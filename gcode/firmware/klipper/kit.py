@@ -30,6 +30,7 @@ class KlipperKit:
     """Kit of a Klipper machine; see `gcode.firmware.base.FirmwareKit`."""
 
     step_mm = (0.0, 0.0, 0.0, 0.0)
+    shortest_move_mm = 0.0
     extruder_alone_stops = True
 
     def __init__(self, machine: Machine, firmware: Klipper) -> None:

@@ -53,6 +53,7 @@ class MarlinKit:
         self._mesh_slope = machine.mesh_slope
         scale = firmware.steps_per_mm
         self.step_mm = (1.0 / scale.x, 1.0 / scale.y, 1.0 / scale.z, 1.0 / scale.e)
+        self.shortest_move_mm = firmware.min_steps_per_segment * max(self.step_mm[:2])
 
     @property
     def refusal(self) -> str | None:

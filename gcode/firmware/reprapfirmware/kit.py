@@ -35,6 +35,7 @@ class RepRapKit:
     """Kit of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareKit`."""
 
     extruder_alone_stops = False
+    shortest_move_mm = 0.0
 
     def __init__(self, machine: Machine, firmware: RepRapFirmware) -> None:
         self._machine = machine

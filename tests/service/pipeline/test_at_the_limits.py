@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from models.machine import AxisTravel, CommandLimits, Machine
 from models.store import load_machine
 from service.pipeline.compensating import PieceCompensator, deviation
 from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
 from tests.gcode.cutting import HEAD, pieces_of
 
 
@@ -52,6 +55,17 @@ def test_a_vase_on_a_machine_with_a_slow_z() -> None:
     piece = pieces_of(HEAD + "G1 X80\n" + "\n".join(wall) + "\n", machine)[-1]
     made = PieceCompensator(machine, Options()).compensate(piece)
     assert deviation(made, made.encoded.phases)[made.extruding].max() < 5e-3
+
+
+def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
+    """Moves that keep their own lines because Z could not follow are no secret."""
+    machine = load_machine("voron-v0")
+    wall = "".join(f"G1 X{60 + 20 * (i % 2)} Z{6 + i} E1 F1200\n" for i in range(20))
+    source = tmp_path / "climb.gcode"
+    source.write_text(HEAD + wall)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+    assert any("climb faster than Z can follow" in warning for warning in result.warnings)
 
 
 def fast(machine: Machine, speed_mm_s: float) -> Machine:
