@@ -12,6 +12,9 @@ __all__ = ["assign_speeds"]
 
 RUSH = 0.5
 """No segment is hurried to less than this part of its planned time."""
+MOST_LOST = 0.8
+"""The law of losses holds where a ramp fits into its segment: more than this part of its time is
+not believed to be lost."""
 
 
 @kernel
@@ -91,7 +94,7 @@ def assign_speeds(
         if i > 0 and not ours[i - 1]:
             # The stretch starts when its rest is over, whenever that is.
             late = now + planned_s[i] - end_s[i]
-        available = end_s[i] + late - now - correction_s[i] - braking_s[i]
+        available = end_s[i] + late - now - correction_s[i]
         least = max(length_mm[i] / speed_mm_s[i], RUSH * planned_s[i])
         if available < least:
             late += least - available
@@ -104,15 +107,20 @@ def assign_speeds(
             loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
             if before > corner:
                 braking = (before - corner) ** 2 / (2.0 * before_accel * before)
-            # Time that the segment before it was not given.
-            more = loss + (braking - braking_s[i - 1] if behind else braking)
-            v = min(length_mm[i] / (available - min(more, 0.8 * available)), speed_mm_s[i])
+                braking = min(braking, MOST_LOST * planned_s[i - 1]) if behind else braking
+            # What the segment before was given for braking is no time of this one, and this one
+            # brakes itself.
+            lost = loss + braking - (braking_s[i - 1] if behind else 0.0) + braking_s[i]
+            v = min(length_mm[i] / (available - min(lost, MOST_LOST * available)), speed_mm_s[i])
+            # No faster than it gets within its length; there the law holds to the last.
+            v = min(v, np.sqrt(corner * corner + 2.0 * accel_mm_s2[i] * length_mm[i]))
         feedrate[i] = printed_feedrate(60.0 * v)
         v = feedrate[i] / 60.0
         corner = min(v, before, junction_mm_s[i])
-        loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
+        loss = min((v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v), MOST_LOST * available)
         braking = (before - corner) ** 2 / (2.0 * before_accel * before) if before > 0.0 else 0.0
         if behind:
+            braking = min(braking, MOST_LOST * planned_s[i - 1])
             predicted_s[i - 1] += braking - braking_s[i - 1]
             now += braking - braking_s[i - 1]
             braking_s[i - 1] = braking

@@ -98,10 +98,10 @@ def test_plan_and_simulate_agree(kind: str, tmp_path: Path, cache: Path) -> None
 
 def test_what_a_firmware_cannot_execute_is_refused(tmp_path: Path, cache: Path) -> None:
     machine = machine_with("marlin")
-    firmware = machine.firmware.model_copy(update={"s_curve": True})
+    firmware = machine.firmware.model_copy(update={"variant": "bugfix"})
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(body("marlin"))
-    with pytest.raises(ModelError, match=r"ender3 cannot execute this file: .*; build without it"):
+    with pytest.raises(ModelError, match=r"ender3 cannot execute .*; install release 2\.1\.2"):
         compensate_file(
             source,
             target,
