@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import ValidationError
 from pydantic_core import from_json
 
+from models.complaints import complaint
 from models.errors import ModelError
 from models.firmware import FIRMWARE_KINDS
 from models.machine import Machine
@@ -96,13 +97,8 @@ def explain(error: ValidationError) -> str:
         # The kind chooses the schema and is no part of the document's path.
         del place[1]
     where = ".".join(str(part) for part in place) or "document"
-    message = first["msg"].removeprefix("Value error, ")
-    given = first["input"]
-    shown = "" if isinstance(given, (dict, list, tuple)) else f" (given: {given!r:.80})"
-    if first["type"] == "missing":
-        shown = ""
     more = f"; {len(complaints) - 1} more" if len(complaints) > 1 else ""
-    return f"{where}: {message}{shown}{more}"
+    return f"{where}: {complaint(first)}{more}"
 
 
 # What comes with the program does not change while it runs, and every upload asks for it.

@@ -78,7 +78,7 @@ def run(arguments: list[str]) -> int:
     except Interrupted as interruption:
         return _fail("interrupted; nothing was written", interruption.exit_code)
     except typer.TyperException as error:
-        return _fail(f"{error.format_message()} (stillpath COMMAND --help lists the options)", 2)
+        return _fail(f"{_of_usage(error)} (stillpath COMMAND --help lists the options)", 2)
     except Refused as error:
         return _fail(str(error), 2)
     except MemoryError:
@@ -323,6 +323,19 @@ def _is_ours(error: ValueError) -> bool:
     from models.errors import ModelError
 
     return isinstance(error, GcodeError | ModelError | DesignError)
+
+
+def _of_usage(error: typer.TyperException) -> str:
+    """Return what is wrong with the command line; a value that typer refused in our words."""
+    from pydantic import ValidationError
+
+    from models.complaints import complaint
+
+    refused, parameter = error.__cause__, getattr(error, "param", None)
+    if not isinstance(refused, ValidationError) or parameter is None:
+        return error.format_message()
+    name = next((name for name in parameter.opts if name.startswith("--")), parameter.metavar)
+    return f"{name or parameter.name}: {complaint(refused.errors(include_url=False)[0])}"
 
 
 def _of_system(error: OSError) -> str:

@@ -16,6 +16,7 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.routing import Match
 
+from models.complaints import complaint
 from service.database.engine import DatabaseAway
 from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from service.storage.base import StorageError
@@ -24,8 +25,6 @@ __all__ = ["Problem", "install", "problem_response", "responses"]
 
 _METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-_SHOWN = 200
-"""Characters of a wrong value that are repeated."""
 
 
 class Problem(Exception):  # named as in RFC 9457
@@ -160,13 +159,8 @@ def _field(entry: Mapping[str, Any]) -> dict[str, str]:
     place = entry.get("loc", ())
     return {
         "name": ".".join(str(part) for part in place[1:]) or str(place[0] if place else "request"),
-        "message": f"{entry.get('msg', 'bad value')} (given: {_short(entry.get('input'))})",
+        "message": complaint(entry),
     }
-
-
-def _short(given: object) -> str:
-    text = repr(given)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 _SCHEMA: dict[str, Any] = {
@@ -195,7 +189,7 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
         problem(
             422,
             "Bad parameter",
-            "method: String should match pattern '^(fbf|zpetc|none|shaper:...)$' (given: 'magic')",
+            "tolerance_um: must be at least 0.5 µm (given: '0.1')",
         ),
         problem(428, "Precondition required", "Machine 'mine' exists. Send its ETag as If-Match."),
         problem(429, "Too many requests", "More than 1200 requests in a minute. Wait 1 s."),

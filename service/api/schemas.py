@@ -14,6 +14,7 @@ from service.pipeline.options import (
     BasisName,
     BudgetUm,
     DialectName,
+    MethodName,
     Options,
     RobustMode,
 )
@@ -88,10 +89,8 @@ class JobQuery(BaseModel):
     machine: Line = Field(
         max_length=255, description="A name from `/v1/machines`.", examples=["ender3"]
     )
-    method: str = Field(
+    method: MethodName = Field(
         default="fbf",
-        # The methods are written down once, in the options.
-        pattern=Options.model_json_schema()["properties"]["method"]["pattern"],
         description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
         "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
         "3hump_ei) or `none`; with `+ripple` behind it the machine's ripple is undone as well. "

@@ -83,13 +83,12 @@ def _settings(data_dir: Path | None) -> Settings:
     from pydantic import ValidationError
 
     from service.settings import Settings
+    from service.wrong_options import wrong_setting
 
     try:
         return Settings() if data_dir is None else Settings(data_dir=data_dir)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ModelError(f"settings, from STILLPATH_...: {place}: {first['msg']}") from None
+        raise ModelError(wrong_setting(error)) from None
 
 
 def _of_one_computer(data_dir: Path | None) -> Settings:

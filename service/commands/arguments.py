@@ -99,12 +99,9 @@ def chosen_options(**given: Any) -> Options:
     from pydantic import ValidationError
 
     from service.pipeline.options import Options
+    from service.wrong_options import wrong_option
 
     try:
         return Options(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
-        first = error.errors()[0]
-        if first["loc"] == ("method",):
-            raise Refused(f"unknown method {given['method']!r}; there is {METHODS}") from None
-        place = ".".join(str(part) for part in first["loc"])
-        raise Refused(f"{place}: {first['msg']} (given: {first['input']!r})") from None
+        raise Refused(wrong_option(error)) from None

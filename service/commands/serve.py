@@ -103,11 +103,9 @@ def _settings(**given: Any) -> Settings:
     from pydantic import ValidationError
 
     from service.settings import Settings
+    from service.wrong_options import wrong_setting
 
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        said = f"{place}: {first['msg']} (given: {first['input']!r})" if place else first["msg"]
-        raise typer.TyperException(said) from None
+        raise typer.TyperException(wrong_setting(error)) from None

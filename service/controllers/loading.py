@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from compensation.base import DesignError
+from models.complaints import complaint
 from models.diagrams import Block, Diagram
 from models.loops import LoopSpec
 from service.controllers.options import ControllerOptions
@@ -70,7 +71,7 @@ def read_controller(document: str | bytes, source: str = "controller") -> Loaded
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise DesignError(
-            f"{source}: {where or 'document'}: {first['msg']}; a file of "
+            f"{source}: {where or 'document'}: {complaint(first)}; a file of "
             "`stillpath controller --json` is needed"
         ) from None
     blocks = tuple(equation.block() for equation in found.difference_equations)

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from compensation.base import DesignError
+from models.complaints import complaint
 from models.disturbances import Narrowband, Periodic, Switched, Wideband
 from models.loops import LoopSpec, load_loop
 
@@ -232,8 +233,8 @@ def read_options(document: Mapping[str, Any]) -> ControllerOptions:
             raise DesignError(f"{method} needs {where}") from None
         if first["type"] == "extra_forbidden":
             raise DesignError(f"{method} has no setting {where}") from None
-        value = "" if first["type"] == "model_type" else f" (given: {first['input']!r:.80})"
-        raise DesignError(f"{method}: {where}: {first['msg']}{value}") from None
+        said = complaint(first, repeat=first["type"] != "model_type")
+        raise DesignError(f"{method}: {where}: {said}") from None
 
 
 def resolved(name: str, options: ControllerOptions) -> LoopSpec:

@@ -10,13 +10,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
+from models.complaints import complaint
 from service.deliveries.posting import Reply, post
 from service.deliveries.targets import TargetRefused, read_url
-from service.pipeline.options import BudgetUm, Options
+from service.pipeline.options import BudgetUm, MethodName
 
 __all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
 
-_METHOD = Options.model_json_schema()["properties"]["method"]["pattern"]
 # A small computer reads a large file through before it answers.
 _TIMEOUT_S = 300.0
 
@@ -52,7 +52,7 @@ class Printer(BaseModel):
     url: str
     api_key: SecretStr | None = None
     machine: Annotated[str, Field(min_length=1, max_length=255)]
-    method: Annotated[str, Field(pattern=_METHOD)] | None = None
+    method: MethodName | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] | None = None
     budget_um: BudgetUm | None = None
     start: bool = False
@@ -172,6 +172,7 @@ def _printer(path: Path, name: str, section: Any) -> Printer:
         # Without what was given: it may be the key.
         first = error.errors(include_input=False, include_url=False)[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise PrinterFileError(f"{path}: [printer.{name}] {place}: {first['msg']}") from None
+        said = complaint(first, repeat=False)
+        raise PrinterFileError(f"{path}: [printer.{name}] {place}: {said}") from None
     except TypeError as error:
         raise PrinterFileError(f"{path}: [printer.{name}]: {error}") from None

@@ -210,16 +210,29 @@ def _write(output: Path | None, machine: Machine) -> None:
             temporary.write_text(machine.model_dump_json(indent=1) + "\n", encoding="utf-8")
 
 
+_CALLED = {
+    "accel_per_hz_mm_s": "accel_per_hz",
+    "f_start_hz": "min_freq",
+    "f_end_hz": "max_freq",
+    "hz_per_s": "hz_per_sec",
+    "sweeping_accel_mm_s2": "sweeping_accel",
+    "time_column": "columns",
+    "command_column": "columns",
+    "measured_column": "columns",
+}
+"""Settings of readers that are called otherwise on the command line."""
+
+
 def _settings(**given: Any) -> ReadSettings:
     from pydantic import ValidationError
 
     from models.identification.readers import ReadSettings
-    from models.store import explain
+    from service.wrong_options import wrong_option
 
     try:
         return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
     except ValidationError as error:
-        raise ModelError(f"options: {explain(error)}") from None
+        raise ModelError(wrong_option(error, _CALLED)) from None
 
 
 def _columns(text: str | None) -> dict[str, str]:

@@ -449,12 +449,12 @@ def _service_settings() -> Settings:
 def _checked(make: Callable[[], _Made]) -> _Made:
     from pydantic import ValidationError
 
-    from models.store import explain
+    from service.wrong_options import wrong_setting
 
     try:
         return make()
     except ValidationError as error:
-        raise ModelError(f"settings, from STILLPATH_...: {explain(error)}") from None
+        raise ModelError(wrong_setting(error)) from None
 
 
 def _day(text: str) -> Any:

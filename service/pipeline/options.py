@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -13,6 +15,7 @@ from pydantic import (
     model_serializer,
 )
 
+from compensation.registry import COMPENSATORS
 from models.machine import Machine
 from service.version import __version__
 
@@ -21,6 +24,7 @@ __all__ = [
     "BasisName",
     "BudgetUm",
     "DialectName",
+    "MethodName",
     "Options",
     "RobustMode",
     "stamp",
@@ -28,6 +32,20 @@ __all__ = [
 
 DEFAULT_TOLERANCE_UM = 2.0
 
+_PLAIN = (*COMPENSATORS, "none")
+_METHOD = rf"^(advise|({'|'.join(_PLAIN)})(\+ripple)?)$"
+
+
+def _known(method: str) -> str:
+    if re.fullmatch(_METHOD, method) is None:
+        raise ValueError(
+            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple behind it, "
+            "and advise"
+        )
+    return method
+
+
+MethodName = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"pattern": _METHOD})]
 BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
 RobustMode = Literal["off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
@@ -51,13 +69,7 @@ class Options(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: Annotated[
-        str,
-        Field(
-            pattern=r"^(advise|(fbf|npz-ignore|zmetc|zpetc|ebzpetc|ts|none"
-            r"|shaper:(zv|mzv|ei|2hump_ei|3hump_ei))(\+ripple)?)$"
-        ),
-    ] = "fbf"
+    method: MethodName = "fbf"
     basis: BasisName = "ce-opt"
     robust: RobustMode = "off"
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None

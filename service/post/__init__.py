@@ -50,6 +50,7 @@ def compensate_in_place(
     from service.pipeline.options import Options
     from service.pipeline.progress import Progress
     from service.reports import render_report
+    from service.wrong_options import wrong_option
 
     def told(progress: Progress) -> None:
         tell(progress.stage, progress.fraction)
@@ -63,13 +64,7 @@ def compensate_in_place(
         tell("starting", None)
         result = compensate_file(path, path, found.machine, chosen, progress=told)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        if field == "method":
-            raise Refused(
-                f"unknown method {first['input']!r}; `stillpath compensate --help` lists them"
-            ) from None
-        raise Refused(f"{field}: {first['msg']} (given: {first['input']!r})") from None
+        raise Refused(wrong_option(error)) from None
     except (GcodeError, ModelError, DesignError) as error:
         raise Refused(str(error)) from error
     result.warnings.extend(found.warnings)

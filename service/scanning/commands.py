@@ -111,6 +111,7 @@ def scan(
 def _read(file: Path) -> Disturbance:
     from pydantic import TypeAdapter, ValidationError
 
+    from models.complaints import complaint
     from service.controllers.options import Disturbance
 
     adapter: TypeAdapter[Disturbance] = TypeAdapter(Disturbance)
@@ -119,6 +120,6 @@ def _read(file: Path) -> Disturbance:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise typer.BadParameter(f"{file}: {where}: {first['msg']}") from None
+        raise typer.BadParameter(f"{file}: {where}: {complaint(first)}") from None
     except ValueError as error:
         raise typer.BadParameter(f"{file}: not JSON ({error})") from None

@@ -148,13 +148,12 @@ def _opened(data_dir: Path | None) -> Iterator[Engine]:
     from service.database.engine import StoreError, open_database
     from service.security.keys import KeyRefused
     from service.settings import Settings
+    from service.wrong_options import wrong_setting
 
     try:
         settings = Settings() if data_dir is None else Settings(data_dir=data_dir)
     except ValidationError as error:
-        first_error = error.errors(include_input=False)[0]
-        place = ".".join(str(part) for part in first_error["loc"])
-        raise ModelError(f"settings: {place}: {first_error['msg']}") from None
+        raise ModelError(wrong_setting(error)) from None
     try:
         engine = open_database(settings)
         try:

@@ -183,7 +183,7 @@ def test_who_and_why_are_text(store: MachineStore, tmp_path: Path, capsys, by, m
 def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.setenv("STILLPATH_REQUIRE_APPROVAL", "perhaps")
     assert machines("ender3") == 2
-    assert "require_approval" in one_line(capsys)
+    assert "STILLPATH_REQUIRE_APPROVAL: must be true or false" in one_line(capsys)
 
 
 # Klipper's configuration
