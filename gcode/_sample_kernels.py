@@ -8,15 +8,120 @@ import numpy as np
 
 from models.jit import kernel
 
-__all__ = ["distances", "sweep"]
+__all__ = ["distances", "sweep", "visit"]
 
 
 @kernel(allocates=False)
 def sweep(
-    times: Any,
     t0_s: float,
     dt_s: float,
     first: int,
+    position: Any,
+    row: Any,
+    until: Any,
+    inside: Any,
+    t_s: Any,
+    accel_s: Any,
+    cruise_s: Any,
+    decel_s: Any,
+    start_mm: Any,
+    direction: Any,
+    start_mm_s: Any,
+    cruise_mm_s: Any,
+    accel_mm_s2: Any,
+    s_curve: Any,
+) -> None:
+    """Fill `position` and `row` (n) at t0 + (first + k) dt.
+
+    `position` has the first two rows or more of x y z e. Between phases and behind the last one
+    the tool stands where the phase before ended. `inside` (n), or nothing, tells which samples are
+    not later than `until` of their phase.
+    """
+    moves = len(t_s)
+    count = len(row)
+    axes = len(position)
+    k = 0
+    for m in range(moves):
+        # Samples k..stop - 1 belong to this move.
+        stop = count
+        if m + 1 < moves:
+            behind = t_s[m + 1]
+            stop = _place(behind, t0_s, dt_s, first, k, count)
+            while stop > k and t0_s + (first + stop - 1) * dt_s >= behind:
+                stop -= 1
+            while stop < count and t0_s + (first + stop) * dt_s < behind:
+                stop += 1
+        if stop == k:
+            continue
+        begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
+        v0, v1, rate = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m]
+        # Each part of the move by itself, so that a sample asks nothing: the way goes to x first.
+        way, number = position[0, k:stop], first + k
+        if s_curve[m]:
+            for i in range(len(way)):
+                left = t0_s + (number + i) * dt_s - begin
+                way[i] = _way(left, accel, cruise, decel, v0, v1, rate, True)
+        else:
+            risen = _passed(begin, 0.0, accel, t0_s, dt_s, first, k, stop)
+            steady = _passed(begin, accel, cruise, t0_s, dt_s, first, risen, stop)
+            for i in range(risen - k):
+                rising = max(t0_s + (number + i) * dt_s - begin, 0.0)
+                way[i] = (v0 + 0.5 * rate * rising) * rising
+            lifted = (v0 + 0.5 * rate * accel) * accel
+            way, number = position[0, risen:stop], first + risen
+            for i in range(steady - risen):
+                way[i] = lifted + v1 * (t0_s + (number + i) * dt_s - begin - accel)
+            lifted += v1 * cruise
+            way, number = position[0, steady:stop], first + steady
+            for i in range(len(way)):
+                falling = min(t0_s + (number + i) * dt_s - begin - accel - cruise, decel)
+                way[i] = lifted + (v1 - 0.5 * rate * falling) * falling
+        way = position[0, k:stop]
+        for axis in range(axes - 1, -1, -1):
+            along, origin, slope = position[axis, k:stop], start_mm[m, axis], direction[m, axis]
+            for i in range(len(way)):
+                along[i] = origin + slope * way[i]
+        row[k:stop] = m
+        if len(inside) > 0:
+            part, last_s, number = inside[k:stop], until[m], first + k
+            for i in range(len(part)):
+                part[i] = t0_s + (number + i) * dt_s <= last_s
+        k = stop
+
+
+@kernel(inline=True, allocates=False)
+def _place(t_s: float, t0_s: float, dt_s: float, first: int, low: int, high: int) -> int:
+    """Return about which sample is the first that is not before a time, low to high."""
+    guess = np.ceil((t_s - t0_s) / dt_s) - first
+    return int(min(max(guess, float(low)), float(high)))
+
+
+@kernel(inline=True, allocates=False)
+def _passed(
+    begin: float,
+    before: float,
+    lasts: float,
+    t0_s: float,
+    dt_s: float,
+    first: int,
+    low: int,
+    high: int,
+) -> int:
+    """Return the first sample, low to high, behind a part of a move.
+
+    The part comes `before` seconds behind the move's begin, and `lasts` so long.
+    """
+    at = _place(begin + before + lasts, t0_s, dt_s, first, low, high)
+    while at > low and t0_s + (first + at - 1) * dt_s - begin - before > lasts:
+        at -= 1
+    while at < high and t0_s + (first + at) * dt_s - begin - before <= lasts:
+        at += 1
+    return at
+
+
+@kernel(allocates=False)
+def visit(
+    times: Any,
     position: Any,
     row: Any,
     t_s: Any,
@@ -30,46 +135,24 @@ def sweep(
     accel_mm_s2: Any,
     s_curve: Any,
 ) -> None:
-    """Fill `position` and `row` (n) at `times`, or at t0 + (first + k) dt if it is empty.
-
-    `position` has two rows, x y, or four, x y z e. Between phases and behind the last one the
-    tool stands where the phase before ended.
-    """
-    moves = len(t_s)
-    count = len(row)
-    given = len(times) > 0
-    flat = len(position) == 2
-    k = 0
-    for m in range(moves):
-        # Samples k..stop - 1 belong to this move.
-        stop = count
-        if m + 1 < moves:
-            behind = t_s[m + 1]
-            if given:
-                stop = k
-                while stop < count and times[stop] < behind:
-                    stop += 1
-            else:
-                guess = np.ceil((behind - t0_s) / dt_s) - first
-                stop = int(min(max(guess, float(k)), float(count)))
-                while stop > k and t0_s + (first + stop - 1) * dt_s >= behind:
-                    stop -= 1
-                while stop < count and t0_s + (first + stop) * dt_s < behind:
-                    stop += 1
-        begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
-        v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
-        x, y, z, e = start_mm[m]
-        dx, dy, dz, de = direction[m]
-        for i in range(k, stop):
-            t = times[i] if given else t0_s + (first + i) * dt_s
-            path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
-            position[0, i] = x + dx * path
-            position[1, i] = y + dy * path
-            row[i] = m
-            if not flat:
-                position[2, i] = z + dz * path
-                position[3, i] = e + de * path
-        k = stop
+    """Fill `position` and `row` (n) as `sweep` does, at rising `times`."""
+    m = 0
+    for i in range(len(times)):
+        while m + 1 < len(t_s) and times[i] >= t_s[m + 1]:
+            m += 1
+        path = _way(
+            times[i] - t_s[m],
+            accel_s[m],
+            cruise_s[m],
+            decel_s[m],
+            start_mm_s[m],
+            cruise_mm_s[m],
+            accel_mm_s2[m],
+            s_curve[m],
+        )
+        for axis in range(len(position)):
+            position[axis, i] = start_mm[m, axis] + direction[m, axis] * path
+        row[i] = m
 
 
 @kernel(allocates=False)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from gcode import _sample_kernels as kernels
 from gcode.types import Phases
 
-__all__ = ["Sampler", "Samples", "distances", "sample_phases"]
+__all__ = ["Sampler", "Samples", "distances", "sample_phases", "sample_until"]
 
 _MOST = 1 << 17  # samples at once: a dwell may last for hours
-_NO_TIMES: NDArray[np.float64] = np.empty(0)
+_NO_TIMES, _NO_MARKS = np.empty(0), np.empty(0, np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,14 +88,45 @@ def sample_phases(
     _check(phases)
     axes = 2 if flat else 4
     if isinstance(t_s, tuple):
-        t0_s, dt_s, n = t_s
-        if not (math.isfinite(t0_s) and dt_s > 0 and math.isfinite(dt_s) and n >= 0):
-            raise ValueError(f"the grid (t0 {t0_s}, dt {dt_s}, n {n}) needs dt > 0 and n >= 0")
-        return _sweep(phases, _NO_TIMES, t0_s, dt_s, 0, np.empty((axes, n)))
+        t0_s, dt_s, n = _grid(t_s)
+        return _sweep(phases, t0_s, dt_s, 0, np.empty((axes, n)))
     times = np.ascontiguousarray(t_s, np.float64)
     if times.ndim != 1 or not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
         raise ValueError("the sampling times must be finite and ascending")
-    return _sweep(phases, times, 0.0, 1.0, 0, np.empty((axes, len(times))))
+    position, row = np.empty((axes, len(times))), np.empty(len(times), np.int64)
+    kernels.visit(times, position, row, *_columns(phases))
+    return position, row
+
+
+def sample_until(
+    phases: Phases,
+    grid: tuple[float, float, int],
+    until_s: NDArray[np.float64],
+    *,
+    axes: int = 4,
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Sample planned moves on a grid, and say which samples come in time.
+
+    Parameters
+    ----------
+    phases, grid
+        As `sample_phases` has them.
+    until_s : ndarray, shape (len(phases),)
+    axes : int
+        2 to 4: how many of x y z e are wanted.
+
+    Returns
+    -------
+    position_mm : ndarray, shape (axes, n)
+    row : ndarray of int64, shape (n,)
+    inside : ndarray of bool, shape (n,)
+        The sample is not later than `until_s` of its phase.
+    """
+    _check(phases)
+    t0_s, dt_s, n = _grid(grid)
+    inside = np.empty(n, np.bool_)
+    position, row = _sweep(phases, t0_s, dt_s, 0, np.empty((axes, n)), until_s, inside)
+    return position, row, inside
 
 
 def distances(
@@ -151,24 +182,31 @@ class Sampler:
         end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
         while self._next < stop:
             n = min(stop - self._next, _MOST)
-            position = np.empty((4, n))
-            _, row = _sweep(phases, _NO_TIMES, 0.0, self.dt_s, self._next, position)
+            position, moving = np.empty((4, n)), np.empty(n, np.bool_)
+            _, row = _sweep(phases, 0.0, self.dt_s, self._next, position, end_s, moving)
             t_s = np.arange(self._next, self._next + n, dtype=np.float64) * self.dt_s
             self._next += n
-            moving = t_s <= end_s[row]
             yield Samples(t_s, position[:3], position[3], phases.move_index[row], moving)
+
+
+def _grid(grid: tuple[float, float, int]) -> tuple[float, float, int]:
+    t0_s, dt_s, n = grid
+    if not (math.isfinite(t0_s) and dt_s > 0 and math.isfinite(dt_s) and n >= 0):
+        raise ValueError(f"the grid (t0 {t0_s}, dt {dt_s}, n {n}) needs dt > 0 and n >= 0")
+    return grid
 
 
 def _sweep(
     phases: Phases,
-    times: NDArray[np.float64],
     t0_s: float,
     dt_s: float,
     first: int,
     position: NDArray[np.float64],
+    until_s: NDArray[np.float64] = _NO_TIMES,
+    inside: NDArray[np.bool_] = _NO_MARKS,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     row = np.empty(position.shape[1], np.int64)
-    kernels.sweep(times, t0_s, dt_s, first, position, row, *_columns(phases))
+    kernels.sweep(t0_s, dt_s, first, position, row, until_s, inside, *_columns(phases))
     return position, row
 
 

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.sampler import sample_phases
+from gcode.sampler import sample_until
 from gcode.types import Phases
 
 __all__ = ["Group", "Timeline", "build_timeline", "group_rows"]
@@ -145,10 +145,9 @@ def build_timeline(
             end[i] = now
     samples = int(np.ceil(now / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
     moved = replace(phases, t_s=row_start)
-    position, row = sample_phases(moved, (0.0, dt_s, samples))
-    t = dt_s * np.arange(samples)
     xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
-    moving = xy[row] & (t <= row_start[row] + duration[row] + _GRID_EPS * dt_s)
+    until = np.where(xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
+    position, row, moving = sample_until(moved, (0.0, dt_s, samples), until)
     return Timeline(
         dt_s=dt_s,
         position_mm=position,

@@ -14,7 +14,7 @@ from gcode.errors import GcodeError
 from gcode.firmware.encoding import Encoded
 from gcode.firmware.registry import kit
 from gcode.pieces import Piece
-from gcode.sampler import distances, sample_phases
+from gcode.sampler import distances, sample_phases, sample_until
 from gcode.segments import ErrorFilter, Segments, fit_segments
 from gcode.timeline import Timeline, build_timeline, group_rows
 from gcode.types import Phases
@@ -278,7 +278,7 @@ def as_executed(
 
     Returns
     -------
-    planned_mm, executed_mm : ndarray, shapes (4, n) and (2, n)
+    planned_mm, executed_mm : ndarray, shapes (3, n) and (2, n)
     row : ndarray of int64, shape (n,)
         Row of the piece's `phases`.
     extruding : ndarray of bool, shape (n,)
@@ -288,10 +288,10 @@ def as_executed(
     last = executed.accel_s[-1] + executed.cruise_s[-1] + executed.decel_s[-1]
     n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
     moved = replace(phases, t_s=piece.encoded.row_start_s)
-    planned, row = sample_phases(moved, (0.0, dt_s, n))
-    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
     direction = phases.direction
     feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
     until = np.where(feeds, moved.t_s + duration, -np.inf)
-    return planned, position, row, dt_s * np.arange(n) <= until[row]
+    planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
+    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
+    return planned, position, row, extruding

@@ -26,7 +26,7 @@ from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
 from gcode.pieces import Passage, Piece, Splitter
-from gcode.sampler import sample_phases
+from gcode.sampler import sample_phases, sample_until
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import Retiming
 from gcode.types import EventKind, Events, Moves, Phases, rows_of
@@ -447,7 +447,6 @@ class _Job:
             self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
 
     def _measure_passage(self, passage: Passage, phases: Phases) -> None:
-        moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
         duration = phases.accel_s + phases.cruise_s + phases.decel_s
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
@@ -458,13 +457,12 @@ class _Job:
             self._sum.passed_s += float(np.sum(duration[feeding]))
             first = phases.move_index[int(np.argmax(feeding))]
             self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
+        until = np.where(feeding, phases.t_s + duration, -np.inf)
         samples = max(round(motion_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             n = min(_CHUNK, samples - start)
-            position, row = sample_phases(phases, (start * DT_S, DT_S, n))
-            t = DT_S * (start + np.arange(n))
-            moving = moves_xy[row] & (t <= phases.t_s[row] + duration[row])
-            extruding = moving & (phases.direction[row, 3] > 0.0)
+            grid = (start * DT_S, DT_S, n)
+            position, row, extruding = sample_until(phases, grid, until, axes=3)
             at = phases.move_index[row]
             self._measurement.add(self._samples(passage, at, position, position, extruding))
             self._observe(position[:2])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gcode.firmware.klipper.planner import Planner
 from gcode.firmware.planning import join_phases
 from gcode.interpreter import interpret_bytes
-from gcode.sampler import Sampler, Samples, distances, sample_phases
+from gcode.sampler import Sampler, Samples, distances, sample_phases, sample_until
 from gcode.types import Phases
 from models.machine import Machine
 
@@ -51,6 +51,17 @@ def test_twin(plan: Phases, times: list[float]) -> None:
     flat, same = sample_phases(plan, np.array(times), flat=True)
     np.testing.assert_array_equal(flat, position[:2])
     np.testing.assert_array_equal(same, row)
+
+
+@pytest.mark.parametrize("axes", [2, 3, 4])
+def test_grid_as_times(plan: Phases, axes: int) -> None:
+    until_s = plan.t_s + 0.7 * plan.accel_s
+    position, row, inside = sample_until(plan, (-0.1, 3e-3, 2000), until_s, axes=axes)
+    times = -0.1 + np.arange(2000) * 3e-3
+    expected, same = sample_phases(plan, times)
+    np.testing.assert_array_equal(position, expected[:axes])
+    np.testing.assert_array_equal(row, same)
+    np.testing.assert_array_equal(inside, times <= until_s[row])
 
 
 @settings(deadline=None, max_examples=50)
