@@ -29,11 +29,13 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
 
     It raises `Interrupted` when the process was asked to stop.
     """
-    with interruptible() as check, shown(title) as show:
+    from service.compiling import compiling_told
+
+    with interruptible() as check, shown(title) as show, compiling_told(show) as told:
 
         def tell(progress: Progress) -> None:
             check()
-            show(progress)
+            told(progress)
 
         yield tell
 

@@ -32,6 +32,7 @@ _EXAMPLE: dict[str, Any] = {
     "eta_s": 3.1,
     "queue_position": None,
     "attempt": 1,
+    "losses": 0,
     "owner": "anna",
     "batch": None,
     "priority": 0,
@@ -217,6 +218,9 @@ class JobView(BaseModel):
     eta_s: float | None = Field(description="Seconds still needed; null while unknown.")
     queue_position: int | None = Field(description="Jobs before this one while it is queued.")
     attempt: int = Field(description="How often it was started.")
+    losses: int = Field(
+        default=0, description="How often its worker was lost; a restart of the service is no loss."
+    )
     owner: str
     batch: str | None
     priority: int
@@ -260,6 +264,7 @@ class JobView(BaseModel):
             eta_s=job.eta_s,
             queue_position=queue_position,
             attempt=job.attempt,
+            losses=job.losses,
             owner=job.owner,
             batch=job.batch,
             priority=job.priority,

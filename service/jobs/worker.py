@@ -156,21 +156,23 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
 
 def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Compensate the task's file and write its report; see `Runner`."""
+    from service.compiling import compiling_told
     from service.machines.resolve import PinnedMachine
     from service.pipeline.options import Options
     from service.pipeline.road import compensate_file
     from service.reports import write_report
 
     pinned = PinnedMachine.read(task.machine_file, task.machine)
-    result = compensate_file(
-        task.source,
-        task.target,
-        pinned.machine,
-        Options.model_validate(task.options),
-        cache_dir=task.cache_dir,
-        progress=progress,
-        layers=task.report,
-    )
+    with compiling_told(progress) as told:
+        result = compensate_file(
+            task.source,
+            task.target,
+            pinned.machine,
+            Options.model_validate(task.options),
+            cache_dir=task.cache_dir,
+            progress=told,
+            layers=task.report,
+        )
     result.warnings.extend(pinned.warnings)
     write_report(result, task.report)
     contour_um = {c.name: c.extruding.contour_rms_um for c in result.channels}

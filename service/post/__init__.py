@@ -59,10 +59,12 @@ def compensate_in_place(
         found = open_machines().for_job(options["machine"], files=True)
         chosen = Options(**{key: options[key] for key in options if key != "machine"})
 
+        from service.compiling import compiling_told
         from service.pipeline.road import compensate_file
 
         tell("starting", None)
-        result = compensate_file(path, path, found.machine, chosen, progress=told)
+        with compiling_told(told) as progress:
+            result = compensate_file(path, path, found.machine, chosen, progress=progress)
     except ValidationError as error:
         raise Refused(wrong_option(error)) from None
     except (GcodeError, ModelError, DesignError) as error:

@@ -223,7 +223,8 @@ def test_a_restart_continues_what_was_queued_and_running(tmp_path: Path):
     source.write_text("G1 X3\n")
     (tmp_path / "incoming" / "half").write_text("half an upload")
     with open_client(tmp_path) as client:
-        assert until(client, slow, over)["state"] == "done"
+        again = until(client, slow, over)
+        assert (again["state"], again["attempt"], again["losses"]) == ("done", 2, 0)
         assert until(client, waiting, over)["state"] == "done"
     assert not (tmp_path / "incoming" / "half").exists()
 

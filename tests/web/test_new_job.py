@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
+from service.api.schemas import JobView
+from service.compiling import STAGE
 from tests.web.served import GEAR, Service, running
 from tests.web.visitor import Visitor
 
@@ -207,3 +211,31 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     assert KEY not in page.evaluate("JSON.stringify({...localStorage}) + document.cookie")
     page.get_by_role("button", name="Forget key").click()
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
+
+
+@pytest.mark.parametrize(
+    ("job", "said"),
+    [
+        ({"eta_s": 42.0}, "45 s left"),
+        ({"stage": STAGE, "eta_s": None}, "Time left is not known yet"),
+        ({"attempt": 2, "losses": 0}, "begun anew, because the service was restarted"),
+        ({"attempt": 3, "losses": 1}, "begun anew, because its worker was lost"),
+    ],
+)
+def test_a_job_says_how_it_is_with_it(visitor: Visitor, job: dict[str, Any], said: str):
+    (example,) = JobView.model_config["json_schema_extra"]["examples"]
+    running = example | {"eta_s": None} | job
+
+    def answer(route: Route) -> None:
+        if route.request.url.endswith("/events"):
+            body = f"event: job\ndata: {json.dumps(running)}\n\n"
+            route.fulfill(body=body, content_type="text/event-stream")
+        else:
+            route.fulfill(body=json.dumps(running), content_type="application/json")
+
+    page = visitor.open("#/")
+    page.route(re.compile(rf"/v1/jobs/{running['id']}(/events)?$"), answer)
+    page.goto(f"{visitor.url}/#/jobs/{running['id']}")
+    panel = page.get_by_role("region", name="Progress")
+    expect(panel).to_contain_text(said)
+    expect(panel).to_contain_text(running["stage"].capitalize())

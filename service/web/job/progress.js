@@ -28,7 +28,7 @@ export function progressPanel() {
     fill(stage, capital(job.stage));
     fill(share, `${Math.floor(100 * job.progress)} %`);
     fill(left, remaining(job.eta_s) || "Time left is not known yet",
-      job.attempt > 1 ? ` · attempt ${job.attempt}: a worker was lost, and the job began anew` : "");
+      job.attempt > 1 ? ` · ${begunAnew(job)}` : "");
     const step = Math.floor(job.progress / ANNOUNCE_EVERY);
     if (step !== said) {
       said = step;
@@ -37,6 +37,13 @@ export function progressPanel() {
   };
   const silence = () => fill(left, "The service does not answer; it is asked again until it does.");
   return { element, update, silence };
+}
+
+/** Why a job that was started before began anew. @param {any} job */
+function begunAnew(job) {
+  return job.losses
+    ? `begun anew, because its worker was lost${job.losses > 1 ? ` ${job.losses} times` : ""}`
+    : "begun anew, because the service was restarted";
 }
 
 /** @param {string} text */

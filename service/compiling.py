@@ -1,0 +1,86 @@
+"""Says that kernels are being compiled, which happens once on a computer and takes minutes.
+
+Numba compiles a kernel when it is first called and keeps it on disk. Until it is there the work
+stands still, and what was measured of its pace says nothing of the time left.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+from numba.core.event import Listener, install_listener
+
+from service.pipeline.progress import Progress, ProgressCallback
+
+__all__ = ["STAGE", "compiling_told"]
+
+STAGE = "compiling for this computer (once, some minutes)"
+
+_QUIET_S = 15.0
+"""How long nothing was compiled before the time left is told again."""
+
+
+@contextmanager
+def compiling_told(callback: ProgressCallback) -> Iterator[ProgressCallback]:
+    """Yield a progress callback that says when this process compiles instead of working.
+
+    Parameters
+    ----------
+    callback : callable
+        Is told of both. What it raises in the middle of a compiler is raised when the work next
+        says where it is.
+    """
+    told = _Told(callback)
+    with install_listener("numba:compile", told):
+        yield told
+
+
+class _Told(Listener):
+    def __init__(self, callback: ProgressCallback) -> None:
+        self._callback = callback
+        self._latest = Progress("starting", 0.0, 0.0, 0.0, None)
+        self._began = time.monotonic()
+        self._raised: BaseException | None = None
+        self._depth = 0
+        self._since = 0.0
+        self._compiled_s = 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        """Tell where the work is; time left by its pace without compiling."""
+        if self._raised is not None:
+            raise self._raised
+        self._latest = progress
+        if self._compiled_s and progress.eta_s is not None:
+            progress = replace(progress, eta_s=self._left_s(progress))
+        self._callback(progress)
+
+    def on_start(self, event: Any) -> None:  # noqa: ARG002
+        """Tell that a kernel is being compiled; it may compile others on the way."""
+        if self._depth == 0:
+            self._since = time.monotonic()
+        self._depth += 1
+        elapsed_s = time.monotonic() - self._began
+        latest = self._latest
+        try:
+            self._callback(Progress(STAGE, latest.fraction, latest.print_seconds, elapsed_s, None))
+        except BaseException as error:
+            self._raised = error
+
+    def on_end(self, event: Any) -> None:  # noqa: ARG002
+        """Count how long it took."""
+        self._depth -= 1
+        if self._depth == 0:
+            now = time.monotonic()
+            self._compiled_s += now - self._since
+            self._since = now
+
+    def _left_s(self, progress: Progress) -> float | None:
+        """Return the time still needed, None while more is likely to be compiled."""
+        if time.monotonic() - self._since < _QUIET_S:
+            return None
+        worked_s = max(progress.elapsed_s - self._compiled_s, 0.0)
+        return worked_s * (1.0 - progress.fraction) / max(progress.fraction, 1e-9)
