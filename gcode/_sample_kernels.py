@@ -157,7 +157,10 @@ def visit(
 
 @kernel(allocates=False)
 def distances(
-    times: Any,
+    dt_s: float,
+    first: Any,
+    late_s: Any,
+    until_s: Any,
     points: Any,
     out: Any,
     t_s: Any,
@@ -171,29 +174,32 @@ def distances(
     accel_mm_s2: Any,
     s_curve: Any,
 ) -> None:
-    """Fill `out` (n) with the distance in x y between `points` (2, n) and the tool at `times`.
+    """Fill `out` (n) with the distance in x y between `points` (2, n) and the tool.
 
-    Time never goes back: one before the time of a sample before counts as that.
+    The points from `first[g]` on, up to the next of these, belong to k dt + late, `until` at the
+    latest. Time never goes back.
     """
-    moves = len(t_s)
+    moves, count = len(t_s), len(out)
     m = 0
     begin, accel, cruise, decel = t_s[0], accel_s[0], cruise_s[0], decel_s[0]
     v0, v1, rate, eased = start_mm_s[0], cruise_mm_s[0], accel_mm_s2[0], s_curve[0]
     x, y, dx, dy = start_mm[0, 0], start_mm[0, 1], direction[0, 0], direction[0, 1]
     behind = t_s[1] if moves > 1 else np.inf
     t = -np.inf
-    for k in range(len(times)):
-        t = max(t, times[k])
-        if t >= behind:
-            while m + 1 < moves and t >= t_s[m + 1]:
-                m += 1
-            begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
-            v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
-            x, y, dx, dy = start_mm[m, 0], start_mm[m, 1], direction[m, 0], direction[m, 1]
-            behind = t_s[m + 1] if m + 1 < moves else np.inf
-        path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
-        gap_x, gap_y = x + dx * path - points[0, k], y + dy * path - points[1, k]
-        out[k] = np.sqrt(gap_x * gap_x + gap_y * gap_y)
+    for g in range(len(first)):
+        late, until = late_s[g], until_s[g]
+        for k in range(first[g], first[g + 1] if g + 1 < len(first) else count):
+            t = max(t, min(k * dt_s + late, until))
+            if t >= behind:
+                while m + 1 < moves and t >= t_s[m + 1]:
+                    m += 1
+                begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
+                v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
+                x, y, dx, dy = start_mm[m, 0], start_mm[m, 1], direction[m, 0], direction[m, 1]
+                behind = t_s[m + 1] if m + 1 < moves else np.inf
+            path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
+            gap_x, gap_y = x + dx * path - points[0, k], y + dy * path - points[1, k]
+            out[k] = np.sqrt(gap_x * gap_x + gap_y * gap_y)
 
 
 @kernel(inline=True, allocates=False)
@@ -212,17 +218,18 @@ def _way(
     On an s_curve the speed between v and v + d follows Marlin's quintic Bezier,
     v + d (10 u^3 - 15 u^4 + 6 u^5) with u from 0 to 1 (stepper.cpp, bugfix-2.1.x, 2026-08).
     """
-    left = max(left, 0.0)
-    rising = min(left, accel)
-    left -= rising
-    steady = min(left, cruise)
-    falling = min(left - steady, decel)
-    if eased:
-        path = _eased(v0, rate, accel, rising) + v1 * steady
-        path += _eased(v1, -rate, decel, falling)
-    else:
-        path = (v0 + 0.5 * rate * rising) * rising + v1 * steady
-        path += (v1 - 0.5 * rate * falling) * falling
+    rising = min(max(left, 0.0), accel)
+    path = _eased(v0, rate, accel, rising) if eased else (v0 + 0.5 * rate * rising) * rising
+    left -= accel
+    if left > 0.0:
+        path += v1 * min(left, cruise)
+        left -= cruise
+        if left > 0.0:
+            falling = min(left, decel)
+            if eased:
+                path += _eased(v1, -rate, decel, falling)
+            else:
+                path += (v1 - 0.5 * rate * falling) * falling
     return path
 
 

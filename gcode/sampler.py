@@ -130,7 +130,12 @@ def sample_until(
 
 
 def distances(
-    phases: Phases, t_s: NDArray[np.float64], points_mm: NDArray[np.float64]
+    phases: Phases,
+    points_mm: NDArray[np.float64],
+    dt_s: float,
+    first: NDArray[np.int64],
+    late_s: NDArray[np.float64],
+    until_s: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return the distance in X Y between points and the tool on planned moves, shape (n,).
 
@@ -138,14 +143,18 @@ def distances(
     ----------
     phases : Phases
         At least one, in order of time.
-    t_s : ndarray, shape (n,)
-        Time never goes back: one before the time of an earlier point counts as that.
     points_mm : ndarray, shape (2 or more, n)
-        x y first.
+        x y first; of the times ``k dt``, but for what follows.
+    dt_s : float
+    first : ndarray of int64, shape (stretches,)
+        Point that each stretch begins with, rising from 0.
+    late_s, until_s : ndarray, shape (stretches,)
+        The points of a stretch belong to times so much later, and to this at the latest. Time
+        never goes back: one before the time of an earlier point counts as that.
     """
     _check(phases)
-    out = np.empty(len(t_s))
-    kernels.distances(t_s, points_mm, out, *_columns(phases))
+    out = np.empty(points_mm.shape[1])
+    kernels.distances(dt_s, first, late_s, until_s, points_mm, out, *_columns(phases))
     return out
 
 

@@ -22,7 +22,7 @@ from models.machine import Machine
 from models.operating import OperatingGrid, machine_at
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
-from service.pipeline._peak_kernels import peaks
+from service.pipeline._peak_kernels import peaks, speed_step
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
@@ -52,6 +52,8 @@ class CompensatedPiece:
     extruding : ndarray of bool, shape (n,)
     segments : Segments
     encoded : Encoded
+    step_mm, bend_mm : float
+        Longest step of the command in X Y, and largest second difference of either.
     """
 
     timeline: Timeline
@@ -59,6 +61,8 @@ class CompensatedPiece:
     extruding: NDArray[np.bool_]
     segments: Segments
     encoded: Encoded
+    step_mm: float
+    bend_mm: float
 
 
 class PieceCompensator:
@@ -137,11 +141,13 @@ class PieceCompensator:
                 tail_s=self.compensator.tail_s,
             )
             extruding = timeline.moving & feeds[timeline.row]
-            command = timeline.position_mm.copy()
-            command[:2] = self.compensator.compensate(command[:2], extruding, timeline.rests)
+            path = timeline.position_mm
+            xy_mm = self.compensator.compensate(path[:2], extruding, timeline.rests)
+            command = np.concatenate([xy_mm, path[2:]])
             _retract_along(command, timeline, phases)
             self._check_travel(command[:2], timeline.row, piece)
-            segments, encoded = self._fit(piece, timeline, command)
+            step_mm, bend_mm = peaks(command)
+            segments, encoded = self._fit(piece, timeline, command, bend_mm)
             change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
             if change < _REST_TOLERANCE_S:
                 break
@@ -150,16 +156,15 @@ class PieceCompensator:
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
-        return CompensatedPiece(timeline, command, extruding, segments, encoded)
+        return CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
 
     def _fit(
-        self, piece: Piece, timeline: Timeline, command: NDArray[np.float64]
+        self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
     ) -> tuple[Segments, Encoded]:
         """Segments and moves; finer where a motor's speed would step too far."""
         limit = self._machine.command.speed_step_mm_s
         tolerance = self._tolerance_mm
         # No step of speed larger than what the command itself asks for within a sample.
-        _, bend_mm = peaks(command)
         step_mm_s = max(bend_mm / timeline.dt_s, MIN_STEP_MM_S)
         for _ in range(3):
             segments = fit_segments(
@@ -193,20 +198,19 @@ class PieceCompensator:
 
     def _speed_step(self, phases: Phases) -> float:
         """Largest step of a motor's speed beyond what rounding to whole steps may bring."""
-        speed = phases.cruise_mm_s
-        duration = phases.accel_s + phases.cruise_s + phases.decel_s
-        rounding = max(self._step_mm[:2]) / np.maximum(duration, 1e-4)
-        if max(self._step_mm) > 0.0:
+        return speed_step(
+            phases.accel_s,
+            phases.cruise_s,
+            phases.decel_s,
+            phases.start_mm_s,
+            phases.cruise_mm_s,
+            phases.accel_mm_s2,
+            phases.direction,
+            max(self._step_mm[:2]),
             # Ramps are parts of a step there, and no motor can tell.
-            lifted = phases.accel_s * (speed - phases.start_mm_s)
-            fallen = phases.accel_mm_s2 * phases.decel_s**2
-            speed = speed - 0.5 * (lifted + fallen) / np.maximum(duration, 1e-9)
-        velocity = phases.direction[:, :2] * speed[:, None]
-        if self._machine.kinematics == "corexy":
-            velocity = velocity @ np.array([[1.0, 1.0], [1.0, -1.0]])
-            rounding = 2.0 * rounding
-        step = np.maximum(*np.abs(np.diff(velocity.T)))
-        return float(np.max(step - rounding[:-1] - rounding[1:], initial=0.0))
+            max(self._step_mm) > 0.0,
+            self._machine.kinematics == "corexy",
+        )
 
     def _check_travel(
         self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
@@ -214,6 +218,8 @@ class PieceCompensator:
         """See that places (2, n), each of a row of the piece's phases, lie within the travel."""
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
+            if travel.min_mm <= place_mm[i].min() and place_mm[i].max() <= travel.max_mm:
+                continue
             beyond = np.maximum(travel.min_mm - place_mm[i], place_mm[i] - travel.max_mm)
             worst = int(np.argmax(beyond))
             if beyond[worst] > 0.0:
@@ -236,6 +242,8 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     """
     direction = phases.direction
     wipes = (direction[:, 3] < 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    if not np.any(wipes):
+        return
     inside = wipes[timeline.row] & timeline.moving
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
     last = command.shape[1] - 1
@@ -258,17 +266,19 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
     A stretch counts from its own start: rests may take a little longer or shorter than planned.
     """
     timeline, encoded = piece.timeline, piece.encoded
-    n = piece.command_mm.shape[1]
-    t = timeline.dt_s * np.arange(n, dtype=np.float64)
-    starts = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
-    starts[0] = 0
-    lengths = np.diff(np.append(np.clip(starts, 0, n), n))
-    t += np.repeat(encoded.group_start_s - timeline.start_s, lengths)
-    # In a rest, time waits where the stretch behind it begins.
-    until = np.append(encoded.group_start_s[1:], np.inf)
-    np.minimum(t, np.repeat(until, lengths), out=t)
-    t -= float(timeline.start_s[0])
-    return distances(executed, t, piece.command_mm)
+    first = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
+    np.clip(first, 0, piece.command_mm.shape[1], out=first)
+    first[0] = 0
+    origin_s = timeline.start_s[0]
+    return distances(
+        executed,
+        piece.command_mm,
+        timeline.dt_s,
+        first,
+        encoded.group_start_s - timeline.start_s - origin_s,
+        # In a rest, time waits where the stretch behind it begins.
+        np.append(encoded.group_start_s[1:], np.inf) - origin_s,
+    )
 
 
 def as_executed(

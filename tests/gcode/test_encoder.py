@@ -123,7 +123,8 @@ def test_plain_path_survives(machine: Machine) -> None:
     plants = [plant_set(machine.axes[a], 1e-3).nominal for a in ("x", "y")]
     segments = fit_segments(timeline, timeline.position_mm, 5e-3, ErrorFilter(plants))
     encoded = encoder.encode(piece, timeline, segments)
-    command = CompensatedPiece(timeline, timeline.position_mm, timeline.moving, segments, encoded)
+    path_mm, moving = timeline.position_mm, timeline.moving
+    command = CompensatedPiece(timeline, path_mm, moving, segments, encoded, 0.0, 0.0)
     assert np.mean(deviation(command, encoded.phases) < 7e-3) > 0.98
     assert np.max(deviation(command, encoded.phases)) < 60e-3
 

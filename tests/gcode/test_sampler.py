@@ -65,11 +65,20 @@ def test_grid_as_times(plan: Phases, axes: int) -> None:
 
 
 @settings(deadline=None, max_examples=50)
-@given(st.lists(st.floats(-1, 6), max_size=40), st.integers(0, 1000))
-def test_distances(plan: Phases, times: list[float], seed: int) -> None:
-    points = np.random.default_rng(seed).normal(scale=20.0, size=(2, len(times)))
-    found = distances(plan, np.array(times), points)
-    position, _ = sample_phases(plan, np.maximum.accumulate(np.array(times)))
+@given(
+    st.lists(st.tuples(st.integers(0, 400), st.floats(-1, 6), st.floats(0, 6)), max_size=6),
+    st.integers(0, 1000),
+)
+def test_distances(plan: Phases, stretches: list[tuple[int, float, float]], seed: int) -> None:
+    count, dt_s = 400, 4e-3
+    points = np.random.default_rng(seed).normal(scale=20.0, size=(2, count))
+    first = np.array([0, *sorted(at for at, _, _ in stretches)])
+    late = np.array([0.0, *(late for _, late, _ in stretches)])
+    until = np.array([np.inf, *(until for _, _, until in stretches)])
+    found = distances(plan, points, dt_s, first, late, until)
+    stretch = np.searchsorted(first, np.arange(count), side="right") - 1
+    times = np.minimum(np.arange(count) * dt_s + late[stretch], until[stretch])
+    position, _ = sample_phases(plan, np.maximum.accumulate(times))
     np.testing.assert_allclose(found, np.hypot(*(position[:2] - points)), rtol=0, atol=1e-9)
 
 
@@ -114,7 +123,7 @@ def test_refused(plan: Phases) -> None:
     with pytest.raises(ValueError, match="no phases"):
         sample_phases(none, (0.0, 1.0, 1))
     with pytest.raises(ValueError, match="no phases"):
-        distances(none, np.zeros(1), np.zeros((2, 1)))
+        distances(none, np.zeros((2, 1)), 1.0, np.zeros(1, int), np.zeros(1), np.zeros(1))
     with pytest.raises(ValueError, match="ascending"):
         sample_phases(plan, np.array([1.0, 0.0]))
     with pytest.raises(ValueError, match="dt > 0"):
