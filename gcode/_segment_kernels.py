@@ -2,12 +2,60 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["fit_stretch", "path_directions", "rest_errors"]
+__all__ = ["LONGEST", "Answers", "Bounds", "fit_stretch", "path_directions", "rest_errors"]
+
+LONGEST = 64
+"""Segments of up to so many samples end where the machine answers their error least."""
+
+
+class Bounds(NamedTuple):
+    """How far a segment may be from the command, mm, and its speed (mm/s) from the last one's.
+
+    Along and across the path, by how much the funnel in which the end is chosen is wider, z and e;
+    and by how much the speed of an axis may step.
+    """
+
+    along_mm: float
+    across_mm: float
+    loose_mm: float
+    z_mm: float
+    e_mm: float
+    step_mm_s: float
+
+
+class Answers(NamedTuple):
+    """What a machine with answers of the form of `models.modal` makes of a fit's errors.
+
+    A segment that begins with sample k and covers m samples has an error of its straight line, and
+    one that rises from 0 to `shift` over these and falls over the next as its end is shifted. The
+    energy of the answer to all that has been, with the shifted end, is least where `shift` is
+    minus (Re(head[m] state) + echo[m] error) / norm[m]; all sums go on to the end of the answer.
+
+    Attributes
+    ----------
+    pole : ndarray of complex128, shape (axes, order)
+    power : ndarray of complex128, shape (axes, LONGEST, order)
+        Powers of the poles: what becomes of an error.
+    head : ndarray of complex128, shape (axes, LONGEST + 1, order)
+    echo : ndarray, shape (axes, LONGEST + 1, LONGEST)
+    lift : ndarray of complex128, shape (axes, LONGEST + 1, order)
+        What a shift by 1 adds to the state at the segment's end.
+    norm : ndarray, shape (axes, LONGEST + 1)
+    """
+
+    pole: NDArray[np.complex128]
+    power: NDArray[np.complex128]
+    head: NDArray[np.complex128]
+    echo: NDArray[np.float64]
+    lift: NDArray[np.complex128]
+    norm: NDArray[np.float64]
 
 
 @kernel
@@ -34,30 +82,21 @@ def rest_errors(pole: NDArray[np.complex128], states: NDArray[np.complex128], sa
             states[axis, r] *= pole[axis, r] ** samples
 
 
-@kernel
+@kernel(allocates=False)
 def fit_stretch(
     position: NDArray[np.float64],
     direction: NDArray[np.float64],
-    along: float,
-    across: float,
-    loose: float,
-    tolerance_z: float,
-    tolerance_e: float,
-    step: float,
+    bounds: Bounds,
     grid: float,
     dt_s: float,
     start_s: float,
     first: int,
     last: int,
     begin: NDArray[np.float64],
-    pole: NDArray[np.complex128],
-    weight: NDArray[np.complex128],
-    direct: NDArray[np.float64],
-    ramp: NDArray[np.float64],
-    ramp_state: NDArray[np.complex128],
-    tail: NDArray[np.complex128],
-    norm: NDArray[np.float64],
+    level: bool,
+    answers: Answers,
     states: NDArray[np.complex128],
+    errors: NDArray[np.float64],
     out_t: NDArray[np.float64],
     out_position: NDArray[np.float64],
 ) -> int:
@@ -66,135 +105,182 @@ def fit_stretch(
     The fit starts at `begin` at `start_s` and ends exactly at sample `last`. A funnel of slopes in
     the frame of the path's direction says how long a segment may be; where exactly it ends,
     inside the (slightly looser) funnel, is chosen so that the machine's answer to the error stays
-    small. That answer is direct e + sum of Re(weight x), x <- pole x + e, per axis; `ramp`,
-    `ramp_state`, `tail` and `norm` are what it is for a triangular error
-    (`gcode.segments.ErrorFilter`); `states` carries x and is updated in place.
+    small. `states` (axes, order) carries that answer and is updated in place. With `level` set z
+    is the same at `begin` and at all samples. `errors` (LONGEST,) is scratch.
     Vertices in X and Y lie on multiples of `grid`. A segment is cut short where the speed of an
-    axis would step by more than `step`, as far as one sample allows. Returns their number.
+    axis would step too far, as far as one sample allows. Returns their number.
     """
-    order = pole.shape[1]
-    longest = ramp.shape[1] - 1
-    low, high = np.empty(4), np.empty(4)
-    new_low, new_high = np.empty(4), np.empty(4)
-    wide_low, wide_high = np.empty(2), np.empty(2)
-    tolerance = np.array([along, across, tolerance_z, tolerance_e])
-    value = np.empty(4)
-    slope = np.empty(4)
-    wish, straight, inner = np.empty(2), np.empty(2), np.empty(2)
-    trial = np.empty((2, order), np.complex128)
-    origin = begin.copy()
+    x, y, z, e = begin[0], begin[1], begin[2], begin[3]
     origin_s = start_s
-    speed = np.zeros(2)
+    speed_x = speed_y = 0.0
     k = first
     count = 0
     while k <= last:
-        cx, cy = direction[0, k], direction[1, k]
-        for i in range(4):
-            low[i], high[i] = -np.inf, np.inf
-        for i in range(2):
-            wide_low[i], wide_high[i] = -np.inf, np.inf
-        j = k
-        while j <= last:
-            span = j * dt_s - origin_s
-            rate = 1.0 / span
-            dx, dy = position[0, j] - origin[0], position[1, j] - origin[1]
-            if j > k:
-                # The speed may not step too far, neither into the segment nor into the stop.
-                if abs(dx * rate - speed[0]) > step or abs(dy * rate - speed[1]) > step:
-                    break
-                if j == last and max(abs(dx), abs(dy)) > step * span:
-                    break
-            value[0] = cx * dx + cy * dy
-            value[1] = cx * dy - cy * dx
-            value[2] = position[2, j] - origin[2]
-            value[3] = position[3, j] - origin[3]
-            # Where the path has turned, slack along the frame is slack across the path.
-            turn = abs(cx * direction[1, j] - cy * direction[0, j])
-            tolerance[0] = along
-            if turn * along > 0.5 * across:
-                tolerance[0] = max(across, 0.5 * across / turn)
-            fits = True
-            for i in range(4):
-                slack = 0.0 if j == last else tolerance[i]
-                new_low[i] = max(low[i], (value[i] - slack) * rate)
-                new_high[i] = min(high[i], (value[i] + slack) * rate)
-                if new_low[i] > new_high[i] + 1e-9:
-                    fits = False
-            if not fits:
-                break
-            # Element by element: a slice of four numbers would cost more than the rest.
-            for i in range(4):
-                low[i], high[i] = new_low[i], new_high[i]
-            for i in range(2):
-                wide_low[i] = max(wide_low[i], (value[i] - tolerance[i] - loose) * rate)
-                wide_high[i] = min(wide_high[i], (value[i] + tolerance[i] + loose) * rate)
-            j += 1
-        end = max(j - 1, k)
-        samples = end - k + 1
+        end, low, high, left, right, z_slope, e_slope = _reach(
+            position,
+            direction,
+            bounds,
+            dt_s,
+            origin_s,
+            x,
+            y,
+            z,
+            e,
+            speed_x,
+            speed_y,
+            k,
+            last,
+            level,
+        )
         span = end * dt_s - origin_s
-        shaped = j > k and end < last
-        # The answer to the straight line to the sample `end`; any other end adds a ramp to it.
-        weigh = shaped and samples <= longest
-        for axis in range(2):
-            straight[axis] = (position[axis, end] - origin[axis]) / span
-            inner[axis] = 0.0
-            for r in range(order):
-                trial[axis, r] = states[axis, r]
-        # Both axes side by side: each waits for its own last result only.
-        for i in range(samples):
-            at = k + i
-            since = at * dt_s - origin_s
-            for axis in range(2):
-                error = origin[axis] + straight[axis] * since - position[axis, at]
-                answer = direct[axis] * error
-                for r in range(order):
-                    x = trial[axis, r]
-                    answer += (weight[axis, r] * x).real
-                    trial[axis, r] = pole[axis, r] * x + error
-                if weigh:
-                    inner[axis] += answer * ramp[axis, samples, i]
-        for axis in range(2):
-            wish[axis] = 0.0
-            if weigh:
-                for r in range(order):
-                    inner[axis] += (trial[axis, r] * tail[axis, samples, r]).real
-                wish[axis] = -inner[axis] / norm[axis, samples]
-        if shaped:
-            dx = position[0, end] + wish[0] - origin[0]
-            dy = position[1, end] + wish[1] - origin[1]
-            along_slope = min(max((cx * dx + cy * dy) / span, wide_low[0]), wide_high[0])
-            across_slope = min(max((cx * dy - cy * dx) / span, wide_low[1]), wide_high[1])
-            slope[0] = cx * along_slope - cy * across_slope
-            slope[1] = cy * along_slope + cx * across_slope
-            moves = False
-            for axis in range(2):
-                wish[axis] = slope[axis] * span
-                target = grid * np.round((origin[axis] + wish[axis]) / grid)
-                slope[axis] = (target - origin[axis]) / span
-                moves = moves or abs(target - origin[axis]) > 0.5 * grid
-            if not moves:
+        end_x, end_y = position[0, end], position[1, end]
+        since = k * dt_s - origin_s
+        wish_x = _least_answer(position[0, k : end + 1], x, since, dt_s, answers, 0, states, errors)
+        wish_y = _least_answer(position[1, k : end + 1], y, since, dt_s, answers, 1, states, errors)
+        new_x, new_y = end_x, end_y
+        if end < last:
+            cx, cy = direction[0, k], direction[1, k]
+            dx, dy = end_x + wish_x - x, end_y + wish_y - y
+            along = min(max(cx * dx + cy * dy, low * span), high * span)
+            across = min(max(cx * dy - cy * dx, left * span), right * span)
+            dx, dy = cx * along - cy * across, cy * along + cx * across
+            new_x, new_y = grid * np.round((x + dx) / grid), grid * np.round((y + dy) / grid)
+            if abs(new_x - x) <= 0.5 * grid and abs(new_y - y) <= 0.5 * grid:
                 # A segment of no length cannot pass the time; one grid step can.
-                axis = 0 if abs(wish[0]) >= abs(wish[1]) else 1
-                slope[axis] = (grid if wish[axis] >= 0.0 else -grid) / span
-            slope[2] = 0.5 * (low[2] + high[2])
-            slope[3] = 0.5 * (low[3] + high[3])
+                if abs(dx) >= abs(dy):
+                    new_x = x + (grid if dx >= 0.0 else -grid)
+                else:
+                    new_y = y + (grid if dy >= 0.0 else -grid)
+            z += z_slope * span
+            e += e_slope * span
         else:
-            # The exact end of the stretch, or not even one sample fits: through the sample.
-            for i in range(4):
-                slope[i] = (position[i, end] - origin[i]) / span
-        for axis in range(2):
-            shift = origin[axis] + slope[axis] * span - position[axis, end]
-            for r in range(order):
-                states[axis, r] = trial[axis, r]
-                if samples <= longest:
-                    states[axis, r] += shift * ramp_state[axis, samples, r]
-        for i in range(4):
-            origin[i] = position[i, last] if end == last else origin[i] + slope[i] * span
-        speed[0], speed[1] = slope[0], slope[1]
+            z, e = position[2, last], position[3, last]
+        samples = end - k + 1
+        if samples <= LONGEST:
+            for r in range(states.shape[1]):
+                states[0, r] += (new_x - end_x) * answers.lift[0, samples, r]
+                states[1, r] += (new_y - end_y) * answers.lift[1, samples, r]
+        speed_x, speed_y = (new_x - x) / span, (new_y - y) / span
+        x, y = new_x, new_y
         origin_s = end * dt_s
         out_t[count] = origin_s
-        for i in range(4):
-            out_position[i, count] = origin[i]
+        out_position[0, count] = x
+        out_position[1, count] = y
+        out_position[2, count] = z
+        out_position[3, count] = e
         count += 1
         k = end + 1
     return count
+
+
+@kernel(force_inline=True, allocates=False)
+def _reach(
+    position: NDArray[np.float64],
+    direction: NDArray[np.float64],
+    bounds: Bounds,
+    dt_s: float,
+    origin_s: float,
+    x: float,
+    y: float,
+    z: float,
+    e: float,
+    speed_x: float,
+    speed_y: float,
+    k: int,
+    last: int,
+    level: bool,
+) -> tuple[int, float, float, float, float, float, float]:
+    """Find the last sample at which a segment that begins with sample `k` may end.
+
+    Returns it with the slopes that the end may have, lowest and highest along the path, the same
+    across it, and those of z and e.
+    """
+    cx, cy = direction[0, k], direction[1, k]
+    along, across, loose, z_tolerance, e_tolerance, step = bounds
+    along_low = across_low = z_low = e_low = wide_low = left = -np.inf
+    along_high = across_high = z_high = e_high = wide_high = right = np.inf
+    end = k
+    for j in range(k, last + 1):
+        span = j * dt_s - origin_s
+        rate = 1.0 / span
+        dx, dy = position[0, j] - x, position[1, j] - y
+        if j > k:
+            # The speed may not step too far, neither into the segment nor into the stop.
+            if abs(dx * rate - speed_x) > step or abs(dy * rate - speed_y) > step:
+                break
+            if j == last and max(abs(dx), abs(dy)) > step * span:
+                break
+        on, off, up, fed = (
+            cx * dx + cy * dy,
+            cx * dy - cy * dx,
+            position[2, j] - z,
+            position[3, j] - e,
+        )
+        # Where the path has turned, slack along the frame is slack across the path.
+        turn = abs(cx * direction[1, j] - cy * direction[0, j])
+        slack = along
+        if turn * along > 0.5 * across:
+            slack = max(across, 0.5 * across / turn)
+        given = 0.0 if j == last else 1.0
+        a0 = max(along_low, (on - given * slack) * rate)
+        a1 = min(along_high, (on + given * slack) * rate)
+        b0 = max(across_low, (off - given * across) * rate)
+        b1 = min(across_high, (off + given * across) * rate)
+        e0 = max(e_low, (fed - given * e_tolerance) * rate)
+        e1 = min(e_high, (fed + given * e_tolerance) * rate)
+        if a0 > a1 + 1e-9 or b0 > b1 + 1e-9 or e0 > e1 + 1e-9:
+            break
+        if not level:
+            z0 = max(z_low, (up - given * z_tolerance) * rate)
+            z1 = min(z_high, (up + given * z_tolerance) * rate)
+            if z0 > z1 + 1e-9:
+                break
+            z_low, z_high = z0, z1
+        along_low, along_high, across_low, across_high, e_low, e_high = a0, a1, b0, b1, e0, e1
+        wide_low = max(wide_low, (on - slack - loose) * rate)
+        wide_high = min(wide_high, (on + slack + loose) * rate)
+        left = max(left, (off - across - loose) * rate)
+        right = min(right, (off + across + loose) * rate)
+        end = j
+    z_slope = 0.0 if level else 0.5 * (z_low + z_high)
+    return end, wide_low, wide_high, left, right, z_slope, 0.5 * (e_low + e_high)
+
+
+@kernel(force_inline=True, allocates=False)
+def _least_answer(
+    position: NDArray[np.float64],
+    begin: float,
+    since_s: float,
+    dt_s: float,
+    answers: Answers,
+    axis: int,
+    states: NDArray[np.complex128],
+    errors: NDArray[np.float64],
+) -> float:
+    """Take the states of an axis along a straight line that ends on the last sample.
+
+    `begin` is where it starts, `since_s` before the first sample. Returns by how much the end is
+    best shifted. `errors` (LONGEST,) is scratch.
+    """
+    samples = len(position)
+    slope = (position[-1] - begin) / (since_s + (samples - 1) * dt_s)
+    order = states.shape[1]
+    if samples > LONGEST:
+        for i in range(samples):
+            error = begin + slope * (since_s + i * dt_s) - position[i]
+            for r in range(order):
+                states[axis, r] = answers.pole[axis, r] * states[axis, r] + error
+        return 0.0
+    answer = 0.0
+    # The last sample has no error.
+    for i in range(samples - 1):
+        errors[i] = begin + slope * (since_s + i * dt_s) - position[i]
+        answer += answers.echo[axis, samples, i] * errors[i]
+    for r in range(order):
+        state = states[axis, r]
+        answer += (answers.head[axis, samples, r] * state).real
+        state *= answers.power[axis, samples, r]
+        for i in range(samples - 1):
+            state += errors[i] * answers.power[axis, samples - 1 - i, r]
+        states[axis, r] = state
+    return float(-answer / answers.norm[axis, samples])

@@ -11,11 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode._segment_kernels import fit_stretch, path_directions, rest_errors
+from gcode._segment_kernels import (
+    LONGEST,
+    Answers,
+    Bounds,
+    fit_stretch,
+    path_directions,
+    rest_errors,
+)
 from gcode.timeline import Timeline
 from models.modal import modal_form
 from models.plants import DiscretePlant
@@ -30,7 +38,6 @@ E_TOLERANCE_MM = 1e-3
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
 END_EXCESS_MM = 1.5e-3
-_LONGEST = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +74,8 @@ class ErrorFilter:
     Notes
     -----
     `share` is how much of the tolerance is used: all of it up to a resonance of `FULL_GAIN`.
-    The answer to an error e is direct e + sum of Re(weight x) with x <- pole x + e. For a
-    triangular error that rises over m samples and falls over m - 1, `ramp[:, m]` is the answer
-    while it rises, `ramp_state[:, m]` the state at its peak, `tail[:, m]` weighs a state at the
-    peak with all that follows, and `norm[:, m]` is the answer's energy. They give the peak that
-    minimises the energy of the answer to what is already there plus the triangle.
+    `answers` is for the kernel. The answer to an error e is direct e + sum of Re(weight x) with
+    x <- pole x + e; products of answers, summed up to their end, are geometric series.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
@@ -79,47 +83,16 @@ class ErrorFilter:
         # Without the rows of zeros that fill up a modal form.
         rows = [np.zeros((0, 4)) if f is None else f[np.any(f != 0.0, axis=1)] for f in forms]
         order, axes = max(1, *(len(form) for form in rows)), len(plants)
-        self.pole = np.zeros((axes, order), complex)
-        self.weight = np.zeros((axes, order), complex)
-        self.direct = np.ones(axes)
-        self.ramp = np.zeros((axes, _LONGEST + 1, _LONGEST))
-        self.ramp_state = np.zeros((axes, _LONGEST + 1, order), complex)
-        self.tail = np.zeros((axes, _LONGEST + 1, order), complex)
-        self.norm = np.ones((axes, _LONGEST + 1))
+        pole, weight = np.zeros((2, axes, order), complex)
+        direct = np.ones(axes)
         for i, (plant, form) in enumerate(zip(plants, rows, strict=True)):
-            self.pole[i, : len(form)] = form[:, 0] + 1j * form[:, 1]
-            self.weight[i, : len(form)] = form[:, 2] + 1j * form[:, 3]
+            pole[i, : len(form)] = form[:, 0] + 1j * form[:, 1]
+            weight[i, : len(form)] = form[:, 2] + 1j * form[:, 3]
             if len(form) or plant.order == 0:
-                self.direct[i] = plant.d
-            self._triangles(i)
-        self.share = float(np.clip(FULL_GAIN / self._peak_gain(), 0.5, 1.0))
-
-    def _peak_gain(self) -> float:
-        """Largest answer of an axis to a sine below a quarter of the sampling rate."""
-        z = np.exp(1j * np.linspace(0.0, 0.5 * np.pi, 2001))[:, None]
-        pole, weight = self.pole[:, None], self.weight[:, None]
-        sums = weight / (z - pole) + weight.conj() / (z - pole.conj())
-        return float(np.max(np.abs(self.direct[:, None] + 0.5 * sums.sum(axis=2))))
-
-    def _triangles(self, i: int) -> None:
-        pole, weight, direct = self.pole[i], self.weight[i], self.direct[i]
-        # Sum over k of Re(w_a p_a^k x_a) Re(w_b p_b^k x_b) = Re(x_a (mixed x_b + plain conj x_b)).
-        pairs = np.outer(weight, weight) / (1.0 - np.outer(pole, pole))
-        crossed = np.outer(weight, weight.conj()) / (1.0 - np.outer(pole, pole.conj()))
-        for m in range(1, _LONGEST + 1):
-            shape = np.concatenate([np.arange(1, m + 1), np.arange(m - 1, 0, -1)]) / m
-            state, answer = np.zeros(len(pole), complex), np.empty(len(shape))
-            for k, error in enumerate(shape):
-                answer[k] = (weight @ state).real + direct * error
-                state = pole * state + error
-                if k == m - 1:
-                    self.ramp_state[i, m] = state
-            rest = answer[m:]
-            powers = pole[:, None] ** np.arange(len(rest))
-            after = 0.5 * (pairs @ state + crossed @ state.conj())
-            self.ramp[i, m, :m] = answer[:m]
-            self.tail[i, m] = weight * (powers @ rest) + pole ** len(rest) * after
-            self.norm[i, m] = answer @ answer + (state @ after).real
+                direct[i] = plant.d
+        tables = [_tables(*axis) for axis in zip(pole, weight, direct, strict=True)]
+        self.answers = Answers(pole, *(np.stack(table) for table in zip(*tables, strict=True)))
+        self.share = float(np.clip(FULL_GAIN / _peak_gain(pole, weight, direct), 0.5, 1.0))
 
 
 def across_tolerance_mm(tolerance_mm: float) -> float:
@@ -164,13 +137,21 @@ def fit_segments(
     groups = np.empty(capacity, dtype=np.int64)
     direction = np.empty((2, command_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
-    states = np.zeros_like(error_filter.pole)
+    bounds = Bounds(
+        along_mm=ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
+        across_mm=error_filter.share * across_tolerance_mm(tolerance_mm) + slack_mm,
+        loose_mm=LOOSE_MM,
+        z_mm=Z_TOLERANCE_MM,
+        e_mm=E_TOLERANCE_MM,
+        step_mm_s=step_mm_s,
+    )
+    states, errors = np.zeros_like(error_filter.answers.pole), np.empty(LONGEST)
     count = 0
     for i, group in enumerate(timeline.groups):
         start = timeline.end_s[i - 1] if i else 0.0
         if group.rest:
             resting = timeline.end_s[i] - timeline.start_s[i]
-            rest_errors(error_filter.pole, states, round(resting / dt))
+            rest_errors(error_filter.answers.pole, states, round(resting / dt))
             continue
         last = round(timeline.end_s[i] / dt)
         if i == len(timeline.groups) - 1:
@@ -182,26 +163,17 @@ def fit_segments(
         n = fit_stretch(
             command_mm,
             direction,
-            ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
-            error_filter.share * across_tolerance_mm(tolerance_mm) + slack_mm,
-            LOOSE_MM,
-            Z_TOLERANCE_MM,
-            E_TOLERANCE_MM,
-            step_mm_s,
+            bounds,
             grid_mm,
             dt,
             start,
             first,
             last,
             begin,
-            error_filter.pole,
-            error_filter.weight,
-            error_filter.direct,
-            error_filter.ramp,
-            error_filter.ramp_state,
-            error_filter.tail,
-            error_filter.norm,
+            bool(np.all(command_mm[2, first : last + 1] == begin[2])),
+            error_filter.answers,
             states,
+            errors,
             end_s[count:],
             end_mm[:, count:],
         )
@@ -239,3 +211,42 @@ def _merge_crawl(
     end_s[keep - 1] = end_s[last]
     end_mm[:, keep - 1] = end_mm[:, last]
     return keep
+
+
+def _peak_gain(
+    pole: NDArray[np.complex128], weight: NDArray[np.complex128], direct: NDArray[np.float64]
+) -> float:
+    """Largest answer of an axis to a sine below a quarter of the sampling rate."""
+    z = np.exp(1j * np.linspace(0.0, 0.5 * np.pi, 2001))[:, None]
+    pole, weight = pole[:, None], weight[:, None]
+    sums = weight / (z - pole) + weight.conj() / (z - pole.conj())
+    return float(np.max(np.abs(direct[:, None] + 0.5 * sums.sum(axis=2))))
+
+
+def _tables(
+    pole: NDArray[np.complex128], weight: NDArray[np.complex128], direct: np.float64
+) -> list[NDArray[Any]]:
+    """`power`, `head`, `echo`, `lift` and `norm` of one axis (`Answers`)."""
+    lag = np.arange(2 * LONGEST)
+    power = pole ** lag[:, None]
+    # Two answers multiplied and summed up: a series for every pair of poles.
+    series = (
+        weight / (1.0 - np.outer(pole, pole)),
+        weight.conj() / (1.0 - np.outer(pole, pole.conj())),
+    )
+    pairs = 0.5 * np.sum(series, axis=(0, 2))
+    impulse = np.append(direct, (power[:-1] @ weight).real)
+    correlation = (power @ (weight * pairs)).real + direct * impulse
+    # Errors that rise over m samples and fall over the next ones, a row for every m.
+    count = np.arange(LONGEST + 1)[:, None]
+    triangle = np.maximum(np.minimum(lag + 1, 2 * count - lag - 1), 0) / np.maximum(count, 1)
+    echo = triangle @ correlation[np.abs(lag[:, None] - lag)]
+    lift = np.zeros((LONGEST + 1, len(pole)), complex)
+    lift[1:] = np.cumsum(np.cumsum(power[:LONGEST], axis=0), axis=0) / count[1:]
+    return [
+        power[: LONGEST + 1],
+        (triangle @ power) * weight * (direct + pole * pairs),
+        echo[:, :LONGEST],
+        lift,
+        np.sum(triangle * echo, axis=1),
+    ]

@@ -156,7 +156,7 @@ def test_noise_shaping_pays(f_hz: float) -> None:
     command = curvy(5, 4000, 120)
     rms = []
     shaping, zero = ErrorFilter([plant, plant]), ErrorFilter([plant, plant])
-    for column in (zero.ramp, zero.tail):
+    for column in (zero.answers.head, zero.answers.echo):
         column[:] = 0
     for used in (zero, shaping):
         fitted = fit_segments(line_of(command), command, 5e-3, used)
