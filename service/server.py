@@ -7,6 +7,7 @@ import socket
 import sys
 from collections.abc import Iterator
 
+import structlog
 import uvicorn
 
 from service.api import create_app
@@ -14,6 +15,7 @@ from service.database.engine import open_database
 from service.exclusive import exclusive
 from service.jobs.worker import Runner, run_task
 from service.logs import configure_logging
+from service.machines.settings import EARLIER_DATA_DIR
 from service.security.keys import keys_needed
 from service.settings import Settings
 
@@ -67,6 +69,7 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         _alone(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
+        _tell_where(settings)
         # The application does so again; what uvicorn makes of an error there nobody can read.
         open_database(settings).dispose()
         for address in _addresses(host, listener.getsockname()[1]):
@@ -82,6 +85,18 @@ def _addresses(host: str, port: int) -> list[str]:
         return [f"http://127.0.0.1:{port}/", f"http://{name}:{port}/ (from other computers)"]
     shown = f"[{host}]" if ":" in host else host
     return [f"http://{shown}:{port}/"]
+
+
+def _tell_where(settings: Settings) -> None:
+    """Say where the data are, and if that is not where the command line keeps its machines."""
+    log = structlog.get_logger("serve")
+    log.info("data directory", folder=str(settings.data_dir.resolve()))
+    if "data_dir" not in settings.model_fields_set and settings.data_dir == EARLIER_DATA_DIR:
+        log.warning(
+            "the data of an earlier version are here and go on being used; machines made on the "
+            "command line lie elsewhere: set STILLPATH_DATA_DIR for both to share them",
+            STILLPATH_DATA_DIR=str(settings.data_dir.resolve()),
+        )
 
 
 @contextlib.contextmanager

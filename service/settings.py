@@ -9,9 +9,25 @@ from typing import Annotated, Self
 from pydantic import Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.machines.settings import ENV_PREFIX, MachineSettings
+from service.machines.settings import (
+    EARLIER_DATA_DIR,
+    ENV_PREFIX,
+    MachineSettings,
+    user_data_dir,
+)
 
 __all__ = ["Settings", "is_loopback"]
+
+
+def _data_dir() -> Path:
+    """Return the folder that the command line uses too, so that both see the same machines.
+
+    Where an earlier version has left its data, they go on being used.
+    """
+    try:
+        return EARLIER_DATA_DIR if EARLIER_DATA_DIR.is_dir() else user_data_dir()
+    except RuntimeError:  # a user without a home, as services may be
+        return EARLIER_DATA_DIR
 
 
 class Settings(MachineSettings, BaseSettings):
@@ -23,7 +39,8 @@ class Settings(MachineSettings, BaseSettings):
     Attributes
     ----------
     data_dir : Path
-        Uploads on their way, and, unless they are elsewhere, database, results and machines.
+        Uploads on their way, and, unless they are elsewhere, database, results and machines. By
+        default the user's folder for data, or `stillpath-data` here if there is one.
     database_url : str, optional
         For instance ``postgresql+psycopg://user@host/stillpath``; by default SQLite in `data_dir`.
     storage_url : str, optional
@@ -67,7 +84,7 @@ class Settings(MachineSettings, BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
-    data_dir: Path = Path("stillpath-data")
+    data_dir: Annotated[Path, Field(default_factory=_data_dir)]
     database_url: str | None = None
     storage_url: str | None = None
     scheduler: str | None = None

@@ -85,7 +85,7 @@ def open_documents(name: str) -> Documents:
 
 def data_dir() -> Path:
     """Return the folder of this user's machines and identifications."""
-    from service.machines.resolve import user_data_dir
+    from service.machines.settings import user_data_dir
 
     return _settings().data_dir or user_data_dir()
 
@@ -117,6 +117,7 @@ def machines(context: typer.Context) -> None:
             str(max(approved)) if approved else "none",
         )
     _print(table)
+    _tell_of_others()
 
 
 @app.command()
@@ -432,6 +433,19 @@ def who(by: str | None) -> str:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):  # a container's user may have no name
         return "unknown"
+
+
+def _tell_of_others() -> None:
+    """Say if the service keeps machines of its own in this folder, as earlier versions did."""
+    from service.machines.settings import EARLIER_DATA_DIR
+
+    others, own = EARLIER_DATA_DIR / "machines", data_dir() / "machines"
+    if others.is_dir() and others.resolve() != own.resolve():
+        typer.echo(
+            f"note: a service that is started here keeps other machines, in {others}; "
+            f"STILLPATH_DATA_DIR={EARLIER_DATA_DIR.resolve()} shows those",
+            err=True,
+        )
 
 
 def _settings() -> MachineSettings:

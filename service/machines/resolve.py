@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from service.machines.checks import age_warnings
 from service.machines.revision import NotApproved, UnknownMachine, document_text
 from service.machines.store import MachineStore
 
-__all__ = ["PinnedMachine", "Resolver", "user_data_dir"]
+__all__ = ["PinnedMachine", "Resolver"]
 
 
 class PinnedMachine(BaseModel):
@@ -111,15 +109,3 @@ class Resolver:
             raise UnknownMachine(str(no_such_machine(name, self.store.names())))
         revision = self.store.usable(name, require_approval=approved)
         return PinnedMachine(machine=revision.machine, number=revision.number)
-
-
-def user_data_dir(environment: Mapping[str, str] = os.environ) -> Path:
-    """Return the folder where programs keep what a user owns, by the platform's convention."""
-    if sys.platform == "win32":
-        base = environment.get("LOCALAPPDATA")
-        fallback = Path.home() / "AppData" / "Local"
-    elif sys.platform == "darwin":
-        base, fallback = None, Path.home() / "Library" / "Application Support"
-    else:
-        base, fallback = environment.get("XDG_DATA_HOME"), Path.home() / ".local" / "share"
-    return (Path(base) if base else fallback) / "stillpath"

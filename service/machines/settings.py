@@ -1,17 +1,20 @@
-"""Settings of the user's machines, from the environment, for the command line and the service."""
+"""Settings of the user's machines, and where they lie, for the command line and the service."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["ENV_PREFIX", "MachineSettings"]
+__all__ = ["EARLIER_DATA_DIR", "ENV_PREFIX", "MachineSettings", "user_data_dir"]
 
 ENV_PREFIX = "STILLPATH_"
+EARLIER_DATA_DIR = Path("stillpath-data")
+"""Where the service kept its data before it had the user's folder in common with the commands."""
 
 
 class MachineSettings(BaseModel):
@@ -45,3 +48,15 @@ class MachineSettings(BaseModel):
         known = {ENV_PREFIX + field.upper(): field for field in cls.model_fields}
         given = {name.upper(): value for name, value in environment.items()}
         return cls.model_validate({known[n]: v for n, v in given.items() if n in known})
+
+
+def user_data_dir(environment: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder where programs keep what a user owns, by the platform's convention."""
+    if sys.platform == "win32":
+        base = environment.get("LOCALAPPDATA")
+        fallback = Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base, fallback = None, Path.home() / "Library" / "Application Support"
+    else:
+        base, fallback = environment.get("XDG_DATA_HOME"), Path.home() / ".local" / "share"
+    return (Path(base) if base else fallback) / "stillpath"

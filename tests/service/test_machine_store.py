@@ -23,13 +23,14 @@ from models.store import builtin_machines, load_machine
 from service.database.documents import DocumentTable
 from service.database.engine import open_database
 from service.machines.diff import diff
-from service.machines.resolve import PinnedMachine, Resolver, user_data_dir
+from service.machines.resolve import PinnedMachine, Resolver
 from service.machines.revision import (
     Conflict,
     NotApproved,
     UnknownMachine,
     source_file,
 )
+from service.machines.settings import user_data_dir
 from service.machines.store import MachineStore
 from service.machines.transfer import export_history, import_file
 from service.settings import Settings

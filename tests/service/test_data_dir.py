@@ -1,0 +1,80 @@
+"""Where data lie by default: commands and service share a folder; an earlier one stays in use."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.cli import run
+from service.database.documents import open_documents
+from service.database.engine import open_database
+from service.machines.commands import data_dir
+from service.machines.store import MachineStore
+from service.server import _tell_where
+from service.settings import Settings
+
+pytestmark = pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG convention")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Somebody's folder for data, and another one that commands are started in."""
+    monkeypatch.delenv("STILLPATH_DATA_DIR", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "home"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "home" / "stillpath"
+
+
+def make_a_machine(home: Path) -> None:
+    assert run(["machines", "export", "ender3", "-o", "mine.json"]) == 0
+    assert run(["machines", "import", "mine.json", "--as", "mine"]) == 0
+
+
+def test_the_service_has_the_machines_of_the_command_line(home: Path):
+    make_a_machine(home)
+    settings = Settings()
+    assert settings.data_dir == data_dir() == home
+    engine = open_database(settings)
+    assert MachineStore(open_documents(settings, engine, "machines")).names() == ["mine"]
+    engine.dispose()
+    assert not Path("stillpath-data").exists()
+
+
+def test_data_of_an_earlier_version_go_on_being_used_and_both_sides_say_so(home: Path, capsys):
+    make_a_machine(home)
+    (Path("stillpath-data") / "machines").mkdir(parents=True)
+    settings = Settings()
+    assert settings.data_dir == Path("stillpath-data")
+    assert data_dir() == home  # what was made there is not lost either
+    capsys.readouterr()
+    _tell_where(settings)
+    assert "go on being used" in capsys.readouterr().out
+    assert run(["machines"]) == 0
+    out, err = capsys.readouterr()
+    assert "mine" in out
+    assert f"STILLPATH_DATA_DIR={Path('stillpath-data').resolve()} shows those" in err
+
+
+def test_what_is_named_is_used_without_a_word(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    (Path("stillpath-data") / "machines").mkdir(parents=True)
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(Path("stillpath-data").resolve()))
+    settings = Settings()
+    assert settings.data_dir == data_dir() == Path("stillpath-data").resolve()
+    _tell_where(settings)
+    assert "go on being used" not in capsys.readouterr().out
+    assert run(["machines"]) == 0
+    assert not capsys.readouterr().err
+
+
+def test_a_user_without_a_home_keeps_data_where_the_service_is_started(monkeypatch):
+    def none() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_DATA_HOME")
+    monkeypatch.setattr(Path, "home", none)
+    assert Settings().data_dir == Path("stillpath-data")
