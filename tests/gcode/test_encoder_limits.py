@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gcode.firmware._encoding_kernels import round_ends
+from gcode.firmware.klipper._encoder_kernels import MOST_LOST, expected_braking
 from gcode.firmware.klipper._motion_kernels import move_limits
 
 FACTS = (20.0, 200.0, 100.0, 5000.0, 1.0)
@@ -55,6 +56,21 @@ def test_limits_of_moves() -> None:
     expected = np.minimum.reduce([by_filament, np.sqrt(0.5 * reach * tangent), corner])
     assert junction[0] == 0.0
     np.testing.assert_allclose(junction[1:], expected, rtol=1e-7)
+
+
+def test_expected_braking_is_that_of_planned_speeds() -> None:
+    rng = np.random.default_rng(5)
+    n = 300
+    ours, stops = rng.random(n) < 0.8, rng.random(n) < 0.3
+    stops &= ~ours
+    length, planned = rng.uniform(0.01, 1.0, n), rng.uniform(1e-3, 1e-2, n)
+    speed, accel, junction = rng.uniform(10.0, [[150.0], [3e4], [150.0]], (3, n))
+    braking = np.full(n, np.nan)
+    expected_braking(ours, stops, length, planned, speed, accel, junction, braking)
+    v = np.where(ours, np.minimum(length / planned, speed), speed)
+    leave = np.append(np.minimum.reduce([v[:-1], v[1:], junction[1:]]) * ~stops[1:], 0.0)
+    lost = np.minimum((v - leave) ** 2 / (2.0 * accel * v), MOST_LOST * planned)
+    np.testing.assert_allclose(braking, np.where(ours, lost, 0.0), rtol=1e-12)
 
 
 def test_ends_are_rounded_but_for_the_last_of_a_group() -> None:

@@ -8,16 +8,50 @@ from numpy.typing import NDArray
 from gcode.firmware._writing_kernels import printed_feedrate
 from models.jit import kernel
 
-__all__ = ["assign_speeds"]
+__all__ = ["assign_speeds", "expected_braking"]
 
 RUSH = 0.5
 """No segment is hurried to less than this part of its planned time."""
 MOST_LOST = 0.8
 """The law of losses holds where a ramp fits into its segment: more than this part of its time is
 not believed to be lost."""
+_ROUNDS = 3
+_SETTLED_MM_S = 1e-4
+"""A speed that changes by less is as good as it gets: F has steps of 1.7e-3 mm/s and more."""
 
 
-@kernel
+@kernel(allocates=False)
+def expected_braking(
+    ours: NDArray[np.bool_],
+    stops: NDArray[np.bool_],
+    length_mm: NDArray[np.float64],
+    planned_s: NDArray[np.float64],
+    speed_mm_s: NDArray[np.float64],
+    accel_mm_s2: NDArray[np.float64],
+    junction_mm_s: NDArray[np.float64],
+    braking_s: NDArray[np.float64],
+) -> None:
+    """Find what is lost by braking at the end of every segment of ours if all keep their times.
+
+    See `assign_speeds`; `braking_s` is what it starts from.
+    """
+    count = len(length_mm)
+    for i in range(count):
+        braking_s[i] = 0.0
+        if not ours[i]:
+            continue
+        v = min(length_mm[i] / planned_s[i], speed_mm_s[i])
+        leave = 0.0
+        if i + 1 < count and not stops[i + 1]:
+            follows = speed_mm_s[i + 1]
+            if ours[i + 1]:
+                follows = min(length_mm[i + 1] / planned_s[i + 1], follows)
+            leave = min(v, follows, junction_mm_s[i + 1])
+        lost = (v - leave) ** 2 / (2.0 * accel_mm_s2[i] * v)
+        braking_s[i] = min(lost, MOST_LOST * planned_s[i])
+
+
+@kernel(allocates=False)
 def assign_speeds(
     ours: NDArray[np.bool_],
     stops: NDArray[np.bool_],
@@ -41,9 +75,9 @@ def assign_speeds(
 
     The time still to spend is the target minus the time predicted so far. Klipper loses
     (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. What
-    is lost by braking at the end of a segment hangs on the next one: `braking_s` holds it from
-    the run before and is renewed. A stretch starts when the rest before it is over: its times
-    move with that.
+    is lost by braking at the end of a segment hangs on the next one: `braking_s` holds what is
+    expected, or was found by the run before, and is renewed. A stretch starts when the rest
+    before it is over: its times move with that.
     """
     now = start_s
     before = 0.0
@@ -99,28 +133,33 @@ def assign_speeds(
         if available < least:
             late += least - available
             available = least
-        v = length_mm[i] / available
-        loss = braking = 0.0
         behind = i > 0 and ours[i - 1]
-        for _ in range(3):
+        twice_accel = 2.0 * accel_mm_s2[i]
+        # What the segment before was given for braking is no time of this one, and this one
+        # brakes itself.
+        known = braking_s[i] - (braking_s[i - 1] if behind else 0.0)
+        brakes = 1.0 / (2.0 * before_accel * before) if before > 0.0 else 0.0
+        most_braking = MOST_LOST * planned_s[i - 1] if behind else np.inf
+        v = length_mm[i] / available
+        for _ in range(_ROUNDS):
             corner = min(v, before, junction_mm_s[i])
-            loss = (v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v)
-            if before > corner:
-                braking = (before - corner) ** 2 / (2.0 * before_accel * before)
-                braking = min(braking, MOST_LOST * planned_s[i - 1]) if behind else braking
-            # What the segment before was given for braking is no time of this one, and this one
-            # brakes itself.
-            lost = loss + braking - (braking_s[i - 1] if behind else 0.0) + braking_s[i]
+            lost = known + min((before - corner) ** 2 * brakes, most_braking)
+            if v > corner:
+                lost += (v - corner) ** 2 / (twice_accel * v)
+            last = v
             v = min(length_mm[i] / (available - min(lost, MOST_LOST * available)), speed_mm_s[i])
             # No faster than it gets within its length; there the law holds to the last.
-            v = min(v, np.sqrt(corner * corner + 2.0 * accel_mm_s2[i] * length_mm[i]))
+            fastest2 = corner * corner + twice_accel * length_mm[i]
+            if v * v > fastest2:
+                v = np.sqrt(fastest2)
+            if abs(v - last) < _SETTLED_MM_S:
+                break
         feedrate[i] = printed_feedrate(60.0 * v)
         v = feedrate[i] / 60.0
         corner = min(v, before, junction_mm_s[i])
-        loss = min((v - corner) ** 2 / (2.0 * accel_mm_s2[i] * v), MOST_LOST * available)
-        braking = (before - corner) ** 2 / (2.0 * before_accel * before) if before > 0.0 else 0.0
+        loss = min((v - corner) ** 2 / (twice_accel * v), MOST_LOST * available)
+        braking = min((before - corner) ** 2 * brakes, most_braking)
         if behind:
-            braking = min(braking, MOST_LOST * planned_s[i - 1])
             predicted_s[i - 1] += braking - braking_s[i - 1]
             now += braking - braking_s[i - 1]
             braking_s[i - 1] = braking
@@ -135,7 +174,7 @@ def assign_speeds(
         braking_s[count - 1] = before / (2.0 * before_accel)
 
 
-@kernel
+@kernel(allocates=False)
 def _trapezoid_s(length: float, entry: float, leave: float, cruise: float, accel: float) -> float:
     """Time of a move that enters, cruises and leaves at the given speeds where it has room."""
     peak2 = 0.5 * (2.0 * accel * length + entry * entry + leave * leave)

@@ -22,7 +22,7 @@ from gcode.firmware.encoding import (
     interleave,
     limits_in_force,
 )
-from gcode.firmware.klipper._encoder_kernels import assign_speeds
+from gcode.firmware.klipper._encoder_kernels import assign_speeds, expected_braking
 from gcode.firmware.klipper._motion_kernels import move_limits
 from gcode.firmware.klipper.limits import KlipperLimits
 from gcode.firmware.klipper.planner import Planner
@@ -119,8 +119,8 @@ class KlipperEncoder:
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 
         correction, braking, feedrate, predicted = np.zeros((4, len(rows)))
-        # The first run finds what is lost by braking at each end, those behind it know.
-        for turn in range(1 + _PASSES):
+        expected_braking(ours, stops, length, moves.planned_s, speed, accel, junction, braking)
+        for _ in range(_PASSES):
             assign_speeds(
                 ours,
                 stops,
@@ -136,8 +136,6 @@ class KlipperEncoder:
                 feedrate,
                 predicted,
             )
-            if turn == 0:
-                continue
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
