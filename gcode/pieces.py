@@ -8,7 +8,7 @@ Everything else is a *passage*.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import TypeVar
@@ -36,6 +36,7 @@ __all__ = ["Passage", "Piece", "Splitter", "excerpt"]
 
 T = TypeVar("T", Moves, Events, Phases)
 S = TypeVar("S", Moves, Events)
+R = TypeVar("R")
 
 WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of its way more than the second, is
@@ -44,11 +45,6 @@ one of the extruder: X and Y creep, and would be cut into thousands of segments.
 _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
 """What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
 moves of a micrometre it would have millions."""
-
-_CHANGES = np.isin([kind.value for kind in EventKind], [EventKind.LIMITS, EventKind.MODE])
-"""By the number of an event's kind: those that may end a piece."""
-_SOUGHT = 64
-"""Events that are looked at together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,39 +187,31 @@ class Splitter:
         """Return the first move behind which a piece cannot go on, by the number held; None: none.
 
         A stop ends a piece, G92 of more than E, M221, or a stream's other limits. What lies before
-        the first move does not. Blocks hold thousands of events and pieces often a few, so the
-        search ends with the first that is found.
+        the first move does not.
         """
         limits, modal = self._tables
-        limits_id, was = self._limits_id, modal[self._modal_id]
-        kind = events.kind
-        rows = np.flatnonzero((kind >= EventKind.STOP) | _CHANGES[kind])
-        for first in range(0, len(rows), _SOUGHT):
-            some = rows[first : first + _SOUGHT]
-            columns = (kind, events.move_index, events.limits_id, events.modal_id)
-            starts, ends = (
-                (at[some] - self._text_offset).tolist()
-                for at in (events.byte_start, events.byte_end)
-            )
-            for what, move, after, now, start, end in zip(
-                *(column[some].tolist() for column in columns), starts, ends, strict=True
-            ):
-                found = what >= EventKind.STOP
-                if what == EventKind.LIMITS:
-                    found |= self._other_stream(limits[limits_id], limits[after])
-                    limits_id = after
-                elif what == EventKind.MODE:
-                    # Where E counts differently from here on, it must be where the file says.
-                    found |= modal[now].extrude_factor != was.extrude_factor
-                    found |= _shifts_origin(self._text[start:end])
-                    was = modal[now]
-                if found and move > 0:
-                    return int(move)
-        return None
-
-    def _other_stream(self, before: Limits, after: Limits) -> bool:
-        stream_limits = self._kit.stream_limits
-        return after is not before and stream_limits(after) != stream_limits(before)
+        behind_move = events.move_index > 0
+        found = np.flatnonzero((events.kind >= EventKind.STOP) & behind_move)
+        end = int(found[0]) if len(found) else len(events)
+        kind = events.kind[:end]
+        of_limits, of_mode = (
+            np.flatnonzero(kind == what) for what in (EventKind.LIMITS, EventKind.MODE)
+        )
+        others = _changes(
+            self._limits_id, events.limits_id[of_limits], limits, self._kit.stream_limits
+        )
+        # Where E counts differently from here on, it must be where the file says.
+        factors = _changes(
+            self._modal_id, events.modal_id[of_mode], modal, lambda state: state.extrude_factor
+        )
+        for rows in (of_limits[others], of_mode[factors]):
+            end = min([end, *rows[behind_move[rows]][:1].tolist()])
+        for row in of_mode[behind_move[of_mode] & (of_mode < end)].tolist():
+            start, stop = events.byte_start[row], events.byte_end[row]
+            if _shifts_origin(self._text[start - self._text_offset : stop - self._text_offset]):
+                end = row
+                break
+        return int(events.move_index[end]) if end < len(events) else None
 
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
@@ -371,6 +359,19 @@ def excerpt(piece: Piece, first: int, last: int, machine: Machine) -> Piece:
         text=b"",
         phases=plan_moves(moves, piece.limits, machine),
     )
+
+
+def _changes(
+    before: int,
+    after: NDArray[np.int32],
+    table: list[R],
+    seen: Callable[[R], Hashable],
+) -> NDArray[np.bool_]:
+    """Tell after which of a row of events something seen of their rows of a table is another."""
+    used, place = np.unique(np.append(before, after), return_inverse=True)
+    numbers: dict[Hashable, int] = {}
+    number = [numbers.setdefault(seen(table[row]), len(numbers)) for row in used.tolist()]
+    return np.diff(np.array(number)[place]) != 0
 
 
 @lru_cache(maxsize=64)

@@ -12,7 +12,7 @@ import configparser
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import BinaryIO
@@ -47,6 +47,7 @@ _SETTING = re.compile(rb"^; ([a-z][a-z0-9_]*) = ?([^\r\n]*)", re.MULTILINE)
 _CURA_SETTING = re.compile(rb"^;SETTING_3 ([^\r\n]*)", re.MULTILINE)
 _GAP = re.compile(r"[^\S\n]{2,}")
 _TIME_LINE = re.compile(rb"^;?[^\n]{0,60}?[Tt](?:IME|ime)[^\n]{0,100}$", re.MULTILINE)
+_LATEST_WORD = 64
 _FLAVOR = re.compile(rb"^;FLAVOR:([^\r\n]+)", re.MULTILINE)
 _PRODUCTS = {"Cura_SteamEngine": "Cura", "Slic3r Prusa Edition": "PrusaSlicer"}
 
@@ -156,7 +157,7 @@ def _estimates(head: bytes, tail: bytes) -> tuple[float | None, float | None, fl
     totals: list[float] = []
     silent = first_layer = None
     for part in (head, tail):
-        for line in _TIME_LINE.finditer(part):
+        for line in _time_lines(part):
             told = [time for time in read_times(line[0]) if not line[0].startswith(b"M73")]
             # Of several in a line the last one is the whole.
             for time in told[-1:]:
@@ -169,6 +170,22 @@ def _estimates(head: bytes, tail: bytes) -> tuple[float | None, float | None, fl
     known = [total for total in totals if total not in (0.0, _PLACEHOLDER_S)]
     estimate = next(iter(known or totals), None)
     return estimate, silent, first_layer
+
+
+def _time_lines(text: bytes) -> Iterator[re.Match[bytes]]:
+    """Find the lines that may tell times by their word: a search for patterns reads all others."""
+    starts = set()
+    for word in (b"IME", b"ime"):
+        at = text.find(word)
+        while at >= 0:
+            # Further on in a line the word is too late.
+            first = text.rfind(b"\n", max(at - _LATEST_WORD, 0), at) + 1
+            if first > 0 or at < _LATEST_WORD:
+                starts.add(first)
+            at = text.find(word, at + len(word))
+    for start in sorted(starts):
+        if match := _TIME_LINE.match(text, start):
+            yield match
 
 
 def _settings(head: bytes, tail: bytes) -> dict[str, str]:
