@@ -371,7 +371,7 @@ def _changes(
     used, place = np.unique(np.append(before, after), return_inverse=True)
     numbers: dict[Hashable, int] = {}
     number = [numbers.setdefault(seen(table[row]), len(numbers)) for row in used.tolist()]
-    return np.diff(np.array(number)[place]) != 0
+    return np.asarray(np.diff(np.array(number)[place]) != 0)
 
 
 @lru_cache(maxsize=64)

@@ -184,42 +184,92 @@ def motion_sums(
         Carried on, squares: sum and maximum of all, of extruding, of the rest that waits, and of
         rests that count.
     """
-    still = rest[2]
-    for k in range(path.shape[1]):
-        x, y = path[0, k], path[1, k]
-        if math.isnan(rest[0]):
-            rest[0], rest[1] = x, y
-        moved = abs(x - rest[0]) > still_mm or abs(y - rest[1]) > still_mm
-        rest[0], rest[1] = x, y
-        if moved:
-            # The sample at which the path arrives is the first of the rest.
-            still = 0.0
-            rest[3] = 0.0
-        elif still >= 0.0:
-            still += 1.0
-        rests = 0.0 <= still < window
-        settled = rests and still >= shortest
-        if rests:
-            rest[3] += 1.0
-        if settled:
-            rest[4] += rest[3]
-            rest[3] = 0.0
-            rest[5] += 1.0 if still == shortest else 0.0
-        for c in range(len(points)):
-            ex, ey = points[c, 0, k] - x, points[c, 1, k] - y
+    n = path.shape[1]
+    if n > 0 and math.isnan(rest[0]):
+        rest[0], rest[1] = path[0, 0], path[1, 0]
+    k = 0
+    while k < n:
+        behind = k
+        while behind < n and _moved(path, behind, rest, still_mm):
+            behind += 1
+        # Where the path moves on, samples have no part in rests.
+        last = behind - 1 if shortest > 0 else k
+        if k < last:
+            _add_squares(path[:, k:last], points[:, :, k:last], extruding[k:last], sums)
+            k = last
+        moved = behind > k
+        _add_sample(path, points, extruding, k, moved, shortest, window, rest, sums)
+        k += 1
+    if n > 0:
+        rest[0], rest[1] = path[0, n - 1], path[1, n - 1]
+
+
+@kernel(inline=True, allocates=False)
+def _moved(path: Array, k: int, rest: Array, still_mm: float) -> bool:
+    x = path[0, k - 1] if k > 0 else rest[0]
+    y = path[1, k - 1] if k > 0 else rest[1]
+    return abs(path[0, k] - x) > still_mm or abs(path[1, k] - y) > still_mm
+
+
+@kernel(allocates=False)
+def _add_squares(path: Array, points: Array, extruding: NDArray[np.bool_], sums: Array) -> None:
+    """Add samples that belong to no rest."""
+    for c in range(len(points)):
+        total, most, printed, printed_most = sums[c, 0], sums[c, 1], sums[c, 2], sums[c, 3]
+        for k in range(len(extruding)):
+            ex, ey = points[c, 0, k] - path[0, k], points[c, 1, k] - path[1, k]
             squared = ex * ex + ey * ey
-            sums[c, 0] += squared
-            sums[c, 1] = max(sums[c, 1], squared)
+            total += squared
+            # Comparisons, as nothing then waits for the largest of the samples before.
+            if squared > most:
+                most = squared
             if extruding[k]:
-                sums[c, 2] += squared
-                sums[c, 3] = max(sums[c, 3], squared)
-            if moved:
-                sums[c, 4] = sums[c, 5] = 0.0
-            if rests:
-                sums[c, 4] += squared
-                sums[c, 5] = max(sums[c, 5], squared)
-            if settled:
-                sums[c, 6] += sums[c, 4]
-                sums[c, 7] = max(sums[c, 7], sums[c, 5])
-                sums[c, 4] = sums[c, 5] = 0.0
-    rest[2] = still
+                printed += squared
+                if squared > printed_most:
+                    printed_most = squared
+        sums[c, 0], sums[c, 1], sums[c, 2], sums[c, 3] = total, most, printed, printed_most
+
+
+@kernel(force_inline=True, allocates=False)
+def _add_sample(
+    path: Array,
+    points: Array,
+    extruding: NDArray[np.bool_],
+    k: int,
+    moved: bool,
+    shortest: int,
+    window: int,
+    rest: Array,
+    sums: Array,
+) -> None:
+    """Add a sample that may belong to a rest."""
+    if moved:
+        # The sample at which the path arrives is the first of the rest.
+        rest[2] = rest[3] = 0.0
+    elif rest[2] >= 0.0:
+        rest[2] += 1.0
+    rests = 0.0 <= rest[2] < window
+    settled = rests and rest[2] >= shortest
+    if rests:
+        rest[3] += 1.0
+    if settled:
+        rest[4] += rest[3]
+        rest[3] = 0.0
+        rest[5] += 1.0 if rest[2] == shortest else 0.0
+    for c in range(len(points)):
+        ex, ey = points[c, 0, k] - path[0, k], points[c, 1, k] - path[1, k]
+        squared = ex * ex + ey * ey
+        sums[c, 0] += squared
+        sums[c, 1] = max(sums[c, 1], squared)
+        if extruding[k]:
+            sums[c, 2] += squared
+            sums[c, 3] = max(sums[c, 3], squared)
+        if moved:
+            sums[c, 4] = sums[c, 5] = 0.0
+        if rests:
+            sums[c, 4] += squared
+            sums[c, 5] = max(sums[c, 5], squared)
+        if settled:
+            sums[c, 6] += sums[c, 4]
+            sums[c, 7] = max(sums[c, 7], sums[c, 5])
+            sums[c, 4] = sums[c, 5] = 0.0
