@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware._encoding_kernels import merge_still, round_ends
+from gcode.firmware._encoding_kernels import lay_out
 from gcode.pieces import Piece
 from gcode.segments import Segments
 from gcode.timeline import Group, Timeline
@@ -82,7 +82,7 @@ class Interleaved:
     end_s : ndarray, shape (n,)
         When a segment ends on the timeline; 0 for a rest's move.
     planned_s : ndarray, shape (n,)
-        How long a segment lasts.
+        How long a segment lasts; 0 for a rest's move.
     group : ndarray of int64, shape (n,)
     """
 
@@ -92,6 +92,10 @@ class Interleaved:
     end_s: NDArray[np.float64]
     planned_s: NDArray[np.float64]
     group: NDArray[np.int64]
+
+    def places_mm(self) -> NDArray[np.float64]:
+        """Return where the moves begin and end, shape (n + 1, 4): move i goes from i to i + 1."""
+        return np.concatenate([self.begin[None], self.position]) / UNITS_PER_MM
 
 
 def interleave(
@@ -106,42 +110,28 @@ def interleave(
         stretch that does not climb the height that it has. Segments that round to no motion give
         their time and filament to a neighbour.
     """
-    groups = timeline.groups
     # Where the file wants to be; a firmware that counts steps is there but for a part of a step.
     asked = to_units(np.vstack([piece.moves.start_mm[:1], piece.moves.end_mm]))
-    position = np.empty((len(segments), 4), np.int64)
-    grids = np.broadcast_to(np.asarray(grid, np.int64), 3)
-    round_ends(segments.end_mm, segments.group, grids, UNITS_PER_MM, position)
-    final = np.flatnonzero(np.append(segments.group[1:] != segments.group[:-1], True))
-    lasts = np.array([group.last for group in groups])
-    position[final] = asked[lasts[segments.group[final]]]
-    firsts = np.array([group.first for group in groups])
-    begins = asked[firsts]
-    # Where the file leaves Z alone nobody may name it: it may be off the grid, or not be known.
-    level = ~np.logical_or.reduceat(np.diff(asked[:, 2]) != 0, firsts)[segments.group]
-    position[level, 2] = begins[segments.group[level], 2]
-    end_s, keep = segments.end_s.copy(), np.ones(len(segments), dtype=bool)
-    merge_still(position, end_s, segments.group, begins, keep)
-
-    rests = [np.arange(g.first, g.last) for g in groups if g.rest]
-    rest_rows = np.concatenate(rests) if rests else np.zeros(0, np.int64)
-    rest_group = np.concatenate(
-        [np.full(g.last - g.first, i) for i, g in enumerate(groups) if g.rest]
-        or [np.zeros(0, np.int64)]
+    room = len(segments) + len(piece.moves)
+    row, group = np.empty((2, room), np.int64)
+    position = np.empty((room, 4), np.int64)
+    end_s, planned_s = np.empty((2, room))
+    n = lay_out(
+        segments.end_mm,
+        segments.end_s,
+        segments.group,
+        np.array([(g.first, g.last, g.rest) for g in timeline.groups], np.int64),
+        timeline.start_s,
+        asked,
+        np.broadcast_to(np.asarray(grid, np.int64), 3),
+        UNITS_PER_MM,
+        row,
+        position,
+        end_s,
+        planned_s,
+        group,
     )
-    rows = np.concatenate([np.full(int(keep.sum()), -1), rest_rows])
-    group = np.concatenate([segments.group[keep], rest_group])
-    order = np.argsort(group, kind="stable")
-    group, end_s = group[order], np.concatenate([end_s[keep], np.zeros(len(rest_rows))])[order]
-    same = np.append(False, group[1:] == group[:-1])
-    return Interleaved(
-        row=rows[order],
-        begin=asked[0],
-        position=np.concatenate([position[keep], asked[rest_rows + 1]])[order],
-        end_s=end_s,
-        planned_s=end_s - np.where(same, np.append(0.0, end_s[:-1]), timeline.start_s[group]),
-        group=group,
-    )
+    return Interleaved(row[:n], asked[0], position[:n], end_s[:n], planned_s[:n], group[:n])
 
 
 def limits_in_force(

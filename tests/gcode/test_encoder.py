@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware._encoding_kernels import merge_still
+from gcode.firmware._encoding_kernels import lay_out
 from gcode.firmware._writing_kernels import format_moves
 from gcode.firmware.klipper import encoder as encoder_module
 from gcode.firmware.planning import plan_moves
@@ -133,39 +133,75 @@ def test_plain_path_survives(machine: Machine) -> None:
 
 
 @settings(deadline=None, max_examples=60)
-@given(seed=st.integers(0, 2**31), n=st.integers(1, 30))
-def test_twin_of_merge_still(seed: int, n: int) -> None:
+@given(seed=st.integers(0, 2**31), level=st.booleans())
+def test_twin_of_lay_out(seed: int, level: bool) -> None:
+    """Small steps on a coarse grid, so that many segments round to no motion."""
     rng = np.random.default_rng(seed)
-    position = np.cumsum(rng.integers(0, 2, (n, 4)) * (rng.random((n, 1)) < 0.6), axis=0)
-    group = np.sort(rng.integers(0, 3, n))
-    begin = np.zeros((3, 4), np.int64)
-    for g in range(3):
-        first = int(np.searchsorted(group, g))
-        begin[g] = position[first - 1] if first else 0
-    end_s = np.cumsum(rng.random(n))
-    expected = still_merged(position.copy(), end_s.copy(), group, begin)
-    keep = np.ones(n, bool)
-    merge_still(position, end_s, group, begin, keep)
-    kept = [(tuple(p), t) for p, t, k in zip(position, end_s, keep, strict=True) if k]
-    assert kept == expected
+    grid = np.array([3, 2, 2])
+    groups = np.array([(0, 2, 0), (2, 3, 1), (3, 5, 1), (5, 6, 0), (6, 9, 0)])
+    asked = np.cumsum(rng.integers(0, 3, (10, 4)) * (rng.random((10, 1)) < 0.6), axis=0)
+    if level:
+        asked[:, 2] = 7
+    segment_group = np.repeat([0, 3, 4], rng.integers(0, 12, 3))
+    n = len(segment_group)
+    units = 2 * np.cumsum(rng.random((4, n)) * (rng.random(n) < 0.7), axis=1)
+    end_s, start_s = np.cumsum(rng.random(n)), rng.random(5)
+    room = n + 9
+    row, group = np.empty((2, room), np.int64)
+    position = np.empty((room, 4), np.int64)
+    move_end_s, planned_s = np.empty((2, room))
+    count = lay_out(
+        units / 1e6,
+        end_s,
+        segment_group,
+        groups,
+        start_s,
+        asked,
+        grid,
+        1e6,
+        row,
+        position,
+        move_end_s,
+        planned_s,
+        group,
+    )
+    expected = laid_out(units, end_s, segment_group, groups, start_s, asked, grid)
+    found = zip(row, position.tolist(), move_end_s, planned_s, group, strict=True)
+    assert list(found)[:count] == expected
 
 
-def still_merged(
-    position: np.ndarray, end_s: np.ndarray, group: np.ndarray, begin: np.ndarray
-) -> list[tuple[tuple[int, ...], float]]:
+def laid_out(
+    units: np.ndarray,
+    end_s: np.ndarray,
+    segment_group: np.ndarray,
+    groups: np.ndarray,
+    start_s: np.ndarray,
+    asked: np.ndarray,
+    grid: np.ndarray,
+) -> list[tuple[int, list[int], float, float, int]]:
+    """Rows (row, position, end, planned time, group) of the kernel, in plain words."""
     out = []
-    for g in np.unique(group):
-        at, kept = begin[g], []
-        rows = np.flatnonzero(group == g)
-        for i in rows:
-            moves = np.any(position[i, :3] != at[:3])
-            if moves or (i == rows[-1] and not kept and position[i, 3] != at[3]):
-                kept.append([position[i].copy(), end_s[i]])
-                at = position[i]
-            elif i == rows[-1] and kept:
-                kept[-1][0][3] = position[i, 3]
-                kept[-1][1] = end_s[i]
-        out += [(tuple(p), t) for p, t in kept]
+    for g, (first, last, rest) in enumerate(groups.tolist()):
+        if rest:
+            out += [(r, asked[r + 1].tolist(), 0.0, 0.0, g) for r in range(first, last)]
+            continue
+        ends = np.round(units[:, segment_group == g]).astype(np.int64).T
+        ends[:, :3] = grid * np.round(ends[:, :3] / grid).astype(np.int64)
+        ends[-1:] = asked[last]
+        if np.all(asked[first : last + 1, 2] == asked[first, 2]):
+            ends[:, 2] = asked[first, 2]
+        kept: list[tuple[list[int], float]] = []
+        at = asked[first].tolist()
+        times = end_s[segment_group == g]
+        for i, (end, time_s) in enumerate(zip(ends.tolist(), times, strict=True)):
+            final = i + 1 == len(ends)
+            if end[:3] != at[:3] or (final and not kept and end != at):
+                kept.append((end, time_s))
+                at = end
+            elif final and kept:
+                kept[-1] = ([*at[:3], end[3]], time_s)
+        begins = [start_s[g], *(time_s for _, time_s in kept)]
+        out += [(-1, end, t, t - b, g) for (end, t), b in zip(kept, begins, strict=False)]
     return out
 
 

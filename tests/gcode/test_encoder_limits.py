@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.firmware._encoding_kernels import round_ends
 from gcode.firmware.klipper._encoder_kernels import MOST_LOST, expected_braking
 from gcode.firmware.klipper._motion_kernels import move_limits
 
@@ -71,19 +70,3 @@ def test_expected_braking_is_that_of_planned_speeds() -> None:
     leave = np.append(np.minimum.reduce([v[:-1], v[1:], junction[1:]]) * ~stops[1:], 0.0)
     lost = np.minimum((v - leave) ** 2 / (2.0 * accel * v), MOST_LOST * planned)
     np.testing.assert_allclose(braking, np.where(ours, lost, 0.0), rtol=1e-12)
-
-
-def test_ends_are_rounded_but_for_the_last_of_a_group() -> None:
-    rng = np.random.default_rng(3)
-    end_mm = rng.normal(0.0, 100.0, (4, 60))
-    group = np.repeat([0, 2, 3], [20, 1, 39])
-    grid = np.array([1000, 12500, 1000])
-    position = np.empty((60, 4), np.int64)
-    round_ends(end_mm, group, grid, 1e6, position)
-    units = np.round(1e6 * end_mm.T).astype(np.int64)
-    final = [19, 20, 59]
-    np.testing.assert_array_equal(position[final], units[final])
-    np.testing.assert_array_equal(position[:, 3], units[:, 3])
-    inner = np.delete(np.arange(60), final)
-    wanted = grid * np.round(units[inner, :3] / grid).astype(np.int64)
-    np.testing.assert_array_equal(position[inner, :3], wanted)

@@ -110,9 +110,9 @@ class KlipperEncoder:
             When the firmware would refuse a move.
         """
         moves = interleave(piece, timeline, segments, self._grids)
-        rows, position = moves.row, moves.position
-        start = np.concatenate([moves.begin[None], position[:-1]])
-        start_mm, end_mm = start / UNITS_PER_MM, position / UNITS_PER_MM
+        rows = moves.row
+        places_mm = moves.places_mm()
+        start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
         limits_id, limits = limits_in_force(piece, rows, self._limits)
         length, accel, limit, junction, stops = self._motion(start_mm, end_mm, limits_id, limits)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from gcode.errors import GcodeError
 from gcode.firmware.advance import feed_at_ends, final_segments
 from gcode.firmware.encoding import (
-    UNITS_PER_MM,
     Encoded,
     as_moves,
     encoded_piece,
@@ -130,9 +129,9 @@ class RepRapEncoder:
         segments = self._advanced(piece, timeline, self._sparse(timeline, segments))
         segments = self._on_steps(timeline, segments)
         moves = interleave(piece, timeline, segments, 1)
-        rows, position = moves.row, moves.position
-        start = np.concatenate([moves.begin[None], position[:-1]])
-        start_mm, end_mm = start / UNITS_PER_MM, position / UNITS_PER_MM
+        rows = moves.row
+        places_mm = moves.places_mm()
+        start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
         limits_id, limits = limits_in_force(piece, rows, self._limits)
         length, accel, limit, junction = self._motion(start_mm, end_mm, limits_id, limits)
