@@ -10,6 +10,14 @@ from models.jit import kernel
 __all__ = ["format_moves", "printed_feedrate"]
 
 
+_LEADING = np.array([[*f"{n:<3}".encode(), len(str(n))] for n in range(1000)], np.uint8)
+"""Digits of 0 to 999 as they begin a number, and how many there are."""
+_TRAILING = np.array(
+    [[*b"%03d" % n, len((b"%03d" % n).rstrip(b"0"))] for n in range(1000)], np.uint8
+)
+"""The same with all three digits, and how many there are without trailing zeros."""
+
+
 @kernel(inline=True)
 def printed_feedrate(f: float) -> float:
     """F rounded to the decimals that `format_moves` prints: about six significant digits."""
@@ -17,40 +25,48 @@ def printed_feedrate(f: float) -> float:
     return max(float(np.round(f * digits)), 1.0) / digits
 
 
-@kernel
-def _put_fixed(buffer: NDArray[np.uint8], at: int, value: int, decimals: int) -> int:
-    """Write ``value / 10**decimals`` without trailing zeros; returns the next free byte."""
-    if value < 0:
+@kernel(force_inline=True, allocates=False)
+def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
+    """Write ``millionths / 1e6`` without trailing zeros; returns the next free byte.
+
+    Three digits at a time: which of them count is looked up as well, so that nothing depends on a
+    guess how long numbers are. Up to two more bytes are overwritten.
+    """
+    if millionths < 0:
         buffer[at] = 45
         at += 1
-        value = -value
-    scale = 1
-    for _ in range(decimals):
-        scale *= 10
-    whole = value // scale
-    fraction = value - whole * scale
-    digits = 1
-    power = 10
-    while whole >= power:
-        digits += 1
-        power *= 10
-    for k in range(digits):
-        buffer[at + digits - 1 - k] = 48 + whole % 10
-        whole //= 10
-    at += digits
+        millionths = -millionths
+    whole = millionths // 1_000_000
+    fraction = millionths - 1_000_000 * whole
+    if whole < 1000:
+        at = _put_three(buffer, at, _LEADING, whole)
+    else:
+        power = 1000
+        while whole // power >= 1000:
+            power *= 1000
+        at = _put_three(buffer, at, _LEADING, whole // power)
+        while power > 1:
+            power //= 1000
+            _put_three(buffer, at, _TRAILING, whole // power % 1000)
+            at += 3
     if fraction:
         buffer[at] = 46
-        at += 1
-        while fraction:
-            scale //= 10
-            digit = fraction // scale
-            buffer[at] = 48 + digit
-            at += 1
-            fraction -= digit * scale
+        thousandths = fraction // 1000
+        fraction -= 1000 * thousandths
+        behind = _put_three(buffer, at + 1, _TRAILING, thousandths)
+        at = _put_three(buffer, at + 4, _TRAILING, fraction) if fraction else behind
     return at
 
 
-@kernel
+@kernel(force_inline=True, allocates=False)
+def _put_three(buffer: NDArray[np.uint8], at: int, table: NDArray[np.uint8], number: int) -> int:
+    """Write the three bytes of a number below 1000; returns the byte behind those that count."""
+    for k in range(3):
+        buffer[at + k] = table[number, k]
+    return at + int(table[number, 3])
+
+
+@kernel(allocates=False)
 def format_moves(
     position: NDArray[np.int64],
     begin: NDArray[np.int64],
@@ -72,12 +88,12 @@ def format_moves(
     of move i ends, `extruded[i]` the extruder's position [mm] behind it as written.
     """
     at = 0
-    previous = begin.copy()
+    previous = begin
     rounding = 0.0
     last_f = -1.0
     for i in range(len(position)):
         if fixed[i]:
-            previous[:] = position[i]
+            previous = position[i]
             last_f = -1.0
             line_end[i] = at
             extruded[i] = 1e-6 * position[i, 3] - 1e-5 * rounding * extrude_factor[i]
@@ -91,23 +107,23 @@ def format_moves(
             if position[i, axis] != previous[axis]:
                 buffer[at] = 32
                 buffer[at + 1] = 88 + axis
-                at = _put_fixed(buffer, at + 2, position[i, axis] - origin[i, axis], 6)
+                at = _put_number(buffer, at + 2, position[i, axis] - origin[i, axis])
         wanted = (position[i, 3] - previous[3]) / (10.0 * extrude_factor[i]) + rounding
         written = np.int64(np.round(wanted))
         rounding = wanted - written
         if written != 0:
             buffer[at] = 32
             buffer[at + 1] = 69
-            at = _put_fixed(buffer, at + 2, int(written), 5)
+            at = _put_number(buffer, at + 2, 10 * int(written))
         f = feedrate[i] / speed_factor[i]
         if f != last_f:
             buffer[at] = 32
             buffer[at + 1] = 70
-            at = _put_fixed(buffer, at + 2, int(np.round(f * 1e5)), 5)
+            at = _put_number(buffer, at + 2, 10 * int(np.round(f * 1e5)))
             last_f = f
         buffer[at] = 10
         at += 1
-        previous[:] = position[i]
+        previous = position[i]
         line_end[i] = at
         extruded[i] = 1e-6 * position[i, 3] - 1e-5 * rounding * extrude_factor[i]
     return at

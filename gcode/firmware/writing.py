@@ -42,7 +42,10 @@ _FAR_MM = 10.0
 
 @dataclass(frozen=True, slots=True)
 class _Modes:
-    """Modal states of a piece's written moves: states[i] holds from move first[i] on."""
+    """Modal states of a piece's written moves: states[i] holds from move first[i] on.
+
+    They are the file's, but for X Y Z absolute and E relative, as our lines are.
+    """
 
     first: NDArray[np.int64]
     states: list[ModalState]
@@ -198,14 +201,19 @@ class StreamWriter:
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
     def _modes(self, piece: Piece, index: NDArray[np.int64]) -> _Modes:
-        """Return the file's modal state at every written move."""
+        """Return the modal state at every written move."""
         changes = piece.events.kind == EventKind.MODE
         first = np.concatenate([[0], index[changes]])
         states = [piece.modal_before]
         states += [piece.modal[int(m)] for m in piece.events.modal_id[changes]]
         # Of several changes at one place the last one counts.
         last = np.append(first[1:] != first[:-1], True)
-        return _Modes(first[last], [s for s, keep in zip(states, last, strict=True) if keep])
+        ours = [
+            replace(state, absolute_xyz=True, absolute_e=False)
+            for state, keep in zip(states, last, strict=True)
+            if keep
+        ]
+        return _Modes(first[last], ours)
 
     def _format(
         self, encoded: Encoded, modes: _Modes, index: NDArray[np.int64], kinds: NDArray[np.int8]
@@ -293,9 +301,8 @@ class StreamWriter:
         self._limits_now = limits
         return self._voice.limits(limits)
 
-    def _ours(self, limits: Limits, state: ModalState) -> bytes:
-        """Lines after which ours run under the stream's limits, X Y Z absolute and E relative."""
-        ours = replace(state, absolute_xyz=True, absolute_e=False)
+    def _ours(self, limits: Limits, ours: ModalState) -> bytes:
+        """Lines after which ours run under the stream's limits and in their modes."""
         text = self._limits_to(limits) + self._file_modes(ours)
         self._modal = ours
         if self._far_mm is not None:
@@ -327,6 +334,8 @@ class StreamWriter:
         """Lines that make the printer read as the file expects (not the feedrate)."""
         assert self._modal is not None
         now = self._modal
+        if (now.absolute_xyz, now.absolute_e) == (state.absolute_xyz, state.absolute_e):
+            return b""
         text = b""
         absolute_e = now.absolute_e
         if now.absolute_xyz != state.absolute_xyz:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -241,6 +243,25 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
     np.testing.assert_allclose(moves.end_mm[-n:, :3], position[:, :3] * 1e-6, atol=1e-9)
     np.testing.assert_allclose(moves.end_mm[-n:, 3], e * 1e-6, atol=1e-5)
     np.testing.assert_allclose(moves.speed_mm_s[-n:], feedrate / 60, rtol=1e-6)
+
+
+@pytest.mark.parametrize("top", [999, 10**6 + 1, 10**9, 10**14])
+def test_numbers_are_written_as_python_does(top: int) -> None:
+    """All digits but zeros behind the last one that counts."""
+    rng = np.random.default_rng(top)
+    millionths = rng.integers(-top, top, 200) * rng.choice([1, 10, 1000], 200)
+    n = len(millionths)
+    position = np.zeros((n, 4), np.int64)
+    position[:, 0] = millionths
+    buffer, nothing = np.empty(n * 96 + 16, np.uint8), np.zeros(n + 1, bool)
+    ones, origin = np.ones(n), np.zeros((n, 3), np.int64)
+    begin = np.array([top * 10**4, 0, 0, 0])
+    ends, extruded = np.empty(n, np.int64), np.empty(n)
+    used = format_moves(
+        position, begin, nothing[:n], nothing, ones, ones, ones, origin, buffer, ends, extruded
+    )
+    words = [line.split()[1] for line in buffer[:used].tobytes().decode().splitlines()]
+    assert words == [f"X{Decimal(int(m)) / 10**6:.6f}".rstrip("0").rstrip(".") for m in millionths]
 
 
 def test_stream_limits_are_the_machines(machine: Machine) -> None:
