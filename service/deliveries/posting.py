@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import ssl
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +22,8 @@ __all__ = ["Reply", "Unanswered", "Unreached", "get", "post"]
 _CONNECT_S = 10.0
 _LONGEST_REPLY_BYTES = 4096
 _SLOWEST = 3.0
-"""In how many times ``timeout_s`` the body of a reply must be there, if it comes in drops."""
+"""In how many times ``timeout_s`` the headers of a reply must be there, and then its body, if they
+come in drops."""
 
 
 class Unreached(Exception):
@@ -175,7 +179,17 @@ def _sent(
 ) -> Reply:
     import httpx2
 
-    response = client.send(request, stream=True)
+    late = f"its reply was not whole after {most_s:g} s"
+    limit = _HeaderLimit(most_s)
+    request.extensions["trace"] = limit
+    try:
+        response = client.send(request, stream=True)
+    except httpx2.HTTPError:
+        if limit.reached:
+            raise httpx2.ReadTimeout(late) from None
+        raise
+    finally:
+        limit.end()
     deadline = time.monotonic() + most_s
     try:
         start = b""
@@ -184,7 +198,41 @@ def _sent(
             if len(start) >= longest_bytes:
                 break
             if time.monotonic() > deadline:
-                raise httpx2.ReadTimeout(f"its reply was not whole after {most_s:g} s")
+                raise httpx2.ReadTimeout(late)
     finally:
         response.close()
     return Reply(response.status_code, start[:longest_bytes].decode("utf-8", "replace"))
+
+
+class _HeaderLimit:
+    """Hangs up if the headers of a reply are not there in time.
+
+    The client's own timeout begins anew with every byte. It tells what it does (httpcore's
+    extension ``trace``): what it is connected by, and when it begins to wait.
+    """
+
+    def __init__(self, most_s: float) -> None:
+        self.reached = False
+        self._most_s = most_s
+        self._connection: socket.socket | None = None
+        self._timer: threading.Timer | None = None
+
+    def __call__(self, event: str, info: Mapping[str, Any]) -> None:
+        if event in ("connection.connect_tcp.complete", "connection.start_tls.complete"):
+            self._connection = info["return_value"].get_extra_info("socket")
+        elif event == "http11.receive_response_headers.started":
+            self._timer = threading.Timer(self._most_s, self._hang_up)
+            self._timer.daemon = True
+            self._timer.start()
+
+    def end(self) -> None:
+        """Stop waiting: the headers are there, or will never be."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer.join()
+
+    def _hang_up(self) -> None:
+        self.reached = True
+        if self._connection is not None:
+            with contextlib.suppress(OSError):
+                self._connection.shutdown(socket.SHUT_RDWR)

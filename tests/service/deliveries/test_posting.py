@@ -11,9 +11,9 @@ from service.deliveries import posting
 from service.deliveries.targets import read_url
 
 
-@pytest.fixture
-def dripping():
-    """A server whose body comes one byte at a time, for ever."""
+@pytest.fixture(params=["body", "headers"])
+def dripping(request):
+    """A server whose body, or headers, come one byte at a time, for ever."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         over = threading.Event()
 
@@ -21,7 +21,9 @@ def dripping():
             connection, _ = server.accept()
             with connection:
                 connection.recv(65536)
-                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 4000\r\n\r\n")
+                whole = request.param == "body"
+                end = b"\r\n\r\n" if whole else b"\r\nX-Long: "
+                connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 4000" + end)
                 while not over.wait(0.02):
                     try:
                         connection.sendall(b"x")
