@@ -52,11 +52,14 @@ class Segments:
         Where it ends.
     group : ndarray of int64, shape (n,)
         The timeline's group it belongs to.
+    error_filter : ErrorFilter, optional
+        How the machine answers errors: for who moves the ends.
     """
 
     end_s: NDArray[np.float64]
     end_mm: NDArray[np.float64]
     group: NDArray[np.int64]
+    error_filter: ErrorFilter | None = None
 
     def __len__(self) -> int:
         return len(self.end_s)
@@ -74,8 +77,8 @@ class ErrorFilter:
     Notes
     -----
     `share` is how much of the tolerance is used: all of it up to a resonance of `FULL_GAIN`.
-    `answers` is for the kernel. The answer to an error e is direct e + sum of Re(weight x) with
-    x <- pole x + e; products of answers, summed up to their end, are geometric series.
+    The answer to an error e is direct e + sum of Re(weight x) with x <- pole x + e. `answers` is
+    for the kernel; products of answers, summed up to their end, are geometric series.
     """
 
     def __init__(self, plants: Sequence[DiscretePlant]) -> None:
@@ -90,6 +93,7 @@ class ErrorFilter:
             weight[i, : len(form)] = form[:, 2] + 1j * form[:, 3]
             if len(form) or plant.order == 0:
                 direct[i] = plant.d
+        self.pole, self.weight, self.direct = pole, weight, direct
         tables = [_tables(*axis) for axis in zip(pole, weight, direct, strict=True)]
         self.answers = Answers(pole, *(np.stack(table) for table in zip(*tables, strict=True)))
         self.share = float(np.clip(FULL_GAIN / _peak_gain(pole, weight, direct), 0.5, 1.0))
@@ -182,7 +186,9 @@ def fit_segments(
             n = _merge_crawl(end_s[count:], end_mm[:, count:], n, command_mm, dt, allowed)
         groups[count : count + n] = i
         count += n
-    return Segments(end_s[:count].copy(), end_mm[:, :count].copy(), groups[:count].copy())
+    return Segments(
+        end_s[:count].copy(), end_mm[:, :count].copy(), groups[:count].copy(), error_filter
+    )
 
 
 def _merge_crawl(

@@ -1,10 +1,14 @@
-"""Vertices for a firmware that executes no move of fewer than some steps.
+"""Vertices on whole steps that the printer's answer tells from the command as little as possible.
 
-Its next move takes those steps along. Where the command is slow or turns back, the fit's vertices
-lie nearer, and somebody has to choose: which of them to leave out, and where to put the others, so
-that the motion leaves the command by as little as possible. Distance squared adds up over segments,
-so the best choice is a shortest path (Viterbi, 1967) through every vertex at every place that is
-considered for it. A way is remembered with where it came from, to judge its turns.
+A place on whole steps lies up to half a step beside the command. When the motion passes there is
+free, though, so what counts is the distance across, and of the places around a command in motion
+one lies near it. Where none does, the errors are made to take turns, so that what the printer
+follows cancels. And where the firmware executes no move of fewer than some steps, somebody has to
+choose which vertices to leave out.
+
+The error of a segment moves the printer long after: so all of a stretch is one shortest path
+(Viterbi, 1967) over times and places, each carrying the printer's state. Of the ways that end at
+about one time only the best few are followed on.
 """
 
 from __future__ import annotations
@@ -15,19 +19,27 @@ import numpy as np
 
 from models.jit import kernel
 
-__all__ = ["choose_vertices", "hop", "nearly_back"]
+__all__ = ["MOST_PLACES", "choose_vertices", "hop", "list_places", "nearly_back"]
 
+MOST_PLACES = 25
+"""Places that are tried for a vertex in a slow place; in others it is `_PLACES`."""
+_PLACES = 8
 _BESIDE = 2
-"""A vertex is considered at its own place and up to so many strides beside it, in X and in Y."""
-_LOOK_BACK = 12
+_REACH = 2.0
+"""How much earlier or later a vertex may come, in samples."""
+_WAYS = 4
+"""Ways that are followed on from a vertex."""
+_LOOK_BACK, _LOOK_BACK_SLOW = 2, 4
 """Earlier vertices that a segment may come from, counted from the nearest that is far enough."""
-_LONG_S = 0.025
-_LONGEST_S = 1.0
-"""Longer segments are tried only where there is none shorter, and longer ones not at all: there the
-command moves by less than 0.1 mm/s."""
+_LONG, _LONGEST = 25.0, 1000.0
+"""Samples. Longer segments are tried only where there is none shorter, and longer ones not at all:
+there the command moves by less than 0.1 mm/s."""
+_SHORT = 0.5
 _NEARLY_BACK = 0.9999
-_JOLT_S = 0.02
-"""What makes steps of an excess of speed; large, so that there is none where that is possible."""
+_JOLT = 20.0
+"""Samples. What makes steps of an excess of speed; large, so that there is none where it can be."""
+_SEEN = 0.1
+"""What the square of an error counts by itself, that of the printer's answer being 1."""
 
 
 @kernel(inline=True)
@@ -45,196 +57,322 @@ def nearly_back(ax: float, ay: float, bx: float, by: float) -> bool:
 
 
 @kernel
-def choose_vertices(
-    place: Any,
-    fed: Any,
-    at_s: Any,
+def list_places(
+    at: Any,
+    wanted: Any,
     command: Any,
-    dt_s: float,
+    z: Any,
     least: int,
-    y_weight: float,
-    step_hz: Any,
     corexy: bool,
-    keep: Any,
-) -> bool:
-    """Choose and move the vertices of a stretch such that all are `least` steps apart.
+    low: Any,
+    high: Any,
+    slow: Any,
+    place: Any,
+    place_at: Any,
+    count: Any,
+) -> None:
+    """List for each vertex of a fit the places on whole steps to choose from, and when.
 
     Parameters
     ----------
-    place : ndarray of int64, shape (n, 3)
-        X Y Z in whole steps: where the stretch starts, and the fit's vertices. Those that are kept
-        are edited in place; the first and the last stay.
-    fed : ndarray, shape (n,)
-        Filament there, in lengths that count as much as a step of X.
-    at_s : ndarray, shape (n,)
+    at : ndarray, shape (n,)
+        Times of the start and of the vertices, in samples.
+    wanted : ndarray, shape (n, 2)
+        X and Y there, in steps.
     command : ndarray, shape (m, 3)
-        X and Y in steps and the filament at the times 0, dt_s, ...
+        X and Y in steps at the samples 0, 1, ...
+    z : ndarray of int64, shape (n,)
+    low, high : ndarray of int64, shape (2,)
+        Travel of X and Y.
+    slow : ndarray of bool, shape (n,)
+        Filled: a vertex or one beside it is nearer to its neighbour than `least` steps.
+    place : ndarray of int64, shape (n, MOST_PLACES, 2)
+    place_at : ndarray, shape (n, MOST_PLACES)
+    count : ndarray of int64, shape (n,)
+        Filled. The first and the last vertex have one place.
+    """
+    n = len(at)
+    slow[:] = False
+    nearest = np.round(wanted).astype(np.int64)
+    for k in range(1, n):
+        dx, dy = nearest[k, 0] - nearest[k - 1, 0], nearest[k, 1] - nearest[k - 1, 1]
+        if hop(dx, dy, z[k] - z[k - 1], corexy) < least:
+            slow[max(k - 2, 0) : k + 2] = True
+    for end in (0, n - 1):
+        place[end, 0] = nearest[end]
+        place_at[end, 0] = at[end]
+        count[end] = 1
+    beside = max(1, (least + 3) // 6)
+    miss = np.empty(MOST_PLACES)
+    for k in range(1, n - 1):
+        begin = at[k] + max(-_REACH, 0.5 * (at[k - 1] - at[k]))
+        end_ = at[k] + min(_REACH, 0.5 * (at[k + 1] - at[k]))
+        x, y = _at(command, end_)
+        x0, y0 = _at(command, begin)
+        vx, vy = (x - x0) / (end_ - begin), (y - y0) / (end_ - begin)
+        got = 0
+        if slow[k]:
+            for i in range(-_BESIDE, _BESIDE + 1):
+                for j in range(-_BESIDE, _BESIDE + 1):
+                    x, y = nearest[k, 0] + beside * i, nearest[k, 1] + beside * j
+                    if x < low[0] or x > high[0] or y < low[1] or y > high[1]:
+                        continue
+                    when, _ = _passing(command, x, y, at[k], begin, end_, vx, vy)
+                    place[k, got, 0], place[k, got, 1] = x, y
+                    place_at[k, got] = when
+                    got += 1
+            count[k] = got
+            continue
+        # Along the way, twice a step; half of the places on either side of it.
+        left = right = 0
+        tries = min(int(2.0 * (end_ - begin) * np.sqrt(vx * vx + vy * vy)) + 1, 24)
+        for i in range(tries + 1):
+            t = begin + (end_ - begin) * i / tries
+            x0, y0 = _at(command, t)
+            for corner in range(4):
+                x, y = int(np.floor(x0)) + corner // 2, int(np.floor(y0)) + corner % 2
+                if x < low[0] or x > high[0] or y < low[1] or y > high[1]:
+                    continue
+                known = False
+                for c in range(got):
+                    known = known or (place[k, c, 0] == x and place[k, c, 1] == y)
+                if known:
+                    continue
+                when, far = _passing(command, x, y, t, begin, end_, vx, vy)
+                on_left = far >= 0.0
+                to = got
+                if (left if on_left else right) == _PLACES // 2:
+                    worst = abs(far)
+                    to = -1
+                    for c in range(got):
+                        if (miss[c] >= 0.0) == on_left and abs(miss[c]) > worst:
+                            worst, to = abs(miss[c]), c
+                    if to < 0:
+                        continue
+                else:
+                    got += 1
+                    left, right = left + int(on_left), right + int(not on_left)
+                place[k, to, 0], place[k, to, 1] = x, y
+                place_at[k, to], miss[to] = when, far
+        count[k] = got
+
+
+@kernel
+def choose_vertices(
+    place: Any,
+    place_at: Any,
+    count: Any,
+    slow: Any,
+    z: Any,
+    fed: Any,
+    command: Any,
+    least: int,
+    y_weight: float,
+    step: Any,
+    corexy: bool,
+    pole: Any,
+    weight: Any,
+    direct: Any,
+    energy: Any,
+    chosen: Any,
+) -> bool:
+    """Choose the vertices of a stretch and their places, `least` steps or more apart.
+
+    Parameters
+    ----------
+    place, place_at, count, slow
+        From `list_places`.
+    z : ndarray of int64, shape (n,)
+    fed : ndarray, shape (n,)
+        Filament at the vertices, in lengths that count as much as a step of X.
+    command : ndarray, shape (m, 3)
+        X and Y in steps and the filament at the samples 0, 1, ...
     y_weight : float
         What a squared step of Y counts, one of X being 1.
-    step_hz : ndarray, shape (2,)
-        By how much the step rates of X and Y (of a CoreXY's motors) may step at a vertex, beyond
-        what rounding brings; more is made to cost much.
-    keep : ndarray of bool, shape (n,)
-        Filled.
+    step : ndarray, shape (2,)
+        By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
+        at a vertex, beyond what rounding brings; more is made to cost much.
+    pole, weight : ndarray, shape (2, 2 order)
+    direct : ndarray, shape (2,)
+        The printer's answer to an error e is direct e + sum of Re(weight x), x <- pole x + e, for
+        X and for Y; real and imaginary parts take turns.
+    energy : ndarray, shape (2, 2 order, 2 order)
+        Energy of what states answer from now on, as a quadratic form of their parts.
+    chosen : ndarray of int64, shape (n,)
+        Filled: the number of the vertex' place, -1 where it is left out.
 
     Returns
     -------
     bool
-        False: there is no such choice, and nothing was done.
+        False: there is no such choice.
 
     Notes
     -----
-    No segment goes straight back along the one before it, where vertices were moved. Vertices
-    that are far enough apart anyway stay as the fit has them.
+    No segment goes straight back along the one before it in a slow place.
     """
-    n = len(place)
-    side = 2 * _BESIDE + 1
-    beside = (side * side) // 2
-    stride = max(1, (least + 3) // 6)
-    near = _near_ones(place, least, corexy)
-    cost = np.full((n, side * side), np.inf)
-    came = np.full((n, side * side), -1, np.int32)
-    reached = np.zeros(n, np.bool_)
-    cost[0, beside], reached[0] = 0.0, True
-    gap = np.empty((2, side))
-    moment, origin = np.empty((3, 3)), np.empty(3)
+    n, order = len(place), pole.shape[1] // 2
+    width = 4 * order
+    cost = np.full((n, MOST_PLACES), np.inf)
+    rank = np.full((n, MOST_PLACES), np.inf)  # the cost and what is still to come of it
+    came = np.full((n, MOST_PLACES), -1, np.int64)
+    states = np.zeros((n, MOST_PLACES, width))
+    ways, n_ways = np.zeros((n, _WAYS), np.int64), np.zeros(n, np.int64)
+    cost[0, 0] = rank[0, 0] = 0.0
+    n_ways[0] = 1
+    x, kept = np.empty(width), np.empty(_WAYS)
     for k in range(1, n):
         last = k + 1 == n
-        moves_k = near[k] and not last
+        look_back = _LOOK_BACK_SLOW if slow[k] or slow[k - 1] else _LOOK_BACK
         found = 0
+        kept[:] = np.inf
         for j in range(k - 1, -1, -1):
-            span_s = at_s[k] - at_s[j]
-            if found > 0 and (found >= _LOOK_BACK or span_s > _LONG_S):
+            span = place_at[k, 0] - place_at[j, 0]
+            if found > 0 and (found >= look_back or span > _LONG):
                 break
-            if found > 0 and not (near[k] or near[j + 1]):
+            if span > _LONGEST and j + 1 < k:
                 break
-            if span_s > _LONGEST_S and j + 1 < k:
-                break
-            if not reached[j]:
-                continue
-            moves_j = near[j] and j > 0
             alone = last and j == 0  # a stretch shorter than the firmware's least
-            dx, dy = place[k, 0] - place[j, 0], place[k, 1] - place[j, 1]
-            dz = place[k, 2] - place[j, 2]
-            slack = stride * _BESIDE * (int(moves_k) + int(moves_j))
-            if not alone and hop(abs(dx) + slack, abs(dy) + slack, dz, corexy) < least:
-                continue
-            origin[0], origin[1], origin[2] = place[j, 0], place[j, 1], fed[j]
-            u2, uw, w2 = _moments(command, origin, at_s[j], at_s[k], dt_s, moment)
-            fed_gap = moment[2, 2] + (fed[k] - fed[j]) * (
-                (fed[k] - fed[j]) * w2 - 2.0 * moment[2, 1]
-            )
-            for d in range(side * side):
-                if cost[j, d] == np.inf:
+            careful = slow[k] or slow[j]
+            some = False
+            for way in range(n_ways[j]):
+                d = ways[j, way]
+                if cost[j, d] >= kept[_WAYS - 1]:
                     continue
-                begin = (stride * (d // side - _BESIDE), stride * (d % side - _BESIDE))
-                before = came[j, d]
-                ax, ay, before_s = 0.0, 0.0, 1.0
-                if before >= 0 and (moves_j or moves_k):
-                    i, b = before // (side * side), before % (side * side)
-                    ax = float(place[j, 0] + begin[0] - place[i, 0])
-                    ay = float(place[j, 1] + begin[1] - place[i, 1])
-                    before_s = at_s[j] - at_s[i]
-                    ax -= stride * (b // side - _BESIDE)
-                    ay -= stride * (b % side - _BESIDE)
-                for axis in range(2):
-                    # What is squared and added is q u + p w - r, with its ends q and p.
-                    q = float(begin[axis])
-                    to = dx if axis == 0 else dy
-                    rest = moment[axis, 2] + q * (q * u2 - 2.0 * moment[axis, 0])
-                    slope = 2.0 * (q * uw - moment[axis, 1])
-                    for c in range(side):
-                        p = float(to + stride * (c - _BESIDE))
-                        gap[axis, c] = rest + p * (slope + p * w2)
-                for c in range(side * side):
-                    if not moves_k and c != beside:
+                i = came[j, d]
+                from_x, from_y, begin = place[j, d, 0], place[j, d, 1], place_at[j, d]
+                ax, ay, rate_x, rate_y, rounding = 0.0, 0.0, 0.0, 0.0, 0.0
+                if i >= 0:
+                    h, b = i // MOST_PLACES, i % MOST_PLACES
+                    ax, ay = float(from_x - place[h, b, 0]), float(from_y - place[h, b, 1])
+                    rounding = 1.0 / (begin - place_at[h, b])
+                    rate_x, rate_y = ax * rounding, ay * rounding
+                for c in range(count[k]):
+                    # What would not be followed on need not be known.
+                    total, most = cost[j, d], min(rank[k, c], kept[_WAYS - 1])
+                    span = place_at[k, c] - begin
+                    if total >= most or span < _SHORT:
                         continue
-                    total = cost[j, d] + fed_gap + gap[0, c // side] + y_weight * gap[1, c % side]
-                    if total >= cost[k, c]:
+                    bx, by = float(place[k, c, 0] - from_x), float(place[k, c, 1] - from_y)
+                    if hop(bx, by, z[k] - z[j], corexy) < least and not alone:
                         continue
-                    bx = dx + stride * (c // side - _BESIDE) - begin[0]
-                    by = dy + stride * (c % side - _BESIDE) - begin[1]
-                    if hop(bx, by, dz, corexy) < least and not alone:
+                    per = 1.0 / span
+                    if careful and nearly_back(ax, ay, bx, by):
                         continue
-                    if ax != 0.0 or ay != 0.0:
-                        if nearly_back(ax, ay, float(bx), float(by)):
-                            continue
-                        total += _jolt(
-                            ax / before_s,
-                            ay / before_s,
-                            bx / span_s,
-                            by / span_s,
-                            1.0 / before_s + 1.0 / span_s,
-                            step_hz,
-                            corexy,
-                        )
-                        if total >= cost[k, c]:
-                            continue
-                    cost[k, c] = total
-                    came[k, c] = j * side * side + d
-                    reached[k] = True
-            if reached[k]:
-                found += 1
-    if not reached[n - 1]:
+                    jump = per + rounding
+                    total += _jolt(bx * per - rate_x, by * per - rate_y, jump, step, corexy)
+                    if last:
+                        total += _jolt(bx * per, by * per, per, step, corexy)
+                    for q in range(width):
+                        x[q] = states[j, d, q]
+                    s = int(np.ceil(begin + 1e-6))
+                    end = min(int(np.floor(place_at[k, c] + 1e-6)), len(command) - 1)
+                    fed_per = (fed[k] - fed[j]) * per
+                    while s <= end and total < most:
+                        t = s - begin
+                        for axis in range(2):
+                            start, leg = (from_x, bx) if axis == 0 else (from_y, by)
+                            error = start + leg * per * t - command[s, axis]
+                            answer = direct[axis] * error
+                            for r in range(0, 2 * order, 2):
+                                q = 2 * order * axis + r
+                                re, im = x[q], x[q + 1]
+                                answer += weight[axis, r] * re - weight[axis, r + 1] * im
+                                x[q] = pole[axis, r] * re - pole[axis, r + 1] * im + error
+                                x[q + 1] = pole[axis, r] * im + pole[axis, r + 1] * re
+                            square = answer * answer + _SEEN * error * error
+                            total += square if axis == 0 else y_weight * square
+                        gap = fed[j] + fed_per * t - command[s, 2]
+                        total += gap * gap
+                        s += 1
+                    later = 0.0
+                    if total < most:
+                        for axis in range(2):
+                            square = 0.0
+                            for r in range(2 * order):
+                                part = 0.0
+                                for q in range(2 * order):
+                                    part += energy[axis, r, q] * x[2 * order * axis + q]
+                                square += part * x[2 * order * axis + r]
+                            later += square if axis == 0 else y_weight * square
+                    if total + later < most:
+                        _keep(kept, rank[k, c], total + later)
+                        cost[k, c], rank[k, c] = total, total + later
+                        came[k, c] = j * MOST_PLACES + d
+                        for q in range(width):
+                            states[k, c, q] = x[q]
+                        some = True
+            found += int(some)
+        # The best first: then the others of a vertex are soon seen to be worse.
+        for way in range(_WAYS):
+            best = -1
+            for c in range(count[k]):
+                taken = False
+                for w_ in range(way):
+                    taken = taken or ways[k, w_] == c
+                if not taken and rank[k, c] < np.inf and (best < 0 or rank[k, c] < rank[k, best]):
+                    best = c
+            if best < 0:
+                break
+            ways[k, way] = best
+            n_ways[k] = way + 1
+    if n_ways[n - 1] == 0:
         return False
-    keep[:] = False
-    k, c = n - 1, beside
+    chosen[:] = -1
+    k, c = n - 1, 0
     while k > 0:
-        keep[k] = True
+        chosen[k] = c
         before = came[k, c]
-        place[k, 0] += stride * (c // side - _BESIDE)
-        place[k, 1] += stride * (c % side - _BESIDE)
-        k, c = before // (side * side), before % (side * side)
-    keep[0] = True
+        k, c = before // MOST_PLACES, before % MOST_PLACES
+    chosen[0] = 0
     return True
 
 
 @kernel(inline=True)
-def _jolt(
-    ax: float, ay: float, bx: float, by: float, rounding: float, most: Any, corexy: bool
-) -> float:
-    """Cost of a step of speed from a to b, steps/s, that is larger than a motor takes."""
-    dx, dy = abs(bx - ax), abs(by - ay)
+def _keep(kept: Any, old: float, new: float) -> None:
+    """Put a rank in the place of an older and larger one, or of the largest; they rise."""
+    at = len(kept) - 1
+    for i in range(len(kept)):
+        if kept[i] == old:
+            at = i
+            break
+    while at > 0 and kept[at - 1] > new:
+        kept[at] = kept[at - 1]
+        at -= 1
+    kept[at] = new
+
+
+@kernel(inline=True)
+def _jolt(dx: float, dy: float, rounding: float, most: Any, corexy: bool) -> float:
+    """Cost of a step of speed, steps per sample, that is larger than a motor takes."""
+    dx, dy = abs(dx), abs(dy)
     if corexy:
         dx = dy = dx + dy
         rounding *= 2.0
     excess = max(dx - most[0], dy - most[1]) - rounding
-    return (_JOLT_S * excess) ** 2 if excess > 0.0 else 0.0
-
-
-@kernel
-def _near_ones(place: Any, least: int, corexy: bool) -> Any:
-    """Vertices that are too near to a neighbour, and one more on either side of them."""
-    n = len(place)
-    near = np.zeros(n, np.bool_)
-    for k in range(1, n):
-        dx, dy = place[k, 0] - place[k - 1, 0], place[k, 1] - place[k - 1, 1]
-        if hop(dx, dy, place[k, 2] - place[k - 1, 2], corexy) < least:
-            near[max(k - 2, 0) : k + 2] = True
-    return near
+    return (_JOLT * excess) ** 2 if excess > 0.0 else 0.0
 
 
 @kernel(inline=True)
-def _moments(
-    command: Any, origin: Any, begin_s: float, end_s: float, dt_s: float, moment: Any
-) -> tuple[float, float, float]:
-    """Sum up over the samples of a segment: u u, u w, w w; and for each axis u r, w r, r r.
+def _at(command: Any, t: float) -> tuple[float, float]:
+    """Find X and Y between samples."""
+    k = min(max(int(t), 0), len(command) - 2)
+    w = t - k
+    return (
+        command[k, 0] + w * (command[k + 1, 0] - command[k, 0]),
+        command[k, 1] + w * (command[k + 1, 1] - command[k, 1]),
+    )
 
-    w rises from 0 to 1, u = 1 - w, and r is the command as seen from the origin.
-    """
-    first = int(np.ceil(begin_s / dt_s + 1e-6))
-    last = min(int(np.floor(end_s / dt_s + 1e-6)), len(command) - 1)
-    u2 = uw = w2 = 0.0
-    moment[:] = 0.0
-    for s in range(first, last + 1):
-        w = (s * dt_s - begin_s) / (end_s - begin_s)
-        u = 1.0 - w
-        u2 += u * u
-        uw += u * w
-        w2 += w * w
-        for axis in range(3):
-            r = command[s, axis] - origin[axis]
-            moment[axis, 0] += u * r
-            moment[axis, 1] += w * r
-            moment[axis, 2] += r * r
-    return u2, uw, w2
+
+@kernel(inline=True)
+def _passing(
+    command: Any, x: float, y: float, t: float, begin: float, end: float, vx: float, vy: float
+) -> tuple[float, float]:
+    """When the command, about v at t, is nearest to a place; how far, to the left above 0."""
+    square = vx * vx + vy * vy
+    x0, y0 = _at(command, t)
+    # At a creep, the nearest time says nothing.
+    if square > 0.0025:
+        t = min(max(t + ((x - x0) * vx + (y - y0) * vy) / square, begin), end)
+    x0, y0 = _at(command, t)
+    far = np.sqrt((x - x0) ** 2 + (y - y0) ** 2)
+    return t, far if vx * (y - y0) - vy * (x - x0) >= 0.0 else -far

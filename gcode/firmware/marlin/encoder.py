@@ -9,7 +9,6 @@ the filament (docs/marlin.md).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -36,9 +35,9 @@ from gcode.firmware.marlin._encoder_kernels import (
     spread_advance,
     thin,
 )
-from gcode.firmware.marlin._vertex_kernels import choose_vertices
 from gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from gcode.firmware.marlin.planner import Planner
+from gcode.firmware.marlin.vertices import Lattice, vertices_on_steps
 from gcode.firmware.planning import join_phases
 from gcode.pieces import Piece
 from gcode.segments import Segments
@@ -60,10 +59,6 @@ STREAM_Z_JERK_MM_S = 10.0
 
 _MOST_FEED = 3.0
 """Filament per mm, above which the firmware takes a move for a retraction and advances none."""
-_FILAMENT_MM = 0.01
-"""An error of the filament that counts as much as a step of X, where vertices are left out."""
-_CALM = 0.6
-"""Of the machine's step of speed: what makes up for lost time comes on top."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
@@ -112,6 +107,8 @@ class MarlinEncoder:
     corexy : bool
     speed_step_mm_s : float
         Largest step of a motor's speed.
+    travel_mm : sequence of (float, float), optional
+        Least and largest X, and Y.
     """
 
     def __init__(
@@ -121,11 +118,11 @@ class MarlinEncoder:
         *,
         corexy: bool,
         speed_step_mm_s: float = np.inf,
+        travel_mm: Sequence[tuple[float, float]] = ((-1e6, 1e6), (-1e6, 1e6)),
     ) -> None:
         self._firmware = firmware
         self._velocity = velocity_mm_s
         self._corexy = corexy
-        self._speed_step = speed_step_mm_s
         self._releases = firmware.variant in ("2.0", "2.1")
         scale = firmware.steps_per_mm
         self._scale = np.array([scale.x, scale.y, scale.z, scale.e])
@@ -134,11 +131,20 @@ class MarlinEncoder:
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
         self._burst = 0.5 * firmware.block_buffer_size
+        low_mm, high_mm = np.transpose(travel_mm)
+        self._lattice = Lattice(
+            per_mm=self._scale,
+            # The ends of the travel, but for the rounding of decimals.
+            low=np.ceil(low_mm * self._scale[:2] - 1e-6).astype(np.int64),
+            high=np.floor(high_mm * self._scale[:2] + 1e-6).astype(np.int64),
+            least=firmware.min_steps_per_segment,
+            corexy=corexy,
+            speed_step_mm_s=speed_step_mm_s,
+            moves_per_s=rate,
+        )
 
-    @property
-    def grid_mm(self) -> float:
-        """A step of X; where Y has others, its vertices are rounded to them afterwards."""
-        return 1.0 / float(self._scale[0])
+    grid_mm = 1e-3
+    """Much finer than a step, on which the encoder puts the vertices itself."""
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
         """First guess of the rests' durations: those of the original plan."""
@@ -264,72 +270,29 @@ class MarlinEncoder:
     def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
         """Put the vertices on whole steps, and leave out those that would be swallowed."""
         scale = self._scale[:3]
-        steps = np.round(segments.end_mm[:3].T * scale).astype(np.int64)
+        wish = vertices_on_steps(self._lattice, timeline, segments)
+        steps = np.round(wish.end_mm[:3].T * scale).astype(np.int64)
         begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
-        if self._firmware.min_steps_per_segment > 1:
-            chosen = self._chosen(timeline, segments, steps, begin)
-            steps = steps[chosen]
-            segments = Segments(
-                segments.end_s[chosen], segments.end_mm[:, chosen], segments.group[chosen]
-            )
-        keep = np.ones(len(segments), np.bool_)
+        keep = np.ones(len(wish), np.bool_)
         thin(
             steps,
             begin,
-            segments.end_s,
+            wish.end_s,
             timeline.start_s,
-            segments.group,
-            self._firmware.min_steps_per_segment,
+            wish.group,
+            self._lattice.least,
             self._rate,
             self._burst,
             self._corexy,
             keep,
         )
-        steps, group, end_mm = steps[keep], segments.group[keep], segments.end_mm[:, keep]
+        steps, group, end_mm = steps[keep], wish.group[keep], wish.end_mm[:, keep]
         if self._releases and self._firmware.junction == "deviation":
-            wish = end_mm[:2].T * scale[:2]
-            least = self._firmware.min_steps_per_segment
-            bend_reversals(steps, begin, group, wish, least, self._corexy)
+            places = end_mm[:2].T * scale[:2]
+            bend_reversals(steps, begin, group, places, self._lattice.least, self._corexy)
         last = np.append(group[1:] != group[:-1], True)
         end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
-        return Segments(segments.end_s[keep], end_mm, group)
-
-    def _chosen(
-        self,
-        timeline: Timeline,
-        segments: Segments,
-        steps: NDArray[np.int64],
-        begin: NDArray[np.int64],
-    ) -> NDArray[np.bool_]:
-        """Tell which vertices to keep, and move them in place, so that none is swallowed."""
-        scale, dt_s = self._scale, timeline.dt_s
-        per_mm = np.array([scale[0], scale[1], 1.0 / _FILAMENT_MM])
-        keep = np.ones(len(segments), np.bool_)
-        firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
-        for first, stop in itertools.pairwise((*firsts, len(segments))):
-            group = segments.group[first]
-            start_s, start_mm = timeline.start_s[group], timeline.group_start_mm[group, [0, 1, 3]]
-            at_s = np.append(0.0, segments.end_s[first:stop] - start_s)
-            place = np.vstack([begin[group], steps[first:stop]])
-            fitted = np.column_stack([start_mm, segments.end_mm[[0, 1, 3], first:stop]])
-            fitted *= per_mm[:, None]
-            t_s = dt_s * np.arange(int(at_s[-1] / dt_s) + 1)
-            command = np.column_stack([np.interp(t_s, at_s, row) for row in fitted])
-            kept = np.ones(len(place), np.bool_)
-            if choose_vertices(
-                place,
-                fitted[2],
-                at_s,
-                command,
-                dt_s,
-                self._firmware.min_steps_per_segment,
-                (scale[0] / scale[1]) ** 2,
-                _CALM * self._speed_step * scale[:2],
-                self._corexy,
-                kept,
-            ):
-                steps[first:stop], keep[first:stop] = place[1:], kept[1:]
-        return keep
+        return Segments(wish.end_s[keep], end_mm, group)
 
     def _blocks(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]

@@ -51,6 +51,8 @@ class MarlinKit:
         self._velocity = machine.command.velocity_mm_s
         self._speed_step = machine.command.speed_step_mm_s
         self._mesh_slope = machine.mesh_slope
+        x, y = machine.travel["x"], machine.travel["y"]
+        self._travel_mm = ((x.min_mm, x.max_mm), (y.min_mm, y.max_mm))
         scale = firmware.steps_per_mm
         self.step_mm = (1.0 / scale.x, 1.0 / scale.y, 1.0 / scale.z, 1.0 / scale.e)
         self.shortest_move_mm = firmware.min_steps_per_segment * max(self.step_mm[:2])
@@ -151,6 +153,7 @@ class MarlinKit:
             self._velocity,
             corexy=self._corexy,
             speed_step_mm_s=self._speed_step,
+            travel_mm=self._travel_mm,
         )
 
     def voice(self) -> MarlinVoice:

@@ -1,0 +1,208 @@
+"""The vertices of a stream on whole steps: which ones, where and when.
+
+`_vertex_kernels.py` says how they are chosen.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.marlin._vertex_kernels import MOST_PLACES, choose_vertices, list_places
+from gcode.segments import ErrorFilter, Segments
+from gcode.timeline import Timeline
+
+__all__ = ["Lattice", "vertices_on_steps"]
+
+_FILAMENT_MM = 0.01
+"""An error of the filament that counts as much as a step of X."""
+_CALM = 0.6
+"""Of the machine's step of speed: what makes up for lost time comes on top."""
+_OFTEN_S = 4e-3
+"""Straight lines get a vertex that often, to lie on the command in the mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """Where a machine's vertices may lie, and what its moves must be like.
+
+    Attributes
+    ----------
+    per_mm : ndarray, shape (4,)
+        Steps per mm of X Y Z E.
+    low, high : ndarray of int64, shape (2,)
+        First and last step of X and Y.
+    least : int
+        Fewest steps of a move.
+    corexy : bool
+    speed_step_mm_s : float
+        Largest step of a motor's speed.
+    moves_per_s : float
+        As many moves come in.
+    """
+
+    per_mm: NDArray[np.float64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    least: int
+    corexy: bool
+    speed_step_mm_s: float
+    moves_per_s: float
+
+
+def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) -> Segments:
+    """Choose vertices in whole steps of X and Y near those of a fit.
+
+    Parameters
+    ----------
+    lattice : Lattice
+    timeline : Timeline
+    segments : Segments
+        Fitted much finer than the steps. Where they have no `error_filter`, all errors count alike.
+
+    Returns
+    -------
+    Segments
+        The last vertex of a stretch stays where it is. All moves have `lattice.least` steps, but
+        for a stretch where there is no such choice: its vertices are rounded.
+    """
+    answers = _Answers.of(segments.error_filter)
+    firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
+    end_s, end_mm, groups = [], [], []
+    for first, stop in itertools.pairwise((*firsts.tolist(), len(segments))):
+        group = int(segments.group[first])
+        at_s = np.append(timeline.start_s[group], segments.end_s[first:stop])
+        at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, first:stop].T])
+        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answers)
+        end_s.append(at_s[1:])
+        end_mm.append(at_mm[1:])
+        groups.append(np.full(len(at_s) - 1, group, np.int64))
+    if not end_s:
+        return segments
+    return replace(
+        segments,
+        end_s=np.concatenate(end_s),
+        end_mm=np.concatenate(end_mm).T.copy(),
+        group=np.concatenate(groups),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Answers:
+    """An `ErrorFilter` in real numbers, as `choose_vertices` takes it."""
+
+    pole: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    direct: NDArray[np.float64]
+    energy: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, answer: ErrorFilter | None) -> _Answers:
+        pole, weight, direct = np.zeros((2, 1), complex), np.zeros((2, 1), complex), np.ones(2)
+        if answer is not None:
+            pole, weight, direct = answer.pole, answer.weight, answer.direct
+        # The sum over k of Re(w_a p_a^k x_a) Re(w_b p_b^k x_b) is half of
+        # Re(x_a (plain_ab x_b + crossed_ab conj x_b)), with x = 1 and x = i for the two parts.
+        energy = []
+        for p, w in zip(pole, weight, strict=True):
+            plain = 0.5 * np.outer(w, w) / (1.0 - np.outer(p, p))
+            crossed = 0.5 * np.outer(w, w.conj()) / (1.0 - np.outer(p, p.conj()))
+            unit = np.kron(np.eye(len(p)), [1.0, 1j])
+            form = (unit.T @ (plain @ unit + crossed @ unit.conj())).real
+            energy.append(0.5 * (form + form.T))
+        return cls(_parts(pole), _parts(weight), np.asarray(direct), np.stack(energy))
+
+
+def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(values, dtype=complex).view(np.float64)
+
+
+def _chosen(
+    lattice: Lattice,
+    dt_s: float,
+    at_s: NDArray[np.float64],
+    at_mm: NDArray[np.float64],
+    answers: _Answers,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
+    at_s, at_mm = _often(lattice, at_s, at_mm)
+    n = len(at_s)
+    scale = lattice.per_mm
+    # From near the start: sums of squares of large numbers would lose digits.
+    origin = np.round(at_mm[0, :2] * scale[:2]).astype(np.int64)
+    origin_mm = np.array([*(origin / scale[:2]), 0.0, at_mm[0, 3]])
+    near_mm = at_mm - origin_mm
+    steps = np.column_stack([near_mm[:, :2] * scale[:2], near_mm[:, 3] / _FILAMENT_MM])
+    z = np.round(at_mm[:, 2] * scale[2]).astype(np.int64)
+    first = np.floor(at_s[0] / dt_s)
+    at = at_s / dt_s - first
+    k = np.arange(int(np.ceil(at[-1])) + 2, dtype=np.float64)
+    command = np.column_stack([np.interp(k, at, row) for row in steps.T])
+    slow, count = np.zeros(n, np.bool_), np.zeros(n, np.int64)
+    place, place_at = np.zeros((n, MOST_PLACES, 2), np.int64), np.zeros((n, MOST_PLACES))
+    list_places(
+        at,
+        steps[:, :2].copy(),
+        command,
+        z,
+        lattice.least,
+        lattice.corexy,
+        lattice.low - origin,
+        lattice.high - origin,
+        slow,
+        place,
+        place_at,
+        count,
+    )
+    chosen = np.zeros(n, np.int64)
+    if not choose_vertices(
+        place,
+        place_at,
+        count,
+        slow,
+        z,
+        steps[:, 2].copy(),
+        command[: int(np.floor(at[-1] + 1e-6)) + 1],
+        lattice.least,
+        float((scale[0] / scale[1]) ** 2),
+        _CALM * lattice.speed_step_mm_s * scale[:2] * dt_s,
+        lattice.corexy,
+        answers.pole,
+        answers.weight,
+        answers.direct,
+        answers.energy,
+        chosen,
+    ):
+        at_mm[1:-1, :2] = np.round(at_mm[1:-1, :2] * scale[:2]) / scale[:2]
+        return at_s, at_mm
+    keep = np.flatnonzero(chosen >= 0)
+    which = chosen[keep]
+    at_kept = place_at[keep, which]
+    kept_mm = np.column_stack([np.interp(at_kept, at, row) for row in at_mm.T])
+    kept_mm[:, :2] = (place[keep, which] + origin) / scale[:2]
+    kept_mm[[0, -1]] = at_mm[[0, -1]]
+    kept_s = (at_kept + first) * dt_s
+    kept_s[[0, -1]] = at_s[[0, -1]]
+    return kept_s, kept_mm
+
+
+def _often(
+    lattice: Lattice, at_s: NDArray[np.float64], at_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Put vertices between those of a fit, where both they and the lines have room for them."""
+    way = np.abs(np.diff(at_mm, axis=0)) * lattice.per_mm
+    hops = way[:, 0] + way[:, 1] if lattice.corexy else np.maximum(way[:, 0], way[:, 1])
+    often_s = max(_OFTEN_S, 2.0 / lattice.moves_per_s)
+    parts = np.ceil(np.minimum(np.diff(at_s) / often_s - 1e-9, hops / (2.0 * lattice.least)))
+    parts = np.maximum(parts, 1.0).astype(np.int64)
+    index = np.arange(len(at_s), dtype=np.float64)
+    before = np.repeat(index[:-1], parts)
+    part = np.arange(len(before)) - np.repeat(np.cumsum(parts) - parts, parts)
+    finer = np.append(before + part / np.repeat(parts, parts), index[-1])
+    return (
+        np.interp(finer, index, at_s),
+        np.column_stack([np.interp(finer, index, row) for row in at_mm.T]),
+    )
