@@ -18,7 +18,6 @@ from gcode._motion_kernels import move
 from gcode._plain_kernels import decimal, line_end, may_be_mark, plain
 from gcode._slots import (
     DONE,
-    F_LIMITS,
     FULL,
     GROW,
     HANDBACK,
@@ -53,7 +52,7 @@ from gcode._slots import (
     MEMO_STRIDE,
     OK,
 )
-from gcode._table_kernels import line_hash, memo_slot, note_limits, put_event, settle
+from gcode._table_kernels import line_hash, memo_slot, put_event, recall_limits, settle
 from models.bytes import byte_at
 from models.jit import kernel
 
@@ -65,7 +64,7 @@ _POWERS = 10.0 ** np.arange(23)
 _MOVES = 22  # actions 20 to 22 are G0 to G3
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
 def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: Any) -> int:
     """Do what the line did when Python carried it out; HANDBACK if it is not remembered."""
     slot = memo_slot(tables.memo_keys, line_hash(buf, start, stop))
@@ -74,26 +73,17 @@ def recall(buf: Any, start: int, stop: int, f: Any, i: Any, rows: Any, tables: A
     what = tables.memo_values[slot] // MEMO_STRIDE
     value = tables.memo_values[slot] % MEMO_STRIDE
     kind = _HARMLESS
-    if what == MEMO_EVENT:
-        kind = value
-        if kind == _UNKNOWN:
-            settle(f, i, rows)
-            i[I_KNOWN] = 0
-    elif what == MEMO_LIMITS:
+    if what == MEMO_LIMITS:
         kind = _LIMITS
-        changed = False
-        for k in range(tables.memo_limits.shape[1]):
-            limit = tables.memo_limits[value, k]
-            if limit == limit and limit != f[F_LIMITS + k]:
-                if not changed:
-                    settle(f, i, rows)
-                f[F_LIMITS + k] = limit
-                changed = True
-        if changed:
-            note_limits(f, i, tables)
+        recall_limits(value, f, i, rows, tables)
+    elif what == MEMO_EVENT and value != _UNKNOWN:
+        kind = value
     else:
         settle(f, i, rows)
-        if what == MEMO_LAYER:
+        if what == MEMO_EVENT:
+            kind = _UNKNOWN
+            i[I_KNOWN] = 0
+        elif what == MEMO_LAYER:
             i[I_LAYER] += 1
         elif what == MEMO_FEATURE:
             i[I_FEATURE] = value - 1

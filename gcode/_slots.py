@@ -58,6 +58,8 @@ I_FILLED_MOVES = 24  # rows whose slow columns `settle` has filled
 I_FILLED_EVENTS = 25
 I_PLAIN = 26  # the kernel of plain lines may run
 I_MOTION = 27  # last of G0 to G3, for lines without a command; -1: none
+I_LIMITED_MOVES = 28  # rows whose limits `settle_limits` has filled
+I_LIMITED_EVENTS = 29
 # Rules of the dialect
 I_E_RULE = 30
 I_ARC_RULE = 31

@@ -1,8 +1,8 @@
 """Kernels for what the interpreter writes down: lines to remember, limits, modes, moves, events.
 
 Rows are written in two steps. What differs from row to row is written at once; what stays the same
-over many rows (modes, limits, layer, feature, object, tool) is filled in by `settle` whenever it is
-about to change.
+over many rows (modes, layer, feature, object, tool) is filled in by `settle` whenever it is about
+to change, and the limits, which change most often, by `settle_limits`.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ from gcode._slots import (
     I_KEPT,
     I_KNOWN,
     I_LAYER,
+    I_LIMITED_EVENTS,
+    I_LIMITED_MOVES,
     I_LIMITS_ID,
     I_LINE,
     I_MODAL_ID,
@@ -60,6 +62,7 @@ from gcode._slots import (
     M_STOP,
     M_TOOL,
 )
+from models.bytes import word_at
 from models.jit import kernel
 
 
@@ -155,6 +158,8 @@ class Tables(NamedTuple):
     memo_values: NDArray[np.int64]
     memo_limits: NDArray[np.float64]
     """Limits that remembered lines set; NaN: left alone."""
+    memo_after: NDArray[np.int32]
+    """The row of `limits` that such a line was last found with, and the one it led to."""
     g_words: NDArray[np.int8]
     """What G0 to G1023 are: an `EventKind`, an `Action` or -1."""
     m_words: NDArray[np.int8]
@@ -165,19 +170,27 @@ class Tables(NamedTuple):
 _KEPT = 8
 _FNV_OFFSET = 1469598103934665603
 _FNV_PRIME = 1099511628211
+_HASH_PRIME, _ONE, _29 = np.uint64(0x9E3779B97F4A7C15), np.uint64(1), np.uint64(29)
 
 
 @kernel(allocates=False)
 def line_hash(text: Any, start: int, stop: int) -> int:
-    """Hash the bytes (FNV-1a) to a positive int64."""
-    h = np.int64(_FNV_OFFSET)
-    for p in range(start, stop):
-        h = (h ^ np.int64(text[p])) * np.int64(_FNV_PRIME)
-    h = h & np.int64(0x7FFFFFFFFFFFFFFF)
-    return int(h) if h != 0 else 1
+    """Hash the bytes to a positive int64; behind them there must be room of 8 bytes.
+
+    As FNV-1a does, but eight bytes at a time: no two texts of up to eight have the same hash but
+    for the bit of the sign.
+    """
+    h = np.uint64(stop - start)
+    for p in range(start, stop, 8):
+        word = word_at(text, p)
+        if stop - p < 8:
+            word &= (_ONE << np.uint64(8 * (stop - p))) - _ONE
+        h = (h ^ word) * _HASH_PRIME
+        h ^= h >> _29
+    return max(int(np.int64(h) & np.int64(0x7FFFFFFFFFFFFFFF)), 1)
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
 def memo_slot(keys: Any, h: int) -> int:
     """Find the slot of a remembered line, or the free slot where it belongs."""
     mask = len(keys) - 1
@@ -242,7 +255,7 @@ def settle(f: Any, i: Any, rows: Any) -> None:
         if f[F_UNIT_MM] != 1.0 or f[F_UNIT_E_MM] != 1.0:
             kept = _KEPT  # a stream in millimetres would not fit in
         known = i[I_KNOWN] | kept
-        limits, modal, layer = i[I_LIMITS_ID], i[I_MODAL_ID], i[I_LAYER]
+        modal, layer = i[I_MODAL_ID], i[I_LAYER]
         feature, thing, tool = i[I_FEATURE], i[I_OBJECT], i[I_TOOL]
         if a == 0:
             for k in range(4):
@@ -257,7 +270,6 @@ def settle(f: Any, i: Any, rows: Any) -> None:
             f[F_RUN + k] = real[4 * b + k]
         for n in range(a, b):
             tiny[M_KNOWN, n] = known
-            small[M_LIMITS, n] = limits
             small[M_MODAL, n] = modal
             small[M_LAYER, n] = layer
             small[M_FEATURE, n] = feature
@@ -269,12 +281,22 @@ def settle(f: Any, i: Any, rows: Any) -> None:
     a, b = i[I_FILLED_EVENTS], i[I_EVENTS]
     if a < b:
         dwells = 9 * small.shape[1] + 4
-        limits, modal = i[I_LIMITS_ID], i[I_MODAL_ID]
+        modal = i[I_MODAL_ID]
         for n in range(a, b):
-            small[E_LIMITS, n] = limits
             small[E_MODAL, n] = modal
             rows.real[dwells + n] = 0.0
         i[I_FILLED_EVENTS] = b
+
+
+@kernel(force_inline=True, allocates=False)
+def settle_limits(i: Any, rows: Any) -> None:
+    """Fill the limits of the rows written since the last time."""
+    small, limits = rows.small, i[I_LIMITS_ID]
+    for n in range(i[I_LIMITED_MOVES], i[I_MOVES]):
+        small[M_LIMITS, n] = limits
+    for n in range(i[I_LIMITED_EVENTS], i[I_EVENTS]):
+        small[E_LIMITS, n] = limits
+    i[I_LIMITED_MOVES], i[I_LIMITED_EVENTS] = i[I_MOVES], i[I_EVENTS]
 
 
 @kernel(allocates=False)
@@ -296,19 +318,42 @@ def note_modal(f: Any, i: Any, tables: Any) -> None:
 
 
 @kernel(allocates=False)
-def note_limits(f: Any, i: Any, tables: Any) -> None:
-    """Enter the planner's limits in their table; the rows before them must be settled."""
-    rows, count = tables.limits, i[I_N_LIMITS]
-    for k in range(rows.shape[1]):
-        rows[count, k] = f[F_LIMITS + k]
-    if count > 0 and _same(rows, i[I_LIMITS_ID], count):
+def note_limits(f: Any, i: Any, rows: Any, tables: Any) -> None:
+    """Enter the limits in their table; the rows before them get those that were in force."""
+    table, count = tables.limits, i[I_N_LIMITS]
+    for k in range(table.shape[1]):
+        table[count, k] = f[F_LIMITS + k]
+    if count > 0 and _same(table, i[I_LIMITS_ID], count):
         return
-    number = intern_row(rows, tables.limits_index, count)
+    settle_limits(i, rows)
+    number = intern_row(table, tables.limits_index, count)
     i[I_N_LIMITS] = max(count, number + 1)
     i[I_LIMITS_ID] = number
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
+def recall_limits(line: int, f: Any, i: Any, rows: Any, tables: Any) -> None:
+    """Set the limits that a remembered line sets.
+
+    Slicers change the same few limits to and fro, so the row that it led to the last time is most
+    often the one again.
+    """
+    before, after = i[I_LIMITS_ID], tables.memo_after
+    if after[line, 0] != before:
+        for k in range(tables.limits.shape[1]):
+            limit = tables.memo_limits[line, k]
+            if limit == limit:
+                f[F_LIMITS + k] = limit
+        note_limits(f, i, rows, tables)
+        after[line, 0], after[line, 1] = before, i[I_LIMITS_ID]
+    elif after[line, 1] != before:
+        settle_limits(i, rows)
+        i[I_LIMITS_ID] = after[line, 1]
+        for k in range(tables.limits.shape[1]):
+            f[F_LIMITS + k] = tables.limits[after[line, 1], k]
+
+
+@kernel(force_inline=True, allocates=False)
 def put_event(i: Any, rows: Any, kind: int) -> None:
     """Write the line in hand as an event."""
     n = i[I_EVENTS]

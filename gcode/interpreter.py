@@ -383,7 +383,8 @@ class Interpreter:
             if i[at.I_EVENTS] > events:
                 worst = max(worst, EventKind(int(state.rows.tiny[at.E_KIND, events])))
         i[at.I_EVENTS] = events
-        i[at.I_FILLED_EVENTS] = min(int(i[at.I_FILLED_EVENTS]), events)
+        for filled in (at.I_FILLED_EVENTS, at.I_LIMITED_EVENTS):
+            i[filled] = min(int(i[filled]), events)
         state.settle()
         if i[at.I_MOVES] > moves:
             state.rows.tiny[at.M_KNOWN, moves : int(i[at.I_MOVES])] &= KEPT

@@ -25,6 +25,7 @@ from gcode._table_kernels import (
     note_modal,
     put_event,
     settle,
+    settle_limits,
 )
 from gcode.dialect import Dialect
 from gcode.errors import GcodeError
@@ -125,6 +126,7 @@ class MachineState:
             np.zeros(_MEMOS, np.int64),
             np.zeros(_MEMOS, np.int64),
             np.full((_MEMOS // 2, len(row)), np.nan),
+            np.full((_MEMOS // 2, 2), -1, np.int32),
             dialect.table("G"),
             dialect.table("M"),
             np.full(_LAYERS, np.nan),
@@ -222,6 +224,7 @@ class MachineState:
     def settle(self) -> None:
         """Fill the rows before something changes that many rows share."""
         settle(self.f, self.i, self.rows)
+        settle_limits(self.i, self.rows)
 
     def note_modal(self) -> None:
         """Enter the modes that have changed."""
@@ -230,8 +233,7 @@ class MachineState:
 
     def note_limits(self) -> None:
         """Enter the limits that have changed."""
-        self.settle()
-        note_limits(self.f, self.i, self.tables)
+        note_limits(self.f, self.i, self.rows, self.tables)
 
     def limit(self, name: str) -> float:
         """Return a limit in force."""
@@ -254,9 +256,8 @@ class MachineState:
             self.tables.memo_limits[self.memo_limits] = row
             if self.remember(command, at.MEMO_LIMITS, self.memo_limits):
                 self.memo_limits += 1
-        self.settle()
         limits[:] = np.where(np.isnan(row), limits, row)
-        note_limits(self.f, self.i, self.tables)
+        note_limits(self.f, self.i, self.rows, self.tables)
         return self.event(kind)
 
     def remember(self, command: Command, what: int, value: int) -> bool:
@@ -338,7 +339,7 @@ class MachineState:
         self.rows = Rows.empty(count)
         i = self.i
         i[at.I_MOVES] = i[at.I_EVENTS] = i[at.I_FILLED_MOVES] = i[at.I_FILLED_EVENTS] = 0
-        i[at.I_APART] = 0
+        i[at.I_LIMITED_MOVES] = i[at.I_LIMITED_EVENTS] = i[at.I_APART] = 0
 
     def grow_tables(self) -> None:
         """Make the tables larger that are full."""
@@ -366,6 +367,7 @@ class MachineState:
         limits, limits_index = _begun(tables.limits[i[at.I_LIMITS_ID]])
         i[at.I_N_MODAL] = i[at.I_N_LIMITS] = 1
         i[at.I_MODAL_ID] = i[at.I_LIMITS_ID] = 0
+        tables.memo_after[:] = -1
         self.tables = tables._replace(
             modal=modal, modal_index=modal_index, limits=limits, limits_index=limits_index
         )

@@ -89,6 +89,26 @@ def test_limits(golden_machine: Machine) -> None:
     assert after[-1].minimum_cruise_ratio == 0
 
 
+def test_limits_of_remembered_lines(golden_machine: Machine) -> None:
+    """A line that comes again sets what it set the first time, whatever was in force before it."""
+    accels = [800, 4000, 800, 800, 1500, 4000, 800, 1500, 800]
+    velocities = [100, 100, 200, 100, 200, 200, 100, 100, 200]
+
+    def limits_of(numbered: bool) -> list[tuple[list[object], list[object]]]:
+        lines = ["G28", "G1 X1 Y1 Z1 F600"]
+        for k, (accel, velocity) in enumerate(zip(accels, velocities, strict=True)):
+            note = f" ; {k}" if numbered else ""  # such a line has never been seen before
+            lines += [f"M204 S{accel}{note}", f"SET_VELOCITY_LIMIT VELOCITY={velocity}{note}"]
+            lines += [";TYPE:Perimeter", f"G1 X{k + 2}"] * (k % 3 > 0)
+        blocks = interpret_bytes("\n".join(lines).encode(), golden_machine)
+        return [
+            ([b.limits[n] for n in b.moves.limits_id], [b.limits[n] for n in b.events.limits_id])
+            for b in blocks
+        ]
+
+    assert limits_of(numbered=False) == limits_of(numbered=True)
+
+
 def test_quarter_arc_and_circle(golden_machine: Machine) -> None:
     block = run("G28\nG1 X10\nM83\nG3 X0 Y10 Z1 I-10 J0 E2\n", golden_machine)
     arc = block.moves.end_mm[1:]
