@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["advance_state", "run_windows"]
+__all__ = ["advance_state", "advance_window", "run_windows"]
 
 _NOTHING = 1e-100
 
@@ -28,20 +28,37 @@ def run_windows(
     `command_drive` and `state_drive` hold S y_d and H y_d with one row per window.
     """
     update, states = command_gain.shape
+    by_state, carried = command_gain.T.copy(), state_gain.T.copy()
     following = np.empty(states)
     for w in range(first, last):
-        start = w * update
+        out, drive = u[w * update : (w + 1) * update], command_drive[w]
         for i in range(update):
-            total = command_drive[w, i]
-            for j in range(states):
-                total += command_gain[i, j] * z[j]
-            u[start + i] = total
+            out[i] = drive[i]
         for i in range(states):
-            total = state_drive[w, i]
-            for j in range(states):
-                total += state_gain[i, j] * z[j]
-            following[i] = total
+            following[i] = state_drive[w, i]
+        for j in range(states):
+            value, gain = z[j], by_state[j]
+            for i in range(update):
+                out[i] += gain[i] * value
+            for i in range(states):
+                following[i] += carried[j, i] * value
         z[:] = following
+
+
+@kernel
+def advance_window(
+    advance: NDArray[np.float64],
+    drive: NDArray[np.float64],
+    z: NDArray[np.float64],
+    committed: NDArray[np.float64],
+) -> None:
+    """Bring z, the plants' states and the last two commands, behind a committed command, in place.
+
+    `advance` takes the plants there without a command; `drive` is what z becomes by the command.
+    """
+    following = np.dot(drive, committed)
+    following[:-2] += np.dot(advance, z[:-2])
+    z[:] = following
 
 
 @kernel

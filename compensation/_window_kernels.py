@@ -7,19 +7,33 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["command_of", "constraints_at", "extremes", "tied_window"]
+__all__ = [
+    "BLOCK",
+    "backward",
+    "command_of",
+    "constraints_at",
+    "extremes",
+    "factorise",
+    "forward",
+    "tied_window",
+    "weighted_gram",
+]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
+
+BLOCK = 20
+"""Samples between two running Gram matrices."""
 
 
 @kernel
 def tied_window(
     basis: Array,
     summed: Array,
-    effort: Array,
+    efforts: Array,
     filtered: Array,
+    grams: Array,
     free: Array,
     reach: Array,
     stop: Array,
@@ -28,24 +42,30 @@ def tied_window(
     path: Array,
     targets: Array,
     weight: Array,
-    moving: Ints,
-) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
-    """Command of a window that stands on the path in its rests, without bounds.
+    rests: Ints,
+    limits: Array,
+) -> tuple[Array, bool, Ints, Array, Array, Array, Array, Array, Array]:
+    """Command of a window that stands on the path in its rests, and whether it keeps its limits.
 
     Parameters
     ----------
     path : ndarray, shape (window,)
         On which the command stands in the rests.
+    rests : ndarray of int64, shape (k - 1, 2)
+        Ranges [a, b) of samples, relative to the window; they may reach beyond it.
+    limits : ndarray, shape (4,)
+        Largest second and first difference, lowest and highest value.
 
     Others as in `_tied_problem`.
 
     Returns
     -------
     command : ndarray, shape (window,)
-    fixed : ndarray, shape (window,)
-        The command without functions.
+    kept : bool
+    moving, fixed : ndarray, shapes (k, 2) and (window,)
+        Segments between the rests, and the command without functions.
     factor, wish, ends
-        As in `_tied_problem`, the factor as its transpose.
+        As in `_tied_problem`.
     pinned, values : ndarray, shapes (pins, n) and (pins,)
         Where the command stands on the path: pinned w = values.
 
@@ -55,8 +75,21 @@ def tied_window(
         When the problem is singular, or the rests contradict each other.
     """
     last, previous = z[-2], z[-1]
+    moving = _between(rests, len(basis))
     factor, wish, ends = _tied_problem(
-        basis, summed, effort, filtered, free, reach, stop, price, z, targets, weight, moving
+        basis,
+        summed,
+        efforts,
+        filtered,
+        grams,
+        free,
+        reach,
+        stop,
+        price,
+        z,
+        targets,
+        weight,
+        moving,
     )
     fixed = tied_command(np.zeros(len(basis)), moving, last, previous)
     first = 1 if len(ends) > 0 and moving[0, 1] == 0 else 0
@@ -65,24 +98,41 @@ def tied_window(
     found = wish
     if len(pinned) > 0:
         # The nearest w for which the command stands on the path in the rests.
-        lacking = np.empty(len(pinned))
+        pull = np.empty(len(pinned))
         for i in range(len(pinned)):
             at = moving[first + i, 1] - 1
             values[i] = path[at] - fixed[at]
             forward(factor, pinned[i])
-            lacking[i] = np.dot(pinned[i], wish) - values[i]
-        pull = np.linalg.solve(np.dot(pinned, pinned.T), lacking)
+            pull[i] = np.dot(pinned[i], wish) - values[i]
+        meeting = np.dot(pinned, pinned.T)
+        factorise(meeting)
+        forward(meeting, pull)
+        backward(meeting, pull)
         found = wish - np.dot(pull, pinned)
-    command = command_of(factor, found, basis, moving, last, previous)
-    return command, fixed, factor, wish, ends, pinned, values
+    command = command_of(factor, found, basis, moving, last, previous, path)
+    accel, speed, low, high, _ = extremes(command, last, previous, False)
+    kept = accel <= limits[0] and speed <= limits[1] and low >= limits[2] and high <= limits[3]
+    return command, kept, moving, fixed, factor, wish, ends, pinned, values
+
+
+@kernel
+def _between(rests: Ints, window: int) -> Ints:
+    """Segments [s, e) of a window between its rests, some of them without samples."""
+    moving = np.zeros((len(rests) + 1, 2), np.int64)
+    for m in range(len(rests)):
+        moving[m, 1] = max(rests[m, 0], 0)
+        moving[m + 1, 0] = min(rests[m, 1], window)
+    moving[-1, 1] = window
+    return moving
 
 
 @kernel
 def _tied_problem(
     basis: Array,
     summed: Array,
-    effort: Array,
+    efforts: Array,
     filtered: Array,
+    grams: Array,
     free: Array,
     reach: Array,
     stop: Array,
@@ -94,8 +144,8 @@ def _tied_problem(
 ) -> tuple[Array, Array, Array]:
     """Weighted least squares of a window with rests, factored: least |w - wish|^2.
 
-    Between rests the tied functions are the free ones without a past: their response is the free
-    one minus what the states at the segment's start would go on to do, plus what the segments
+    Up to the first stop the functions are the free ones. Later their response is the free one minus
+    what the free functions' states at the segment's start would go on to do, plus what the segments
     before left behind. In a rest there is only what was left behind, a few states for many samples:
     these samples are summed up first, and meet the functions by way of the states.
 
@@ -103,8 +153,8 @@ def _tied_problem(
     ----------
     basis, summed : ndarray, shape (window, n)
         Increments of the functions, and their double running sums: the commands.
-    effort : ndarray, shape (n, n)
-        Gram matrix of `basis`.
+    efforts, grams : ndarray, shape (blocks + 1, n, n)
+        Running Gram matrices (`weighted_gram`) of `basis` and `filtered`.
     filtered : ndarray, shape (components, window, n)
     free : ndarray, shape (components, window, nz)
         What states do by themselves.
@@ -122,107 +172,146 @@ def _tied_problem(
     Returns
     -------
     factor : ndarray, shape (n, n)
-        The triangle L', upper, with w = L' c.
+        The triangle L', upper, with w = L' c (`factorise`).
     wish : ndarray, shape (n,)
     ends : ndarray, shape (k - 1, n)
         Where the functions' commands stand in each rest.
     """
     window, n = basis.shape
     rests, states = len(moving) - 1, free.shape[2]
-    left = states - 1
-    speed = z[-2] - z[-1]
-    # What segments leave behind: the plants' states and the position, as the command stands.
-    behind = np.zeros((rests * left, n))
+    first, speed = moving[0, 1], z[-2] - z[-1]
+    normal, right = price * efforts[-1], np.zeros(n)
+    if rests > 0:
+        # The untied increments are priced too, or few samples would leave the matrix indefinite.
+        prices = np.zeros(window)
+        for s, e in moving:
+            prices[s:e] = price
+        weighted_gram(efforts, basis.reshape(1, window, n), prices, normal)
+    squares = np.zeros(window)
+    for r in range(first):
+        squares[r] = weight[r] * weight[r]
+    weighted_gram(grams, filtered, squares, normal)
+
+    # States that the functions leave behind, and those that they would have had.
     ends, position = np.zeros((rests, n)), np.zeros(n)
-    normal, right = _effort(basis, effort, moving, price), np.zeros(n)
+    sources, count = np.empty((2 * rests * states, n)), 0
+    for m in range(rests + 1):
+        s, e = moving[m]
+        if e > s > 0:
+            sources[count : count + states] = _states(summed, reach, 0, s)
+            count += states
+        if m < rests and e > s:
+            behind = _states(summed, reach, s, e)
+            sources[count : count + states - 1] = behind[:-1]
+            count += states - 1
+            position += behind[-2]
+            step = behind[-2] - behind[-1]
+            for i in range(n):
+                _add(price * step[i], step, normal[i])
+            if m == 0:
+                _add(-price * speed, step, right)
+        if m < rests:
+            ends[m] = position
+    sources = sources[:count]
+
+    shares, square, pull = (
+        np.zeros((window - first, count)),
+        np.zeros((count, count)),
+        np.zeros(count),
+    )
+    later = 0
+    for s, e in moving[1:]:
+        later += e - s
     # Rows of which the squares are added up.
-    rows, count = np.zeros((len(filtered) * window + rests, n)), 0
-    for m in range(rests):
-        state = _states(summed, reach, moving[m, 0], moving[m, 1])
-        behind[m * left : (m + 1) * left] = state[:-1]
-        position += state[-2]
-        ends[m] = position
-        step = state[-2] - state[-1]
-        _add(np.sqrt(price), step, rows[count])
-        count += 1
-        if m == 0:
-            _add(-price * speed, step, right)
-    first_stop = moving[0, 1]
+    rows, row = np.empty((len(filtered) * later, n)), 0
     for c in range(len(filtered)):
         error = weight * (targets[c] - np.dot(free[c], z))
-        for r in range(first_stop, window):
-            error[r] += weight[r] * speed * stop[c, r - first_stop]
-        square, pull = np.zeros((rests * left, rests * left)), np.zeros(rests * left)
-        gain = np.zeros(rests * left)
-        for m in range(rests + 1):
+        for r in range(first, window):
+            error[r] += weight[r] * speed * stop[c, r - first]
+        right += np.dot(weight[:first] * error[:first], filtered[c, :first])
+        _fill_shares(free[c], weight, moving, shares)
+        for m in range(1, rests + 1):
             s, e = moving[m]
-            following = moving[m + 1, 0] if m < rests else window
-            # What the functions did before s: left behind, and what they would go on to do.
-            known = m * left if s > 0 else 0
-            sources = np.empty((known + (states if s > 0 else 0), n))
-            sources[:known] = behind[:known]
-            if e > s > 0:
-                sources[known:] = _states(summed, reach, 0, s)
-            shares = np.empty((e - s, len(sources)))
-            for r in range(s, following):
-                for before in range(m + 1 if r >= e else m):
-                    at = r - moving[before, 1]
-                    for i in range(left):
-                        gain[before * left + i] = weight[r] * free[c, at, i]
-                    # Both last commands are the same from now on.
-                    gain[(before + 1) * left - 1] += weight[r] * free[c, at, left]
-                if r < e:
-                    for i in range(known):
-                        shares[r - s, i] = gain[i]
-                    for i in range(known, len(sources)):
-                        shares[r - s, i] = -weight[r] * free[c, r - s, i - known]
-                    continue
-                for i in range((m + 1) * left):
-                    pull[i] += gain[i] * error[r]
-                    for j in range(i + 1):
-                        square[i, j] += gain[i] * gain[j]
+            resting = shares[moving[m - 1, 1] - first : s - first]
+            square += np.dot(resting.T, resting)
+            pull += np.dot(error[moving[m - 1, 1] : s], resting)
             if e > s:
-                part = rows[count : count + e - s]
-                for r in range(s, e):
-                    for j in range(n):
-                        part[r - s, j] = weight[r] * filtered[c, r, j]
-                if s > 0:
-                    part += np.dot(shares, sources)
+                part = rows[row : row + e - s]
+                np.dot(shares[s - first : e - first], sources, part)
+                for r in range(e - s):
+                    _add(weight[s + r], filtered[c, s + r], part[r])
                 right += np.dot(error[s:e], part)
-                count += e - s
-        for i in range(len(pull)):
-            _add(pull[i], behind[i], right)
-            for j in range(i):
-                square[j, i] = square[i, j]
-        if rests:
-            normal += np.dot(behind.T, np.dot(square, behind))
-    normal += np.dot(rows[:count].T, rows[:count])
-    factor = np.linalg.cholesky(normal).T.copy()
-    forward(factor, right)
-    return factor, right, ends
+                row += e - s
+    if count > 0:
+        right += np.dot(pull, sources)
+        normal += np.dot(sources.T, np.dot(square, sources))
+    if row > 0:
+        normal += np.dot(rows.T, rows)
+    factorise(normal)
+    forward(normal, right)
+    return normal, right, ends
 
 
 @kernel
-def _effort(basis: Array, effort: Array, moving: Ints, price: float) -> Array:
-    """Price of the increments while the command moves, and of the untied ones.
+def weighted_gram(running: Array, rows: Array, weight: Array, out: Array) -> None:
+    """Add the Gram matrix of weighted rows, most of it from running sums.
 
-    The untied ones keep the matrix definite when a rest leaves few samples.
+    Parameters
+    ----------
+    running : ndarray, shape (blocks + 1, n, n)
+        Gram matrices of the rows before every `BLOCK`th sample, and of all.
+    rows : ndarray, shape (components, window, n)
+    weight : ndarray, shape (window,)
+        Of the squares, the same for a long time.
+    out : ndarray, shape (n, n)
     """
-    if len(moving) == 1:
-        return price * effort
-    still = 0
-    for m in range(len(moving) - 1):
-        still += moving[m + 1, 0] - moving[m, 1]
-    # Outside the rests the increments are the untied ones: whichever samples are fewer.
-    few = 2 * still <= len(basis)
-    rows, count = np.empty((len(basis), basis.shape[1])), 0
-    for m in range(len(moving) - 1 if few else len(moving)):
-        first, last = (moving[m, 1], moving[m + 1, 0]) if few else (moving[m, 0], moving[m, 1])
-        rows[count : count + last - first] = basis[first:last]
-        count += last - first
-    square = np.dot(rows[:count].T, rows[:count])
-    out: Array = price * (2.0 * effort - square) if few else price * (effort + square)
-    return out
+    components, window, n = rows.shape
+    apart, scaled, count = np.empty((components * window, n)), np.empty((components * window, n)), 0
+    before = 0.0
+    for block in range(len(running)):
+        start, end = block * BLOCK, min((block + 1) * BLOCK, window)
+        level = weight[(start + end) // 2] if start < window else 0.0
+        if level != before:
+            for i in range(n):
+                _add(before - level, running[block, i], out[i])
+            before = level
+        for r in range(start, end):
+            if weight[r] != level:
+                for c in range(components):
+                    for j in range(n):
+                        apart[count, j] = rows[c, r, j]
+                        scaled[count, j] = (weight[r] - level) * rows[c, r, j]
+                    count += 1
+    if count > 0:
+        out += np.dot(apart[:count].T, scaled[:count])
+
+
+@kernel
+def _fill_shares(free: Array, weight: Array, moving: Ints, shares: Array) -> None:
+    """Weighted responses of one component to each source, from the first stop on.
+
+    Parameters
+    ----------
+    free : ndarray, shape (window, nz)
+    shares : ndarray, shape (window - moving[0, 1], sources)
+    """
+    window, states = free.shape
+    first, rests, column = moving[0, 1], len(moving) - 1, 0
+    for m in range(rests + 1):
+        s, e = moving[m]
+        if e > s > 0:
+            for r in range(s, e):
+                for i in range(states):
+                    shares[r - first, column + i] = -weight[r] * free[r - s, i]
+            column += states
+        if m < rests and e > s:
+            left = states - 1
+            for r in range(e, window):
+                for i in range(left):
+                    shares[r - first, column + i] = weight[r] * free[r - e, i]
+                # Both last commands are the same from now on.
+                shares[r - first, column + left - 1] += weight[r] * free[r - e, left]
+            column += left
 
 
 @kernel(inline=True)
@@ -254,6 +343,37 @@ def _states(summed: Array, reach: Array, s: int, e: int) -> Array:
 
 
 @kernel
+def factorise(square: Array) -> None:
+    """Replace the upper triangle of a definite matrix by U of its product U' U, in place.
+
+    Small as these matrices are, LAPACK takes twice as long. What is below the triangle stays.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        When it is not definite.
+    """
+    for k in range(len(square)):
+        row = square[k, k:]
+        # Four rows above at a time: what is read and written in between is the row itself.
+        i = 0
+        while i + 4 <= k:
+            a, b, c, d = square[i, k:], square[i + 1, k:], square[i + 2, k:], square[i + 3, k:]
+            by_a, by_b, by_c, by_d = a[0], b[0], c[0], d[0]
+            for j in range(len(row)):
+                row[j] -= by_a * a[j] + by_b * b[j] + by_c * c[j] + by_d * d[j]
+            i += 4
+        while i < k:
+            _add(-square[i, k], square[i, k:], row)
+            i += 1
+        if not row[0] > 0.0:
+            raise np.linalg.LinAlgError("not positive definite")
+        scale = 1.0 / np.sqrt(row[0])
+        for j in range(len(row)):
+            row[j] *= scale
+
+
+@kernel
 def forward(factor: Array, values: Array) -> None:
     """Solve factor' x = values in place, for an upper triangle."""
     for j in range(len(values)):
@@ -263,16 +383,26 @@ def forward(factor: Array, values: Array) -> None:
 
 
 @kernel
+def backward(factor: Array, values: Array) -> None:
+    """Solve factor x = values in place, for an upper triangle."""
+    for j in range(len(values) - 1, -1, -1):
+        for i in range(j + 1, len(values)):
+            values[j] -= factor[j, i] * values[i]
+        values[j] /= factor[j, j]
+
+
+@kernel
 def command_of(
-    factor: Array, w: Array, basis: Array, moving: Ints, last: float, previous: float
+    factor: Array, w: Array, basis: Array, moving: Ints, last: float, previous: float, path: Array
 ) -> Array:
-    """Command of the coefficients c with factor c = w."""
+    """Command of the coefficients c with factor c = w, in its rests on the path to the last bit."""
     c = w.copy()
-    for j in range(len(c) - 1, -1, -1):
-        for i in range(j + 1, len(c)):
-            c[j] -= factor[j, i] * c[i]
-        c[j] /= factor[j, j]
-    return tied_command(np.dot(basis, c), moving, last, previous)
+    backward(factor, c)
+    command = tied_command(np.dot(basis, c), moving, last, previous)
+    for m in range(len(moving) - 1):
+        a, b = moving[m, 1], moving[m + 1, 0]
+        command[max(a - 1, 0) : b] = path[a - 1] if a > 0 else last
+    return command
 
 
 @kernel

@@ -253,7 +253,7 @@ class PreviewFbf:
                     f"{reached.low_mm:.3f} to {reached.high_mm:.3f} mm"
                 )
             if rms <= task.rms_limit_mm_s2 or rung >= GENTLE_RUNG:
-                if all(bounds.kept(reached)):
+                if bounds.kept(reached):
                     # The next piece starts here, or higher where there was room to spare.
                     roomy = rms < 0.8 * task.rms_limit_mm_s2 or rung > GENTLE_RUNG
                     if len(command) > axis.update:

@@ -14,15 +14,18 @@ The design refuses itself when the recursion is unstable or the basis nearly dep
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
+from compensation._window_kernels import BLOCK
 from compensation.base import DesignError
 from compensation.basis import BASES
 from compensation.lifted_window import LiftedWindow
 
-__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign"]
+__all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "running_gram"]
 
 Array = NDArray[np.float64]
 
@@ -64,6 +67,8 @@ class PreviewDesign:
     filtered : ndarray, shape (components, window, n)
     effort : ndarray, shape (n, n)
         Gram matrix of `basis`: the squared command acceleration of a coefficient vector.
+    efforts, grams : ndarray, shape (blocks + 1, n, n)
+        Gram matrices of `basis` and `filtered` before every `BLOCK`th sample, and of all.
     spectral_radius, condition : float
         rho(F) and cond(R): the acceptance figures.
 
@@ -114,6 +119,16 @@ class PreviewDesign:
                 "window or fewer functions"
             )
 
+    @cached_property
+    def efforts(self) -> Array:
+        """Running Gram matrices of `basis`."""
+        return running_gram(self.basis[None])
+
+    @cached_property
+    def grams(self) -> Array:
+        """Running Gram matrices of `filtered`."""
+        return running_gram(self.filtered)
+
     def _condense(self) -> None:
         lifted = self.lifted
         # The last two commands, newest first, follow the members' states.
@@ -121,8 +136,19 @@ class PreviewDesign:
         self.state_gain = self.state_drive @ self.command_gain
         self.state_gain[:-2, :-2] += lifted.advance
 
-    def advanced(self, z: Array, committed: Array) -> Array:
-        """State z after the `update` committed samples of a command."""
-        following = self.state_drive @ committed
-        following[:-2] += self.lifted.advance @ z[:-2]
-        return np.asarray(following)
+
+def running_gram(rows: Array) -> Array:
+    """Return Gram matrices of rows before every `BLOCK`th sample, and of all.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (components, window, n)
+
+    Returns
+    -------
+    ndarray, shape (blocks + 1, n, n)
+    """
+    starts = range(0, rows.shape[1], BLOCK)
+    blocks = [np.concatenate(rows[:, start : start + BLOCK]) for start in starts]
+    grams = [np.zeros((rows.shape[2],) * 2), *(block.T @ block for block in blocks)]
+    return np.asarray(np.cumsum(grams, axis=0))

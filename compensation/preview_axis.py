@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._preview_kernels import advance_state, run_windows
+from compensation._preview_kernels import advance_state, advance_window, run_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, ce_opt_basis, robust_basis
 from compensation.lifted_window import LiftedWindow, lifted_window
@@ -298,61 +298,56 @@ class PreviewAxis:
         targets_mm : ndarray, shape (members, n), optional
             What each member shall do; by default the path.
         """
-        design = self._designs.design(rung)
-        resting_design = self._designs.design(rung, REST_FUNCTIONS)
-        path, stops = task.path_mm, task.stops
-        n, window, update = len(path), self.window, self.update
-        windows = -(-n // update)
-        self._move_origin(float(path[0]))
+        design, drive = self._designs.design(rung), self._drive(rung, task, targets_mm)
+        n, window, update = len(task.path_mm), self.window, self.update
+        windows = len(drive.command)
+        self._move_origin(float(task.path_mm[0]))
         origin = self._origin
         bounds = task.bounds.seen_from(origin)
-        drive = self._drive(rung, task, targets_mm)
-        padded, targets, weights = drive.path_mm, drive.targets_mm, drive.weight
+        # Stops that each window meets.
+        starts = update * np.arange(windows)
+        met = np.searchsorted(task.stops[:, 1], starts, "right")
+        behind = np.searchsorted(task.stops[:, 0], starts + window)
+        apart = behind > met
+        apart[list(careful)] = True
 
         u = np.empty(windows * update)
         z = np.append(self._states, [0.0, 0.0])
-        starts = np.arange(windows) * update
-        apart = np.isin(np.arange(windows), list(careful))
-        for a, b in stops:
-            apart[np.searchsorted(starts, a - window, "right") : np.searchsorted(starts, b)] = True
-        last_states = z[:-2]
-        w = 0
-        while w < windows:
-            start = w * update
-            if w == windows - 1:
+        last_states, w = z[:-2], 0
+        for at in map(int, np.append(np.flatnonzero(apart), windows)):
+            run_windows(
+                design.command_gain, design.state_gain, drive.command, drive.state, z, w, at, u
+            )
+            if at == windows:
+                break
+            if at == windows - 1:
                 last_states = z[:-2].copy()
-            if apart[w]:
-                solved = drive.solved.get(w)
-                if solved is None or not np.array_equal(solved[0], z):
-                    near = (stops[:, 0] < start + window) & (stops[:, 1] > start)
-                    span = slice(start, start + window)
-                    command = solve_window(
-                        resting_design if near.any() else design,
-                        z,
-                        padded[span],
-                        targets[:, span],
-                        weights[span],
-                        stops[near] - start,
-                        bounds,
-                    )
-                    drive.solved[w] = solved = z.copy(), command[:update]
-                committed = solved[1]
-                u[start : start + update] = committed
-                z = design.advanced(z, committed)
-                w += 1
-            else:
-                end = w + int(np.argmax(np.append(apart[w:], True)))
-                gains = (design.command_gain, design.state_gain)
-                run_windows(*gains, drive.command, drive.state, z, w, end, u)
-                w = end
+            start = at * update
+            committed = u[start : start + update]
+            if not (at in drive.solved and np.array_equal(drive.solved[at][0], z)):
+                rests = task.stops[met[at] : behind[at]] - start
+                span = slice(start, start + window)
+                command = solve_window(
+                    self._designs.design(rung, REST_FUNCTIONS) if len(rests) else design,
+                    z,
+                    drive.path_mm[span],
+                    drive.targets_mm[:, span],
+                    drive.weight[span],
+                    rests,
+                    bounds,
+                )
+                drive.solved[at] = z.copy(), command[:update]
+            committed[:] = drive.solved[at][1]
+            advance_window(self._designs.lifted.advance, design.state_drive, z, committed)
+            w = at + 1
         # The windows run on past the end of the path, where the command stands.
-        last = path[-1] - origin
-        u[n - 1] = last
+        end_mm = float(task.path_mm[-1])
+        u[n - 1] = end_mm - origin
         states = self._advanced(last_states, u[(windows - 1) * update : n - 1])
         # Off the rounding by which a bounded solution may miss the end of the travel.
         position = _snapped(u[:n] + origin, task.bounds)
-        position[-1] = path[-1]
-        return AxisCommand(position, states - self._resting(last))
+        position[-1] = end_mm
+        return AxisCommand(position, states - self._resting(end_mm - origin))
 
     def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
         """Return what a rung makes of a piece; the last one again for the same piece and rung.
@@ -367,14 +362,14 @@ class PreviewAxis:
         window, update = self.window, self.update
         padding = -(-len(path) // update) * update + window - len(path)
         padded = np.append(path - path[0], np.full(padding, path[-1] - path[0]))
-        command = _windows(padded, window, update) @ design.path_gain.T
+        command = _products(padded, design.path_gain)
         targets = self._designs.lifted.target[:, None] * padded
         if targets_mm is not None:
             slid = self._designs.lifted.mix @ (targets_mm - path)
             targets[:, : len(path)] += slid
             for component, gain in zip(slid, design.target_gain, strict=True):
                 behind = np.append(component, np.zeros(padding))
-                command += _windows(behind, window, update) @ gain.T
+                command += _products(behind, gain)
         weight = np.append(task.weight, np.full(padding, WEIGHT_REST))
         state = command @ design.state_drive.T
         made = _Drive(task, rung, padded, targets, weight, command, state)
@@ -404,9 +399,19 @@ def _changes(command: Array) -> tuple[Array, Array]:
     return np.diff(standing, 2), np.diff(standing)[:-1]
 
 
-def _windows(samples: Array, window: int, update: int) -> Array:
-    views = np.lib.stride_tricks.sliding_window_view(samples, window)
-    return views[: len(samples) - window : update]
+def _products(samples: Array, gain: Array) -> Array:
+    """Products of a gain, (update, window), with all windows, one row each.
+
+    Windows overlap; so the gain is taken apart, and no sample has to be copied.
+    """
+    update, window = gain.shape
+    windows = (len(samples) - window) // update
+    total = np.zeros((windows, update))
+    for first in range(0, window, update):
+        blocks = samples[first : first + windows * update].reshape(windows, update)
+        part = gain[:, first : first + update]
+        total += blocks[:, : part.shape[1]] @ part.T
+    return total
 
 
 def _snapped(position: Array, bounds: Bounds) -> Array:

@@ -73,14 +73,20 @@ class Bounds:
             ]
         )
 
-    def kept(self, reached: Extremes) -> tuple[bool, bool, bool]:
+    def limits(self) -> Array:
+        """Return what extremes may reach, with room for rounding: accel, speed, low, high."""
+        room = 1.0 + 1e-9
+        travel = self.low_mm - TRAVEL_SLACK_MM, self.high_mm + TRAVEL_SLACK_MM
+        return np.array([room * self.accel, room * self.speed, *travel])
+
+    def kept(self, reached: Extremes) -> bool:
         """Whether acceleration, speed and travel are kept."""
-        slack = 1.0 + 1e-9
-        return (
-            reached.accel <= slack * self.accel,
-            reached.speed <= slack * self.speed,
-            reached.low_mm >= self.low_mm - TRAVEL_SLACK_MM
-            and reached.high_mm <= self.high_mm + TRAVEL_SLACK_MM,
+        accel, speed, low, high = self.limits()
+        return bool(
+            reached.accel <= accel
+            and reached.speed <= speed
+            and reached.low_mm >= low
+            and reached.high_mm <= high
         )
 
 
@@ -131,20 +137,16 @@ def solve_window(
     -------
     ndarray, shape (window,)
     """
-    last, previous = float(z[-2]), float(z[-1])
-    window = len(path_mm)
-    spans = [(max(int(a), 0), min(int(b), window)) for a, b in rests]
-    edges = [0, *(edge for span in spans for edge in span), window]
-    moving = np.array(edges, dtype=np.int64).reshape(-1, 2)
     lifted, summed = design.lifted, design.summed
     try:
         # In the coordinates w = L' c, normal = L L', the cost is |w - wish|^2: well conditioned
         # even where a rest leaves few samples.
-        command, fixed, factor, wish, ends, pinned, values = tied_window(
+        command, kept, moving, fixed, factor, wish, ends, pinned, values = tied_window(
             design.basis,
             summed,
-            design.effort,
+            design.efforts,
             design.filtered,
+            design.grams,
             lifted.from_state,
             lifted.reach,
             lifted.integrated[:, :, 0],
@@ -153,14 +155,18 @@ def solve_window(
             path_mm,
             targets_mm,
             weight,
-            moving,
+            rests,
+            bounds.limits(),
         )
     except np.linalg.LinAlgError as error:
         raise DesignError(f"the window problem at a rest is singular ({error})") from error
+    if kept:
+        return command
     untied = command
+    last, previous = float(z[-2]), float(z[-1])
     rows, low, high = pinned, values, values
-    taken = np.zeros((3, window), bool)
-    while not all(bounds.kept(Extremes.of(command, last, previous))):
+    taken = np.zeros((3, len(path_mm)), bool)
+    while not bounds.kept(Extremes.of(command, last, previous)):
         # Constraints where the command leaves its bounds, then where it does so instead.
         more = constraints_at(
             command, fixed, last, previous, bounds.table(), factor, summed, moving, ends, taken
@@ -172,10 +178,6 @@ def solve_window(
         kinds[: len(values)] = _EQUAL
         found, _, flag, _ = daqp.solve(np.eye(design.n), -wish, rows, high, low, kinds)
         if flag <= 0:
-            command = untied  # nothing keeps them; the caller sees that and takes a gentler design
-            break
-        command = command_of(factor, found, design.basis, moving, last, previous)
-    for a, b in spans:
-        # Rounding must not move a resting axis.
-        command[max(a - 1, 0) : b] = last if a <= 0 else path_mm[a - 1]
-    return np.asarray(command)
+            return untied  # nothing keeps them; the caller sees that and takes a gentler design
+        command = command_of(factor, found, design.basis, moving, last, previous, path_mm)
+    return command

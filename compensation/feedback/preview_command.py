@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation._preview_kernels import advance_window
 from compensation.feedback.zero_phase import reference_plant
 from compensation.lifted_window import lifted_window
 from compensation.preview import PreviewDesign
@@ -47,5 +48,5 @@ def preview_command(
     for first in range(0, windows * update, update):
         committed = design.command_gain @ z + design.path_gain @ path[first : first + window]
         command[first : first + update] = committed
-        z = design.advanced(z, committed)
+        advance_window(lifted.advance, design.state_drive, z, committed)
     return command[: len(y_d)]

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from compensation._preview_kernels import advance_state, run_windows
+from compensation._preview_kernels import advance_state, advance_window, run_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, bspline_basis, ce_opt_basis
 from compensation.lifted import LiftedSet
@@ -242,6 +242,16 @@ def test_twin_of_run_windows(seed: int, update: int, states: int, first: int, co
     run_windows(e, f, s, h, z, first, first + count, u)
     np.testing.assert_allclose(u, expected_u, atol=1e-9, rtol=1e-9)
     np.testing.assert_allclose(z, expected_z, atol=1e-9, rtol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_twin_of_advance_window(count: int) -> None:
+    design = PreviewDesign(members(count, 150, 75), 20)
+    rng = np.random.default_rng(count)
+    z, committed = rng.normal(size=design.lifted.states), rng.normal(size=75)
+    states = design.lifted.advance @ z[:-2] + design.lifted.drive @ committed
+    advance_window(design.lifted.advance, design.state_drive, z, committed)
+    np.testing.assert_allclose(z, [*states, committed[-1], committed[-2]], atol=1e-12)
 
 
 @settings(deadline=None, max_examples=30)

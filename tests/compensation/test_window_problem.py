@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
+from compensation._window_kernels import BLOCK, backward, factorise, forward, weighted_gram
 from compensation.lifted_window import lifted_window
-from compensation.preview import PreviewDesign
+from compensation.preview import PreviewDesign, running_gram
 from compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
 from models.plants import Mode, ModesSpec, discretise
 
@@ -57,9 +60,9 @@ def test_bounds_are_kept_at_the_least_cost(design: PreviewDesign, kind: str) -> 
         "speed": Bounds(1e3, 0.95 * speed, -1e6, 1e6),
         "travel": Bounds(1e3, 1e3, -1e6, 5.001),
     }[kind]
-    assert not all(bounds.kept(Extremes.of(free, 0.0, 0.0)))
+    assert not bounds.kept(Extremes.of(free, 0.0, 0.0))
     bounded = solve(design, z, path, np.ones(WINDOW), NO_RESTS, bounds)
-    assert all(bounds.kept(Extremes.of(bounded, 0.0, 0.0)))
+    assert bounds.kept(Extremes.of(bounded, 0.0, 0.0))
 
     # The same quadratic programme by scipy, from the definition.
     stacked = np.concatenate([*design.filtered, np.sqrt(design.price) * design.basis])
@@ -143,3 +146,37 @@ def test_impossible_bounds_are_left_to_the_caller(design: PreviewDesign) -> None
     free = solve(design, z, corner(), np.ones(WINDOW), NO_RESTS, WIDE)
     found = solve(design, z, corner(), np.ones(WINDOW), NO_RESTS, tight)
     np.testing.assert_array_equal(found, free)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**31), st.integers(1, 3), st.integers(1, 3 * BLOCK))
+def test_twin_of_weighted_gram(seed: int, components: int, window: int) -> None:
+    """Against the definition, with weights that change anywhere, to and from nothing."""
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(size=(components, window, 3))
+    weight = np.repeat(rng.choice([0.0, 0.05, 1.0], window), rng.integers(1, 30, window))[:window]
+    out = rng.normal(size=(3, 3))
+    expected = out + np.einsum("cwi,w,cwj->ij", rows, weight, rows)
+    weighted_gram(running_gram(rows), rows, weight, out)
+    np.testing.assert_allclose(out, expected, atol=1e-10)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 2**31), st.integers(1, 12))
+def test_twin_of_factorise(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows, x = rng.normal(size=(2 * n, n)), rng.normal(size=n)
+    square = rows.T @ rows + np.eye(n)
+    factor = square.copy()
+    factorise(factor)
+    np.testing.assert_allclose(np.triu(factor), np.linalg.cholesky(square).T, atol=1e-10)
+    found = square @ x
+    forward(factor, found)
+    backward(factor, found)
+    np.testing.assert_allclose(found, x, atol=1e-8)
+
+
+def test_what_is_not_definite_has_no_factor() -> None:
+    for square in (np.zeros((2, 2)), np.array([[1.0, 2.0], [2.0, 1.0]]), np.full((1, 1), np.nan)):
+        with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+            factorise(square)
