@@ -208,7 +208,8 @@ def motion_sums(
 def _moved(path: Array, k: int, rest: Array, still_mm: float) -> bool:
     x = path[0, k - 1] if k > 0 else rest[0]
     y = path[1, k - 1] if k > 0 else rest[1]
-    return abs(path[0, k] - x) > still_mm or abs(path[1, k] - y) > still_mm
+    moved: bool = abs(path[0, k] - x) > still_mm or abs(path[1, k] - y) > still_mm
+    return moved
 
 
 @kernel(allocates=False)

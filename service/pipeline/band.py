@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
-_ALL, _EVERY = 64, 8
-"""Of a long print, every eighth block behind the first 64 tells enough."""
+_ALL_BITS = 6
+"""Of a long print, every second block behind the first 64 tells enough, every fourth behind the
+first 128, and so on; each counts for all that it stands for."""
 NOTABLE_UM = 1.0
 """Less than this beyond the band is not worth a word."""
 
@@ -53,16 +54,18 @@ class BandContent:
         total = before.shape[1] + path_mm.shape[1]
         count = max(0, (total - 2) // BLOCK)
         for k in range(count):
+            every = 1 << max(0, self._seen.bit_length() - _ALL_BITS)
             self._seen += 1
-            if self._seen > _ALL and self._seen % _EVERY:
+            if self._seen % every:
                 continue
             first = k * BLOCK
             prints = _span(printed, extruding, first, first + BLOCK)
             if np.count_nonzero(prints) > BLOCK // 2:
                 path = _span(before, path_mm, first, first + BLOCK + 2)
                 accel = np.diff(path, 2) / self._dt_s**2
-                self._power += np.abs(np.fft.rfft(accel * self._window)) ** 2
-                self._blocks += 1
+                spectrum = np.fft.rfft(accel * self._window)
+                self._power += every * (spectrum.real**2 + spectrum.imag**2)
+                self._blocks += every
         self._path = _span(before, path_mm, count * BLOCK, total).copy()
         self._prints = _span(printed, extruding, count * BLOCK, total).copy()
 

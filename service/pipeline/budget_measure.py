@@ -15,9 +15,11 @@ from gcode.quickening import AS_SLICED
 from models.machine import Machine
 from models.schedule import OperatingPoint
 from service.pipeline.layers import LayerTile
-from service.pipeline.measure import Measurement, MotionSamples, Trace
+from service.pipeline.measure import Measurement
+from service.pipeline.points import MotionSamples
 from service.pipeline.result import Channel, GroupFigures
 from service.pipeline.set_errors import ErrorSum, SetErrors
+from service.pipeline.tracing import Trace
 from service.pipeline.yardstick import BestShaper
 
 __all__ = ["BudgetMeasurement"]

@@ -9,18 +9,18 @@ layers that are given away.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.shapers import shape, shaper_pulses
-from gcode.types import Moves
 from models.machine import Machine
-from models.schedule import EMPTY, OperatingPoint
+from models.schedule import OperatingPoint
+from service.pipeline.answers import Answered, Answers
 from service.pipeline.band import BandContent
 from service.pipeline.layer_views import LayerViews
 from service.pipeline.layers import LayerRecorder, LayerTile
+from service.pipeline.points import MeasuredPoints, MotionSamples, part_of
 from service.pipeline.result import (
     AxisSpectrum,
     Channel,
@@ -30,48 +30,17 @@ from service.pipeline.result import (
     Track,
 )
 from service.pipeline.spectra import ErrorSpectra
+from service.pipeline.tracing import Trace, Tracer
 from service.pipeline.yardstick import BestShaper
 from simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
-from simulation.scheduled import MachineStream
 
-__all__ = ["MeasuredPoints", "Measurement", "MotionSamples", "Trace", "channel_names", "part_of"]
+__all__ = ["STRIDE", "Measurement", "channel_names"]
 
 Array = NDArray[np.float64]
 
 STRIDE = 6
 """Contour errors are measured at every sixth sample: they change over tens of samples."""
 _TRACK_BINS = 400
-_LEAST_SAMPLES = 4096
-"""Shorter motion waits for more: between two pieces there are often a few moves only."""
-
-
-@dataclass(frozen=True, slots=True)
-class MotionSamples:
-    """Planned motion on the sampling grid with what belongs to each sample.
-
-    Attributes
-    ----------
-    path_mm, executed_mm : ndarray, shape (2, n)
-        X and Y as planned, and as the firmware executes them.
-    z_mm : ndarray, shape (n,)
-    extruding : ndarray of bool, shape (n,)
-    row : ndarray of int64, shape (n,)
-        Row of `moves` that each sample belongs to.
-    moves : Moves
-    first_move : int
-        Number of the first of them in the file.
-    """
-
-    path_mm: Array
-    executed_mm: Array
-    z_mm: Array
-    extruding: NDArray[np.bool_]
-    row: NDArray[np.int64]
-    moves: Moves
-    first_move: int = 0
-
-    def __len__(self) -> int:
-        return int(self.path_mm.shape[1])
 
 
 class Measurement:
@@ -112,23 +81,17 @@ class Measurement:
         beside: Callable[[MeasuredPoints], Array] | None = None,
         noted: Callable[[MeasuredPoints, Array], None] | None = None,
     ) -> None:
-        self._compensated = compensated
         self._beside, self._noted = beside, noted
         self._stride = STRIDE if trace is None else 1
-        self._tracer = None if trace is None else _Tracer(trace)
+        self._tracer = None if trace is None else Tracer(trace)
         self._dt_s = dt_s
-        self._machine = machine
-        self._point = EMPTY
         self._band = BandContent(machine, dt_s)
         self._names = names or channel_names(compensated=compensated)
         shown = channel_names(compensated=True) if beside else self._names
         self._shown = shown
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
-        self._streams: dict[str, MachineStream] = {}
-        # Plants that change do so where the motion has come to.
-        least = 1 if machine.schedules else _LEAST_SAMPLES
-        self._shaper = _ShaperStream(shaper, dt_s, least)
+        self._answers = Answers(machine, dt_s, shaper, self._names, compensated=compensated)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
         self._spectra = ErrorSpectra(machine, dt_s, self._names)
@@ -137,14 +100,12 @@ class Measurement:
         self._tiles = LayerRecorder(len(shown), self._stride * dt_s, takers)
         self._count = 0
         self._waiting: list[MeasuredPoints] = []
-        self._fresh = self._jumped = True
+        self._jumped = True
         self._last: MotionSamples | None = None
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Say where the machine is from now on."""
-        self._point = point
-        for stream in self._streams.values():
-            stream.operate_at(point)
+        self._answers.operate_at(point)
 
     def add(self, samples: MotionSamples) -> None:
         """Add motion."""
@@ -158,7 +119,7 @@ class Measurement:
                 self._jumped = False
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
-            self._measure(self._shaper.push(samples))
+            self._measure(self._answers.push(samples))
 
     def stand(self, samples: int) -> Array | None:
         """Stand still; return the position for every sample, (2, n), if it is known."""
@@ -182,41 +143,26 @@ class Measurement:
 
     def jump(self) -> None:
         """Say that the position is lost: the machine stands still when motion goes on."""
-        self._measure(self._shaper.flush())
+        self._measure(self._answers.flush())
         self._band.jump()
         self._spectra.jump()
-        self._fresh = self._jumped = True
+        self._jumped = True
         self._last = None
 
     def finish(self) -> None:
         """Say that the motion has ended."""
-        self._measure(self._shaper.flush())
+        self._measure(self._answers.flush())
         self._note(self._meter.flush())
         self._tiles.finish()
 
-    def _measure(self, shaped: _Shaped | None) -> None:
-        if shaped is None:
+    def _measure(self, found: Answered | None) -> None:
+        if found is None:
             return
-        if not self._streams:
-            self._streams = {
-                name: MachineStream(self._machine, self._dt_s, self._point) for name in self._names
-            }
-        elif self._fresh:
-            for stream in self._streams.values():
-                stream.stand()
-        self._fresh = False
-        commands = {
-            "before": shaped.path_mm if self._compensated else shaped.executed_mm,
-            "after": shaped.executed_mm,
-            "shaper": shaped.command,
-        }
-        answers = np.empty((len(self._names), *shaped.path_mm.shape))
-        for name, answer in zip(self._names, answers, strict=True):
-            self._streams[name].push(commands[name], shaped.path_mm, answer)
-        self._spectra.add(shaped.path_mm, answers, shaped.extruding)
+        path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding
+        self._spectra.add(path_mm, answer_mm, extruding)
         if self._tracer is not None:
-            self._tracer.wait(shaped.executed_mm, answers)
-        self._note(self._meter.push(shaped.path_mm, answers, shaped.extruding))
+            self._tracer.wait(found.executed_mm, answer_mm)
+        self._note(self._meter.push(path_mm, answer_mm, extruding))
 
     def _note(self, errors: ContourErrors) -> None:
         done = 0
@@ -321,173 +267,6 @@ def channel_names(*, compensated: bool) -> tuple[str, ...]:
     return ("before", "after", "shaper") if compensated else ("before", "shaper")
 
 
-@dataclass(frozen=True, slots=True)
-class Trace:
-    """Motion as measured, sample by sample.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first sample.
-    path_mm, executed_mm : ndarray, shape (2, n)
-        As planned, and as the firmware executes the written file.
-    simulated_mm : ndarray, shape (channels, 2, n)
-    error_mm : ndarray, shape (channels, n)
-        Contour errors.
-    z_mm, extruding, line, layer : ndarray, shape (n,)
-    """
-
-    first: int
-    path_mm: Array
-    executed_mm: Array
-    simulated_mm: Array
-    error_mm: Array
-    z_mm: Array
-    extruding: NDArray[np.bool_]
-    line: NDArray[np.int64]
-    layer: NDArray[np.int32]
-
-
-class _Tracer:
-    """Hold the motion until its errors are known."""
-
-    def __init__(self, trace: Callable[[Trace], None]) -> None:
-        self._trace = trace
-        self._executed: Array | None = None
-        self._simulated = np.zeros((0, 2, 0))
-        self._told = 0
-
-    def wait(self, executed_mm: Array, simulated_mm: Array) -> None:
-        if self._executed is None:
-            self._executed, self._simulated = executed_mm, simulated_mm
-        else:
-            self._executed = np.concatenate([self._executed, executed_mm], axis=1)
-            self._simulated = np.concatenate([self._simulated, simulated_mm], axis=2)
-
-    def tell(self, points: MeasuredPoints, error_mm: Array) -> None:
-        count = len(points)
-        assert self._executed is not None
-        executed, simulated = self._executed[:, :count], self._simulated[:, :, :count]
-        self._executed = self._executed[:, count:]
-        self._simulated = self._simulated[:, :, count:]
-        first, self._told = self._told, self._told + count
-        self._trace(
-            Trace(
-                first,
-                points.path_mm,
-                executed,
-                simulated,
-                error_mm,
-                points.z_mm,
-                points.extruding,
-                points.moves.line[points.row],
-                points.moves.layer[points.row],
-            )
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredPoints:
-    """What belongs to the samples at which contour errors are measured."""
-
-    path_mm: Array
-    z_mm: Array
-    extruding: NDArray[np.bool_]
-    row: NDArray[np.int64]
-    moves: Moves
-    first_move: int
-    jumped: bool = False
-
-    @classmethod
-    def of(cls, samples: MotionSamples, which: slice) -> MeasuredPoints:
-        """Return what belongs to some samples."""
-        return cls(
-            samples.path_mm[:, which].copy(),
-            samples.z_mm[which].copy(),
-            samples.extruding[which].copy(),
-            samples.row[which].copy(),
-            samples.moves,
-            samples.first_move,
-        )
-
-    def part(self, which: slice) -> MeasuredPoints:
-        """Return some of the points."""
-        return MeasuredPoints(
-            self.path_mm[:, which],
-            self.z_mm[which],
-            self.extruding[which],
-            self.row[which],
-            self.moves,
-            self.first_move,
-            self.jumped and not which.start,
-        )
-
-    def __len__(self) -> int:
-        return len(self.z_mm)
-
-
-@dataclass(frozen=True, slots=True)
-class _Shaped:
-    """Motion with the best shaper's command for it, shapes (2, n) and (n,)."""
-
-    command: Array
-    path_mm: Array
-    executed_mm: Array
-    extruding: NDArray[np.bool_]
-
-
-class _ShaperStream:
-    """The best shaper's command for a motion that arrives in blocks, with the delay taken out.
-
-    It comes once there are `least` samples of it.
-    """
-
-    def __init__(self, shaper: BestShaper, dt_s: float, least: int) -> None:
-        self._dt_s, self._least = dt_s, least
-        self._pulses = [
-            shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
-        ]
-        self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
-        self._path, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
-        self._extruding = np.zeros(0, bool)
-
-    def push(self, samples: MotionSamples) -> _Shaped | None:
-        """Return shaped commands and the motion they belong to, all but the last few samples."""
-        if self._path.shape[1] == 0:
-            # The machine stood where it begins.
-            self._path = np.repeat(samples.path_mm[:, :1], self._reach, axis=1)
-        self._path = np.concatenate([self._path, samples.path_mm], axis=1)
-        self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
-        self._extruding = np.concatenate([self._extruding, samples.extruding])
-        ready = len(self._extruding) - self._reach
-        return self._shape(ready) if ready >= self._least else None
-
-    def flush(self) -> _Shaped | None:
-        """Return what is held, as if the machine stood still from now on."""
-        if self._path.shape[1] == 0:
-            return None
-        out = self._shape(len(self._extruding))
-        self._path = self._path[:, :0]
-        return out
-
-    def _shape(self, ready: int) -> _Shaped:
-        # The path begins `reach` samples before what is held.
-        span = slice(self._reach, self._reach + ready)
-        shaped = [
-            shape(row, self._dt_s, p)[span] for row, p in zip(self._path, self._pulses, strict=True)
-        ]
-        out = _Shaped(
-            np.stack(shaped),
-            self._path[:, span],
-            self._executed[:, :ready],
-            self._extruding[:ready],
-        )
-        self._path = self._path[:, ready:]
-        self._executed = self._executed[:, ready:]
-        self._extruding = self._extruding[ready:]
-        return out
-
-
 class _Bins:
     """Mean squares over bins of time; two bins become one when there are too many."""
 
@@ -525,17 +304,4 @@ def _figures(contour: Tally, tracking: Tally) -> ErrorFigures:
         contour_max_um=1e3 * contour.max,
         tracking_rms_um=1e3 * tracking.rms,
         tracking_max_um=1e3 * tracking.max,
-    )
-
-
-def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
-    """Return the samples start..stop - 1."""
-    return MotionSamples(
-        samples.path_mm[:, start:stop],
-        samples.executed_mm[:, start:stop],
-        samples.z_mm[start:stop],
-        samples.extruding[start:stop],
-        samples.row[start:stop],
-        samples.moves,
-        samples.first_move,
     )

@@ -31,12 +31,14 @@ from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir
 from service.pipeline.layer_files import written_layers
 from service.pipeline.length import LengthGuard
-from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names
+from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.operating import Operation
+from service.pipeline.points import MotionSamples
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from service.pipeline.result import Result, StageTime
 from service.pipeline.shaping import ShapedMotion
+from service.pipeline.tracing import Trace
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 

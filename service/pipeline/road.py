@@ -46,14 +46,16 @@ from service.pipeline.compensating import (
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.layer_files import LayerWriter, written_layers
 from service.pipeline.length import LengthGuard
-from service.pipeline.measure import Measurement, MotionSamples, Trace, channel_names, part_of
+from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options, stamp
+from service.pipeline.points import MotionSamples, part_of
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
+from service.pipeline.tracing import Trace
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 

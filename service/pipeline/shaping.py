@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from models.schedule import OperatingPoint
 from models.shaping import OFF, AxisShaper, Shaping
-from service.pipeline.measure import MotionSamples, part_of
+from service.pipeline.points import MotionSamples, part_of
 
 __all__ = ["ShapedMotion", "shaped"]
 

@@ -17,12 +17,12 @@ from gcode.errors import GcodeError
 from models.machine import Machine
 from service.pipeline.columns import Table, csv_table, npz_table
 from service.pipeline.compensating import DT_S
-from service.pipeline.measure import Trace
 from service.pipeline.motion import simulate_file
 from service.pipeline.options import Options
 from service.pipeline.progress import ProgressCallback
 from service.pipeline.reading import DialectName
 from service.pipeline.road import compensate_file
+from service.pipeline.tracing import Trace
 
 __all__ = ["TrajectoryFormat", "write_trajectories"]
 

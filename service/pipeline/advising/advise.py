@@ -39,10 +39,11 @@ from service.pipeline.clock import StageClock
 from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir, replacing
 from service.pipeline.layer_files import LayerWriter, written_layers
-from service.pipeline.measure import STRIDE, Measurement, MotionSamples, channel_names
+from service.pipeline.measure import STRIDE, Measurement, channel_names
 from service.pipeline.motion import STANDING_S, TextMotion
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options, stamp
+from service.pipeline.points import MotionSamples
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts
 from service.pipeline.result import (

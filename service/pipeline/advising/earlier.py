@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from service.pipeline.measure import MeasuredPoints
+from service.pipeline.points import MeasuredPoints
 
 __all__ = ["EarlierErrors"]
 

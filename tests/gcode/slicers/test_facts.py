@@ -8,7 +8,10 @@ import json
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from gcode.slicers import facts
 from gcode.slicers.facts import LOOKED_AT_BYTES, facts_in, read_facts
 
 
@@ -156,3 +159,16 @@ def test_the_corpus(
         assert facts.filament_diameter_mm == 1.75
         assert facts.nozzle_diameter_mm is not None
         assert facts.number("machine_max_acceleration_x") is not None
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    st.lists(
+        st.sampled_from([b"TIME", b"time", b"ime", b"tT", b"\n", b";", 59 * b"x", 61 * b" "]),
+        max_size=20,
+    )
+)
+def test_lines_with_times_are_those_of_the_pattern(parts: list[bytes]) -> None:
+    text = b"".join(parts)
+    spans = [match.span() for match in facts._TIME_LINE.finditer(text)]
+    assert [match.span() for match in facts._time_lines(text)] == spans

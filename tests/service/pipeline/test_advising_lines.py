@@ -23,7 +23,7 @@ from models.store import load_machine
 from service.pipeline.advising.advice import Advice, Bound
 from service.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
 from service.pipeline.advising.removing import remove_advice
-from service.pipeline.measure import MotionSamples
+from service.pipeline.points import MotionSamples
 from service.pipeline.shaping import ShapedMotion
 
 OURS = Shaping(AxisShaper("zv", 41.0), AxisShaper("zv", 31.0))

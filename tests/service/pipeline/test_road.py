@@ -20,8 +20,9 @@ from models.plants import plant_set
 from models.reference_motion import reference_motion
 from models.store import load_machine
 from service.pipeline.compensating import PieceCompensator, Unfit
-from service.pipeline.measure import STRIDE, Measurement, MotionSamples
+from service.pipeline.measure import STRIDE, Measurement
 from service.pipeline.options import Options
+from service.pipeline.points import MotionSamples
 from service.pipeline.progress import Cancelled, Progress
 from service.pipeline.result import ErrorFigures, Result
 from service.pipeline.road import compensate_file, plan_file
