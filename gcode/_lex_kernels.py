@@ -5,6 +5,9 @@ early with a status when a line needs Python (`HANDBACK`), when the output is fu
 a table must grow (`GROW`) or when the line is an error.
 
 Behind the last line of the buffer there must be room of `PADDING` bytes that begins with a newline.
+
+Rows and tables are a hundred numbers to hand on, so what is called for every tenth line (`plain`,
+`recall`) is inlined.
 """
 
 from __future__ import annotations
@@ -52,7 +55,14 @@ from gcode._slots import (
     MEMO_STRIDE,
     OK,
 )
-from gcode._table_kernels import line_hash, memo_slot, put_event, recall_limits, settle
+from gcode._table_kernels import (
+    line_hash,
+    memo_slot,
+    put_event,
+    recall_limits,
+    settle,
+    settle_limits,
+)
 from models.bytes import byte_at
 from models.jit import kernel
 
@@ -253,4 +263,5 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
         i[I_POS] = i[I_END]
         i[I_LINE] += 1
     settle(f, i, rows)
+    settle_limits(i, rows)
     return DONE

@@ -186,7 +186,7 @@ def _end_of_words(buf: Any, p: int) -> int:
     return p
 
 
-@kernel(allocates=False)
+@kernel(force_inline=True, allocates=False)
 def plain(buf: Any, stop: int, f: Any, i: Any, rows: Any, m_words: Any) -> None:
     """Read plain lines from I_POS on; stop in front of the first that is not plain."""
     if f[F_UNIT_MM] != 1.0 or f[F_UNIT_E_MM] != 1.0 or i[I_HOLD]:

@@ -203,6 +203,8 @@ class Interpreter:
             elif status == at.FULL and i[at.I_MOVES] == 0 and i[at.I_EVENTS] == 0:
                 self._allocate(stop - begun, int(i[at.I_NEED]))
             else:
+                if status != at.DONE:
+                    state.settle()
                 end = int(i[at.I_POS])
                 blocks.append(self._block(begun, end))
                 begun = end
@@ -218,9 +220,8 @@ class Interpreter:
         self.state.allocate(rows)
 
     def _block(self, begun: int, end: int) -> ProgramBlock:
-        """Hand the rows over."""
+        """Hand the rows over; they must be settled."""
         state, i = self.state, self.state.i
-        state.settle()
         n, m = int(i[at.I_MOVES]), int(i[at.I_EVENTS])
         self._note_tables()
         moves = state.rows.moves(n, apart=bool(i[at.I_APART]))
