@@ -164,7 +164,6 @@ def choose_vertices(
     count: Any,
     slow: Any,
     z: Any,
-    fed: Any,
     command: Any,
     least: int,
     y_weight: float,
@@ -183,10 +182,9 @@ def choose_vertices(
     place, place_at, count, slow
         From `list_places`.
     z : ndarray of int64, shape (n,)
-    fed : ndarray, shape (n,)
-        Filament at the vertices, in lengths that count as much as a step of X.
     command : ndarray, shape (m, 3)
-        X and Y in steps and the filament at the samples 0, 1, ...
+        X and Y in steps and the filament at the samples 0, 1, ..., in lengths that count as much as
+        a step of X.
     y_weight : float
         What a squared step of Y counts, one of X being 1.
     step : ndarray, shape (2,)
@@ -240,6 +238,7 @@ def choose_vertices(
                     continue
                 i = came[j, d]
                 from_x, from_y, begin = place[j, d, 0], place[j, d, 1], place_at[j, d]
+                fed = _fed(command, begin)
                 ax, ay, rate_x, rate_y, rounding = 0.0, 0.0, 0.0, 0.0, 0.0
                 if i >= 0:
                     h, b = i // MOST_PLACES, i % MOST_PLACES
@@ -266,7 +265,7 @@ def choose_vertices(
                         x[q] = states[j, d, q]
                     s = int(np.ceil(begin + 1e-6))
                     end = min(int(np.floor(place_at[k, c] + 1e-6)), len(command) - 1)
-                    fed_per = (fed[k] - fed[j]) * per
+                    fed_per = (_fed(command, place_at[k, c]) - fed) * per
                     while s <= end and total < most:
                         t = s - begin
                         for axis in range(2):
@@ -281,7 +280,7 @@ def choose_vertices(
                                 x[q + 1] = pole[axis, r] * im + pole[axis, r + 1] * re
                             square = answer * answer + _SEEN * error * error
                             total += square if axis == 0 else y_weight * square
-                        gap = fed[j] + fed_per * t - command[s, 2]
+                        gap = fed + fed_per * t - command[s, 2]
                         total += gap * gap
                         s += 1
                     later = 0.0
@@ -361,6 +360,13 @@ def _at(command: Any, t: float) -> tuple[float, float]:
         command[k, 0] + w * (command[k + 1, 0] - command[k, 0]),
         command[k, 1] + w * (command[k + 1, 1] - command[k, 1]),
     )
+
+
+@kernel(inline=True)
+def _fed(command: Any, t: float) -> float:
+    """Find the filament between samples."""
+    k = min(max(int(t), 0), len(command) - 2)
+    return float(command[k, 2] + (t - k) * (command[k + 1, 2] - command[k, 2]))
 
 
 @kernel(inline=True)
