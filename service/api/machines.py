@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import date
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from models.errors import ModelError
 from models.machine import Machine
+from models.provenance import SourceFile
 from models.store import builtin_machines, load_machine, read_machine
 from service.api.access import Admin, Reader
 from service.api.machine_views import (
@@ -31,7 +32,16 @@ from service.machines.store import MachineStore
 from service.security.audit import record
 from service.security.callers import Caller
 
-__all__ = ["Author", "Message", "Name", "as_problems", "look_up", "router"]
+__all__ = [
+    "Author",
+    "IfMatch",
+    "Message",
+    "Name",
+    "as_problems",
+    "look_up",
+    "router",
+    "store_revision",
+]
 
 _LARGEST_BYTES = 4_000_000
 _BODY = {
@@ -68,6 +78,49 @@ def look_up(request: Request, name: str) -> Machine:
     """Return the newest state of a machine, approved or not; raise `Problem` if there is none."""
     with as_problems():
         return _machines(request).to_look_at(name).machine
+
+
+def store_revision(
+    request: Request,
+    response: Response,
+    name: str,
+    caller: Caller,
+    make: Callable[[Machine | None], Machine],
+    *,
+    if_match: str | None,
+    author: str | None,
+    message: str,
+    sources: Sequence[SourceFile] = (),
+) -> RevisionView:
+    """Store what is made of a machine's current state as its next revision, and fill the answer.
+
+    Parameters
+    ----------
+    make : callable
+        Is given the current machine, None if there is none of that name.
+
+    Raises
+    ------
+    Problem
+        409 for a built-in machine, 412 or 428 as `if_match` demands.
+    ModelError
+    """
+    store = _store(request)
+    expected = _expected(store, name, if_match)
+    machine = make(store.current(name).machine if expected else None)
+    made = store.add_revision(
+        name,
+        machine,
+        author=author or caller.owner,
+        message=message,
+        sources=sources,
+        expected=expected,
+    )
+    _note(request, caller, "change", made)
+    if expected == 0:
+        response.status_code = 201
+        response.headers["Location"] = f"/v1/machines/{name}"
+    return _changed(store, response, made)
 
 
 @router.get("", summary="List the machines")
@@ -124,24 +177,21 @@ async def put_machine(
     To change a machine say by `If-Match` which state the change was made on. A document that
     changes nothing makes no revision.
     """
-    store = _store(request)
-    expected = await run_in_threadpool(_expected, store, name, if_match)
+    await run_in_threadpool(_expected, _store(request), name, if_match)  # before the body
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
     with as_problems():
         machine = read_machine(content)
-        made = await run_in_threadpool(
-            store.add_revision,
+        return await run_in_threadpool(
+            store_revision,
+            request,
+            response,
             name,
-            machine,
-            author=author or caller.owner,
+            caller,
+            lambda _: machine,
+            if_match=if_match,
+            author=author,
             message=message,
-            expected=expected,
         )
-    await run_in_threadpool(_note, request, caller, "change", made)
-    if expected == 0:
-        response.status_code = 201
-        response.headers["Location"] = f"/v1/machines/{name}"
-    return await run_in_threadpool(_changed, store, response, made)
 
 
 @router.delete(

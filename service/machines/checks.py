@@ -21,6 +21,7 @@ __all__ = [
     "machine_from_config",
     "not_followed",
     "typed_in",
+    "with_room",
 ]
 
 _DEFAULT_HZ = 50.0
@@ -175,7 +176,7 @@ def machine_from_config(
     except ValidationError as error:
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
-    return machine.model_copy(update={"command": _with_room(machine.firmware)})
+    return machine.model_copy(update={"command": with_room(machine.firmware)})
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
@@ -199,7 +200,7 @@ def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
     }
 
 
-def _with_room(firmware: FirmwareFacts) -> CommandLimits:
+def with_room(firmware: FirmwareFacts) -> CommandLimits:
     """Return limits of the command that leave it room above what the printer allows a file."""
     usual = CommandLimits()
     return CommandLimits(

@@ -264,14 +264,22 @@ def put(
 @app.command("set-firmware")
 def set_firmware(
     name: Name,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The firmware section, as JSON.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="The firmware section as JSON, or what Marlin answers to M503."
+        ),
+    ],
     as_name: Annotated[
         str | None, typer.Option("--as", metavar="NAME", help="A copy under a free name.")
     ] = None,
     by: By = None,
     message: Message = "",
 ) -> None:
-    """Give a machine another firmware: its next revision, or with --as a copy."""
+    """Give a machine another firmware: its next revision, or with --as a copy.
+
+    Of an answer to M503, what it does not say stays as the machine has it.
+    """
     from service.machines.transfer import with_firmware_file
 
     resolver = open_machines()

@@ -14,7 +14,14 @@ from typing import Any, NamedTuple, TypeAlias
 
 from models.errors import ModelError
 
-__all__ = ["Fact", "Option", "PrinterConfig", "facts", "read_printer_config"]
+__all__ = [
+    "Fact",
+    "Option",
+    "PrinterConfig",
+    "facts",
+    "parse_printer_config",
+    "read_printer_config",
+]
 
 _LARGEST_BYTES = 4_000_000
 _SAVED = "#*# "
@@ -109,17 +116,23 @@ def read_printer_config(path: Path) -> PrinterConfig:
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise ModelError(f"{path}: over {_LARGEST_BYTES} bytes, not a printer.cfg")
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise ModelError(f"cannot read the configuration {path}: {error.strerror}") from None
+    return parse_printer_config(text, path.name)
+
+
+def parse_printer_config(text: str, name: str) -> PrinterConfig:
+    """Return what `read_printer_config` does, of the text of a file called `name`."""
+    lines = text.splitlines()
     own, includes = _parse(lines, saved=False)
     saved, _ = _parse(lines, saved=True)
     if not own:
-        raise ModelError(f"{path}: no [section] in it; give Klipper's printer.cfg")
+        raise ModelError(f"{name}: no [section] in it; give Klipper's printer.cfg")
     sections = {
         name: saved.get(name, {}) | own.get(name, {}) for name in dict.fromkeys([*own, *saved])
     }
-    return PrinterConfig(path.name, sections, includes)
+    return PrinterConfig(name, sections, includes)
 
 
 def facts(config: PrinterConfig) -> list[Fact]:

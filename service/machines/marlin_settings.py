@@ -12,9 +12,16 @@ from pydantic import ValidationError
 from models.errors import ModelError
 from models.machine import Machine
 from models.store import explain
-from service.machines.checks import typed_in
+from service.machines.checks import typed_in, with_room
 
-__all__ = ["ASSUMED", "firmware_section", "machine_from_m503", "read_travel"]
+__all__ = [
+    "ASSUMED",
+    "firmware_section",
+    "looks_like_m503",
+    "machine_from_m503",
+    "read_travel",
+    "with_m503",
+]
 
 ASSUMED = {
     "variant": "2.1",
@@ -31,6 +38,11 @@ _PER_TOOL = {"M92", "M201", "M203", "M900"}
 _LONGEST_LINE = 500
 
 _Words = dict[str, float | None]
+
+
+def looks_like_m503(text: str) -> bool:
+    """Return whether a text is an answer to M503, whole or in part."""
+    return not {"M92", "M201", "M203", "M204", "M205"}.isdisjoint(_commands(text))
 
 
 def firmware_section(text: str, name: str) -> dict[str, Any]:
@@ -142,6 +154,31 @@ def machine_from_m503(
             for axis, given, of_shaper in zip("xy", f_hz, tuned, strict=True)
         },
     }
+    try:
+        machine = Machine.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}") from None
+    return machine.model_copy(update={"command": with_room(machine.firmware)})
+
+
+def with_m503(machine: Machine, text: str, file: str) -> Machine:
+    """Return a machine with the limits of a printed M503; what that does not say stays.
+
+    A machine of another firmware becomes one with Marlin, with what most builds have (`ASSUMED`)
+    where M503 says nothing.
+
+    Raises
+    ------
+    ModelError
+        As of `machine_from_m503`.
+    """
+    said = firmware_section(text, file)
+    before: dict[str, Any] = dict(ASSUMED)
+    if machine.firmware.kind == "marlin":
+        before = machine.firmware.model_dump(mode="json", exclude_unset=True)
+    for part in ("planner", "shaper"):
+        said[part] = {**(before.get(part) or {}), **said[part]}
+    document = {**machine.model_dump(mode="json"), "firmware": {**before, **said}}
     try:
         return Machine.model_validate(document)
     except ValidationError as error:

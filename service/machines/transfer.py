@@ -12,6 +12,7 @@ from models.errors import ModelError
 from models.machine import Machine
 from models.provenance import SourceFile
 from models.store import explain, read_machine
+from service.machines.marlin_settings import looks_like_m503, with_m503
 from service.machines.revision import (
     Approval,
     Revision,
@@ -90,7 +91,13 @@ def import_file(
 
 
 def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFile]:
-    """Return the machine with the firmware section of a JSON file, and that file as a source.
+    """Return the machine with the firmware section of a file, and that file as a source.
+
+    Parameters
+    ----------
+    machine : Machine
+    file : Path
+        A section as JSON, or what Marlin answers to M503: then what that does not say stays.
 
     Raises
     ------
@@ -98,10 +105,16 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
         Naming the first field of the section that is wrong.
     """
     content = _content(file)
+    text = content.decode(errors="replace")
+    if looks_like_m503(text):
+        return with_m503(machine, text, file.name), source_file(file.name, content)
     try:
         section = from_json(content)
     except ValueError as error:
-        raise ModelError(f"{file}: not JSON ({error})") from None
+        raise ModelError(
+            f"{file}: neither a section as JSON ({error}) nor an answer to M503, which has M92 and "
+            "M203 in it"
+        ) from None
     if not isinstance(section, dict) or "kind" not in section:
         raise ModelError(f"{file}: a firmware section is an object that says its kind")
     try:

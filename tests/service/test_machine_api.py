@@ -22,6 +22,8 @@ from service.settings import Settings
 from tests.service.machines import make_machine, make_plants
 from tests.service.runners import pretend
 from tests.service.test_api import assert_problem, over, until
+from tests.service.test_machine_cli import CONFIG
+from tests.service.test_machine_m503 import M503
 
 MINE = "/v1/machines/mine"
 
@@ -262,3 +264,50 @@ def test_the_description_names_bodies_tags_and_problems(client: TestClient):
     assert set(change["responses"]) >= {"200", "201", "409", "412", "413", "422", "428"}
     assert "ETag" in change["responses"]["200"]["headers"]
     assert "/v1/machines/{name}/revisions/{number}/approve" in paths
+
+
+def settings(client: TestClient, text: str, headers: dict[str, str] | None = None, **query: Any):
+    return client.post(f"{MINE}/settings", content=text, params=query, headers=headers or {})
+
+
+def test_a_machine_of_an_answer_to_m503_and_its_next_revision(client: TestClient):
+    assert_problem(settings(client, M503), 422, "travel=XxYxZ", "235x235x250")
+    made = settings(client, M503, travel="235x235x250", file="a/m503.txt", fy=29, author="anna")
+    assert made.status_code == 201, made.text
+    assert made.headers["location"] == MINE
+    assert (made.json()["message"], made.json()["author"]) == ("from m503.txt", "anna")
+    machine = client.get(MINE).json()
+    assert machine["firmware"]["steps_per_mm"]["y"] == 80.4
+    assert machine["axes"]["y"]["nominal"]["modes"][0]["f_hz"] == 29
+    later = M503.replace("P510", "P900")
+    assert_problem(settings(client, later), 428, "If-Match")
+    assert_problem(settings(client, later, {"If-Match": '"0"'}), 412)
+    again = settings(client, later, {"If-Match": made.headers["etag"]})
+    assert (again.status_code, again.json()["number"]) == (200, 2)
+    assert client.get(MINE).json()["firmware"]["planner"]["accel_mm_s2"] == 900
+
+
+def test_a_machine_of_a_printer_cfg(client: TestClient):
+    made = settings(client, CONFIG, file="printer.cfg", title="Mine", fx=51)
+    assert made.status_code == 201, made.text
+    machine = client.get(MINE).json()
+    assert (machine["title"], machine["kinematics"]) == ("Mine", "corexy")
+    assert machine["axes"]["x"]["nominal"]["modes"][0]["f_hz"] == 51
+    answer = settings(client, CONFIG, {"If-Match": made.headers["etag"]})
+    assert_problem(answer, 422, "give another name")
+
+
+@pytest.mark.parametrize(
+    ("text", "query", "words"),
+    [
+        ("", {}, ["no [section] in it"]),
+        ("[printer]\n", {"file": "printer.cfg"}, ["printer.cfg: [printer] lacks max_velocity"]),
+        (M503, {"travel": "far"}, ["far", "235x235x250"]),
+        (M503, {"travel": "1x1x1", "kinematics": "delta"}, ["kinematics", "delta"]),
+        (M503, {"travel": "1x1x1", "fx": "0"}, ["fx: must be at least 1 (given: '0')"]),
+        (M503.replace("M92", "M93"), {"travel": "1x1x1"}, ["no M92 X in it"]),
+    ],
+)
+def test_settings_that_are_none_are_refused(client: TestClient, text, query, words):
+    assert_problem(settings(client, text, **query), 422, *words)
+    assert client.get(MINE).status_code == 404

@@ -67,7 +67,7 @@ def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) ->
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("{", "not JSON"),
+        ("{", "neither a section as JSON"),
         ("[]", "says its kind"),
         ('{"planner": {}}', "says its kind"),
         ('{"kind": "grbl"}', "firmware: kind must be klipper, marlin or reprapfirmware"),

@@ -125,3 +125,39 @@ def test_what_is_wrong_is_one_line(make, text: str, more: tuple[str, ...], words
     assert (code, out, err.count("\n")) == (2, "", 1)
     for word in words:
         assert word in err
+
+
+def test_an_own_machine_takes_a_later_answer_and_keeps_what_that_does_not_say(
+    make, capsys, tmp_path: Path
+) -> None:
+    make(M503, "--set", "min_steps_per_segment=1", "--set", "variant=2.0")
+    file = tmp_path / "later.txt"
+    file.write_text(M503.replace("P510.00", "P900.00").replace("M593 Y F31.00 D0.10", ""))
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 0
+    assert capsys.readouterr().out.startswith("mine: revision 2")
+    firmware = stored(capsys).firmware
+    assert (firmware.variant, firmware.min_steps_per_segment) == ("2.0", 1)
+    assert (firmware.planner.accel_mm_s2, firmware.planner.travel_accel_mm_s2) == (900, 530)
+    assert (firmware.shaper.freq_x_hz, firmware.shaper.freq_y_hz) == (40.5, 0)
+    assert run(["machines", "diff", "mine", "1", "2"]) == 0
+    assert "firmware.planner.accel_mm_s2: 510 -> 900" in capsys.readouterr().out
+
+
+def test_a_machine_of_another_firmware_becomes_one_with_marlin(capsys, tmp_path: Path) -> None:
+    file = tmp_path / "m503.txt"
+    file.write_text(M503)
+    assert run(["machines", "set-firmware", "ender3", str(file), "--as", "mine"]) == 0
+    capsys.readouterr()
+    firmware = stored(capsys).firmware
+    assert (firmware.kind, firmware.variant, firmware.steps_per_mm.y) == ("marlin", "2.1", 80.4)
+    file.write_text("echo:  M92 X80.00 Y80.00 Z400.00 E93.00\n")
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 2
+    assert "no M203 X in it; send M503 and save all" in capsys.readouterr().err
+
+
+def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> None:
+    fast = M503.replace("X500.00 Y400.00", "X900.00 Y900.00").replace("P510", "P30000")
+    make(fast.replace("M201 X500.00", "M201 X40000.00"))
+    command = stored(capsys).command
+    assert command.velocity_mm_s > 900
+    assert command.accel_mm_s2 > 30000

@@ -8,6 +8,7 @@ from pathlib import Path
 from playwright.sync_api import expect
 
 from tests.models.identification.recordings import QUICK_QUERY, quick_raw
+from tests.service.test_machine_m503 import M503
 from tests.web.machines import put
 from tests.web.served import Service
 from tests.web.visitor import Visitor
@@ -78,3 +79,24 @@ def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: 
     page.get_by_label("Name of your machine").fill("mine")
     page.get_by_role("button", name="Look at the fit").click()
     expect(page.get_by_role("alert")).to_contain_text("raw_data_x_broken.csv")
+
+
+def test_a_machine_is_made_of_what_marlin_answers(visitor: Visitor, tmp_path: Path):
+    file = tmp_path / "m503.txt"
+    file.write_text(M503)
+    page = visitor.open("#/machines", viewport={"width": 390, "height": 844})
+    form = page.locator("form", has_text="M503")
+    expect(page.get_by_label("How far X, Y and Z reach")).to_be_hidden()
+    form.locator("input[type=file]").set_input_files(file)
+    form.get_by_label("Name of your machine").fill("of-m503")
+    page.get_by_label("How far X, Y and Z reach").fill("235x235x250")
+    visitor.shoot(page, "machine-settings")
+    page.get_by_role("button", name="Make the machine").click()
+    expect(page.get_by_role("heading", name="of-m503")).to_be_visible()
+    expect(page.locator("p.lead")).to_contain_text("marlin")
+    file.write_text(M503.replace("P510", "P900"))
+    again = page.locator("form", has_text="M503")
+    again.locator("input[type=file]").set_input_files(file)
+    page.get_by_role("button", name="Keep as the next revision").click()
+    expect(page.get_by_role("button", name="Show differences")).to_be_visible()
+    visitor.shoot(page, "machine-of-m503")

@@ -9,6 +9,7 @@ import { folded } from "../parts/table.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { identifiedPlots, responsePlots } from "../machine/plots.js";
 import { revisionPanel } from "../machine/revisions.js";
+import { settingsPanel } from "../machine/settings.js";
 
 /** @param {import("../lib/router.js").Place} place */
 export async function show({ main, signal, setTitle, params: [name] }) {
@@ -27,6 +28,7 @@ export async function show({ main, signal, setTitle, params: [name] }) {
     isOwn ? h("section", null, h("h2", null, "Revisions"), history) : null,
     h("section", null, h("h2", null, isOwn ? "New measurement" : "Measure yours"),
       measurementPanel({ machines, base: machine.name, own: isOwn, signal })),
+    isOwn && machine.firmware.kind === "marlin" ? h("section", null, h("h2", null, "New settings"), settingsPanel({ machine: summary, signal })) : null,
     h("section", null, folded("Travel and limits", () => facts(machine)),
       h("div.actions", null,
         fileLink({ text: "Document (JSON)", href: where, name: `${machine.name}.json` }))));
@@ -50,8 +52,9 @@ export async function show({ main, signal, setTitle, params: [name] }) {
 /** @param {string} where @param {AbortSignal} signal */
 async function identification(where, signal) {
   const { revisions } = await getJson(`${where}/revisions`, { signal });
-  // A machine that was put as a document has no identification; asking would only tell so by 404.
-  if (!Object.keys(revisions.at(-1)?.provenance ?? {}).length) return null;
+  // What nobody measured has no identification; asking would only tell so by 404.
+  const origins = Object.values(revisions.at(-1)?.provenance ?? {});
+  if (origins.every((/** @type {any} */ of) => of?.kind === "typed in")) return null;
   try {
     return await getJson(`${where}/identification`, { signal });
   } catch (/** @type {any} */ error) {

@@ -3,6 +3,7 @@
 import { getJson } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
 import { measurementPanel } from "../machine/measurement.js";
+import { settingsPanel } from "../machine/settings.js";
 
 /** @param {import("../lib/router.js").Place} place */
 export async function show({ main, signal, setTitle }) {
@@ -15,7 +16,7 @@ export async function show({ main, signal, setTitle }) {
   const draw = () => {
     const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
     const fits = (/** @type {any} */ m) => words.every((/** @type {string} */ w) => `${m.title} ${m.name}`.toLowerCase().includes(w));
-    fill(list, group("Your own", own.filter(fits), own.length ? null : "None yet. Upload a measurement below, or put a document with the API."),
+    fill(list, group("Your own", own.filter(fits), own.length ? null : "None yet. Make one below."),
       group("Built in", builtin.filter(fits), null));
   };
   draw();
@@ -23,7 +24,10 @@ export async function show({ main, signal, setTitle }) {
     h("div.head", null, h("h1", null, "Machines"), h("div.find.end", null, h("label.sr", { for: "find" }, "Find a machine"), search)),
     h("p.lead", null, "A compensator is as good as the model of the machine. Built-in machines are single printers that somebody measured; yours is another one."),
     list,
-    h("section", null, h("h2", null, "A machine of your own"),
+    h("section", null, h("h2", null, "Make your own of the printer's settings"),
+      h("p.hint", null, "Limits and travel come from the firmware. How the frame rings is measured afterwards, on the machine's page."),
+      settingsPanel({ machine: null, signal })),
+    h("section", null, h("h2", null, "Or of measurements, with limits like another machine's"),
       measurementPanel({ machines, base: null, signal })));
 }
 

@@ -24,6 +24,7 @@ _ALSO_REFUSED = {
     "POST /printers/{name}/api/files/local": [422],
     "GET /v1/machines/{name}": [422],
     "PUT /v1/machines/{name}": [412, 422, 428],
+    "POST /v1/machines/{name}/settings": [412, 422, 428],
     "DELETE /v1/machines/{name}": [412, 422],
     "GET /v1/machines/{name}/revisions": [422],
     "GET /v1/machines/{name}/revisions/{number}": [422],

@@ -38,6 +38,7 @@ RULES = {
     "GET /v1/machines/{name}": READ,
     "PUT /v1/machines/{name}": ADMIN,
     "DELETE /v1/machines/{name}": ADMIN,
+    "POST /v1/machines/{name}/settings": ADMIN,
     "GET /v1/machines/{name}/revisions": READ,
     "GET /v1/machines/{name}/revisions/{number}": READ,
     "GET /v1/machines/{name}/diff": READ,

@@ -1,0 +1,136 @@
+"""Machines from what a printer says of itself: Klipper's printer.cfg, Marlin's answer to M503."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
+
+from models.errors import ModelError
+from models.machine import Machine
+from service.api.access import Admin
+from service.api.machine_views import RevisionView
+from service.api.machines import Author, IfMatch, Message, Name, as_problems, store_revision
+from service.api.problems import Problem, responses
+from service.api.uploads import receive_document, safe_name
+from service.machines import marlin_settings
+from service.machines.checks import machine_from_config
+from service.machines.klipper_config import parse_printer_config
+from service.machines.revision import source_file
+
+__all__ = ["router"]
+
+_LARGEST_BYTES = 4_000_000
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "description": "The text: Klipper's printer.cfg, or what Marlin answers to M503.",
+        "content": {"text/plain": {"schema": {"type": "string"}}},
+    }
+}
+
+Hertz = Annotated[float | None, Query(ge=1, le=1000, allow_inf_nan=False)]
+
+router = APIRouter(prefix="/v1/machines", tags=["machines"])
+
+
+@dataclass(frozen=True, slots=True)
+class _Given:
+    """What goes along with the text; of a machine that is there only `file` counts."""
+
+    file: Annotated[
+        str, Query(max_length=255, description="Name of the file, for messages and the record.")
+    ] = "settings.txt"
+    travel: Annotated[
+        str,
+        Query(
+            max_length=60,
+            description="How far the axes reach in mm, which M503 does not say.",
+            examples=["235x235x250"],
+        ),
+    ] = ""
+    kinematics: Annotated[
+        str, Query(max_length=20, description="Of a Marlin printer: `cartesian` or `corexy`.")
+    ] = "cartesian"
+    title: Annotated[str, Query(max_length=200, description="What people call it.")] = ""
+    fx: Hertz = None
+    fy: Hertz = None
+
+
+@router.post(
+    "/{name}/settings",
+    response_model=RevisionView,
+    responses={
+        200: {"description": "The next revision, with Marlin's values"},
+        201: {"description": "The first revision of a new machine", "model": RevisionView},
+        **responses(403, 409, 412, 413, 422, 428),
+    },
+    openapi_extra=_BODY,
+    summary="Make a machine of its printer's settings",
+)
+async def put_settings(
+    request: Request,
+    response: Response,
+    name: Name,
+    caller: Admin,
+    given: Annotated[_Given, Depends()],
+    author: Author = None,
+    message: Message = "",
+    if_match: IfMatch = None,
+) -> RevisionView:
+    """Make a machine of a printer.cfg or of an answer to M503; its plants are still to be measured.
+
+    A machine that is there takes an answer to M503 (with `If-Match`, as of a PUT): what that does
+    not say stays.
+    """
+    content = await receive_document(request, max_bytes=_LARGEST_BYTES)
+    file = safe_name(given.file)
+    text = content.decode(errors="replace")
+
+    def made(before: Machine | None) -> Machine:
+        if before is None:
+            return _new(text, file, name, given)
+        if not marlin_settings.looks_like_m503(text):
+            raise ModelError(
+                f"{name!r} is there already, and a printer.cfg makes a new machine: give another "
+                "name, or compare the two with `stillpath machines check`"
+            )
+        return marlin_settings.with_m503(before, text, file)
+
+    with as_problems():
+        return await run_in_threadpool(
+            store_revision,
+            request,
+            response,
+            name,
+            caller,
+            made,
+            if_match=if_match,
+            author=author,
+            message=message or f"from {file}",
+            sources=[source_file(file, content)],
+        )
+
+
+def _new(text: str, file: str, name: str, given: _Given) -> Machine:
+    f_hz = (given.fx, given.fy)
+    if not marlin_settings.looks_like_m503(text):
+        config = parse_printer_config(text, file)
+        return machine_from_config(config, name, title=given.title, f_hz=f_hz)
+    if not given.travel:
+        raise Problem(
+            422,
+            "The travel is missing",
+            "M503 does not say how far the axes reach: say travel=XxYxZ in mm, like 235x235x250.",
+        )
+    return marlin_settings.machine_from_m503(
+        text,
+        file,
+        name,
+        travel_mm=marlin_settings.read_travel(given.travel),
+        kinematics=given.kinematics,
+        title=given.title,
+        f_hz=f_hz,
+    )

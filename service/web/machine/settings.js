@@ -1,0 +1,80 @@
+/** A machine of what its printer says of itself: Klipper's printer.cfg, Marlin's answer to M503. */
+
+import { isAbort, request } from "../lib/api.js";
+import { announce } from "../lib/announce.js";
+import { fill, h } from "../lib/dom.js";
+import { problemPanel } from "../lib/problem.js";
+import { dropZone } from "../parts/drop-zone.js";
+
+const NAME = "[a-z0-9][a-z0-9_\\-]{0,63}";
+const TRAVEL = "\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*";
+const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
+
+/**
+ * @param {{machine: {name: string, revision: string} | null, signal: AbortSignal}} about `machine`:
+ *   the one that gets Marlin's values, or null for a new one.
+ * @returns {HTMLElement}
+ */
+export function settingsPanel({ machine, signal }) {
+  let text = "";
+  let file = "";
+  const status = h("div", { "aria-live": "polite" });
+  const keep = h("button.main", { type: "submit", disabled: true }, machine ? "Keep as the next revision" : "Make the machine");
+  const name = h("input", { type: "text", id: "settings-name", required: true, pattern: NAME, maxlength: "60", autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
+  const travel = h("input", { type: "text", id: "travel", pattern: TRAVEL, placeholder: "235x235x250", "aria-describedby": "travel-hint" });
+  const kinematics = h("select", { id: "kinematics" }, [["cartesian", "Cartesian"], ["corexy", "CoreXY"]].map(([value, words]) => h("option", { value }, words)));
+  const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "1000", step: "any", placeholder: "as the file says" }));
+  const marlin = h("div", { hidden: true },
+    h("div.fields", null,
+      field("travel", "How far X, Y and Z reach, mm", travel, "M503 does not say it."),
+      field("kinematics", "Kinematics", kinematics)),
+    h("p.hint", null, "What else M503 does not say (version, MIN_STEPS_PER_SEGMENT, S-curves) is taken as most builds have it. Look it up in Configuration.h, and change it in the machine's document if yours differs."));
+  return h("form.card", { onsubmit: (/** @type {Event} */ event) => {
+    event.preventDefault();
+    send();
+  } },
+    dropZone(machine
+      ? { label: "Drop Marlin's answer to M503 here, or choose it", hint: "What it does not say stays as it is", accept: ".txt,.log,.gcode,text/*", onChoose }
+      : { label: "Drop printer.cfg or Marlin's answer to M503 here", hint: "Klipper: printer.cfg. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.txt,.log,text/*", onChoose }),
+    machine ? null : [
+      h("div.fields", null,
+        field("settings-name", "Name of your machine", name, "Small letters, digits, - and _."),
+        field("fx", "Resonance of X, Hz", fx, "If you know it; a measurement takes its place."),
+        field("fy", "Resonance of Y, Hz", fy)),
+      marlin],
+    h("div.actions", null, keep), status);
+
+  /** @param {File[]} files */
+  async function onChoose([chosen]) {
+    text = await chosen.text();
+    file = chosen.name;
+    marlin.hidden = !M503.test(text);
+    travel.required = !machine && !marlin.hidden;
+    keep.disabled = false;
+    fill(status);
+  }
+
+  async function send() {
+    const target = machine ? machine.name : name.value;
+    keep.disabled = true;
+    try {
+      const query = machine || marlin.hidden
+        ? { file, fx: fx.value, fy: fy.value }
+        : { file, fx: fx.value, fy: fy.value, travel: travel.value.trim(), kinematics: kinematics.value };
+      const headers = { "Content-Type": "text/plain", ...(machine ? { "If-Match": `"${machine.revision}"` } : {}) };
+      const made = await (await request(`/v1/machines/${encodeURIComponent(target)}/settings`, { method: "POST", query, headers, body: text, signal })).json();
+      announce(`Revision ${made.number} of ${target} is kept.`);
+      const here = `#/machines/${encodeURIComponent(target)}`;
+      if (location.hash === here) dispatchEvent(new HashChangeEvent("hashchange"));
+      else location.hash = here;
+    } catch (error) {
+      if (!isAbort(error)) fill(status, problemPanel(error));
+      keep.disabled = false;
+    }
+  }
+}
+
+/** @param {string} id @param {string} label @param {Element} control @param {string} [hint] */
+function field(id, label, control, hint) {
+  return h("div.field", null, h("label", { for: id }, label), control, hint ? h("p.hint", { id: `${id}-hint` }, hint) : null);
+}
