@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from compensation._window_kernels import BLOCK
+from compensation._least_squares_kernels import BLOCK
 from compensation.base import DesignError
 from compensation.basis import BASES
 from compensation.lifted_window import LiftedWindow

@@ -361,7 +361,9 @@ class PreviewAxis:
         design, path = self._designs.design(rung), task.path_mm
         window, update = self.window, self.update
         padding = -(-len(path) // update) * update + window - len(path)
-        padded = np.append(path - path[0], np.full(padding, path[-1] - path[0]))
+        padded = np.empty(len(path) + padding)
+        np.subtract(path, path[0], out=padded[: len(path)])
+        padded[len(path) :] = path[-1] - path[0]
         command = _products(padded, design.path_gain)
         targets = self._designs.lifted.target[:, None] * padded
         if targets_mm is not None:
@@ -406,12 +408,13 @@ def _products(samples: Array, gain: Array) -> Array:
     """
     update, window = gain.shape
     windows = (len(samples) - window) // update
-    total = np.zeros((windows, update))
-    for first in range(0, window, update):
+    blocks = samples[: windows * update].reshape(windows, update)
+    total = blocks @ gain[:, :update].T
+    for first in range(update, window, update):
         blocks = samples[first : first + windows * update].reshape(windows, update)
         part = gain[:, first : first + update]
         total += blocks[:, : part.shape[1]] @ part.T
-    return total
+    return np.asarray(total)
 
 
 def _snapped(position: Array, bounds: Bounds) -> Array:

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
-from compensation._window_kernels import BLOCK, backward, factorise, forward, weighted_gram
+from compensation._least_squares_kernels import (
+    BLOCK,
+    backward,
+    factorise,
+    forward,
+    weighted_gram,
+)
 from compensation.lifted_window import lifted_window
 from compensation.preview import PreviewDesign, running_gram
 from compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
