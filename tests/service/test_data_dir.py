@@ -51,7 +51,7 @@ def test_data_of_an_earlier_version_go_on_being_used_and_both_sides_say_so(home:
     assert data_dir() == home  # what was made there is not lost either
     capsys.readouterr()
     _tell_where(settings)
-    assert "go on being used" in capsys.readouterr().out
+    assert "go on being used" in "".join(capsys.readouterr())
     assert run(["machines"]) == 0
     out, err = capsys.readouterr()
     assert "mine" in out
@@ -66,7 +66,7 @@ def test_what_is_named_is_used_without_a_word(
     settings = Settings()
     assert settings.data_dir == data_dir() == Path("stillpath-data").resolve()
     _tell_where(settings)
-    assert "go on being used" not in capsys.readouterr().out
+    assert "go on being used" not in "".join(capsys.readouterr())
     assert run(["machines"]) == 0
     assert not capsys.readouterr().err
 
