@@ -21,10 +21,11 @@ from models.jit import kernel
 
 __all__ = ["MOST_PLACES", "choose_vertices", "hop", "list_places", "nearly_back"]
 
-MOST_PLACES = 25
+MOST_PLACES = 13
 """Places that are tried for a vertex in a slow place; in others it is `_PLACES`."""
 _PLACES = 8
 _BESIDE = 2
+"""How many steps, along X and Y together, the former lie beside the nearest one."""
 _REACH = 2.0
 """How much earlier or later a vertex may come, in samples."""
 _WAYS = 4
@@ -113,7 +114,7 @@ def list_places(
         got = 0
         if slow[k]:
             for i in range(-_BESIDE, _BESIDE + 1):
-                for j in range(-_BESIDE, _BESIDE + 1):
+                for j in range(abs(i) - _BESIDE, _BESIDE - abs(i) + 1):
                     x, y = nearest[k, 0] + beside * i, nearest[k, 1] + beside * j
                     if x < low[0] or x > high[0] or y < low[1] or y > high[1]:
                         continue
@@ -208,16 +209,89 @@ def choose_vertices(
     -----
     No segment goes straight back along the one before it in a slow place.
     """
-    n, order = len(place), pole.shape[1] // 2
-    width = 4 * order
+    n, width = len(place), 2 * pole.shape[1]
     cost = np.full((n, MOST_PLACES), np.inf)
-    rank = np.full((n, MOST_PLACES), np.inf)  # the cost and what is still to come of it
+    rank = np.full((n, MOST_PLACES), np.inf)
     came = np.full((n, MOST_PLACES), -1, np.int64)
     states = np.zeros((n, MOST_PLACES, width))
     ways, n_ways = np.zeros((n, _WAYS), np.int64), np.zeros(n, np.int64)
+    x, kept = np.empty(width), np.empty(_WAYS)
+    return _follow(
+        place,
+        place_at,
+        count,
+        slow,
+        z,
+        command,
+        least,
+        y_weight,
+        step,
+        corexy,
+        pole,
+        weight,
+        direct,
+        energy,
+        cost,
+        rank,
+        came,
+        states,
+        ways,
+        n_ways,
+        x,
+        kept,
+        chosen,
+    )
+
+
+@kernel(allocates=False)
+def _follow(
+    place: Any,
+    place_at: Any,
+    count: Any,
+    slow: Any,
+    z: Any,
+    command: Any,
+    least: int,
+    y_weight: float,
+    step: Any,
+    corexy: bool,
+    pole: Any,
+    weight: Any,
+    direct: Any,
+    energy: Any,
+    cost: Any,
+    rank: Any,
+    came: Any,
+    states: Any,
+    ways: Any,
+    n_ways: Any,
+    x: Any,
+    kept: Any,
+    chosen: Any,
+) -> bool:
+    """See `choose_vertices`; the rest is room to work in.
+
+    Parameters
+    ----------
+    cost : ndarray, shape (n, MOST_PLACES)
+        Of the best way to a place, infinite to begin with.
+    rank : ndarray, shape (n, MOST_PLACES)
+        The cost and what is still to come of it, infinite to begin with.
+    came : ndarray of int64, shape (n, MOST_PLACES)
+        Vertex and place that the best way comes from, or -1.
+    states : ndarray, shape (n, MOST_PLACES, 4 order)
+        The printer's there, X's before Y's.
+    ways : ndarray of int64, shape (n, _WAYS)
+        Places that are followed on from a vertex, the best first.
+    n_ways : ndarray of int64, shape (n,)
+        How many they are, none to begin with.
+    x : ndarray, shape (4 order,)
+    kept : ndarray, shape (_WAYS,)
+    """
+    n, order = len(place), pole.shape[1] // 2
+    width = 4 * order
     cost[0, 0] = rank[0, 0] = 0.0
     n_ways[0] = 1
-    x, kept = np.empty(width), np.empty(_WAYS)
     for k in range(1, n):
         last = k + 1 == n
         look_back = _LOOK_BACK_SLOW if slow[k] or slow[k - 1] else _LOOK_BACK
@@ -235,6 +309,7 @@ def choose_vertices(
             for way in range(n_ways[j]):
                 d = ways[j, way]
                 if cost[j, d] >= kept[_WAYS - 1]:
+                    some = True
                     continue
                 i = came[j, d]
                 from_x, from_y, begin = place[j, d, 0], place[j, d, 1], place_at[j, d]
@@ -246,17 +321,20 @@ def choose_vertices(
                     rounding = 1.0 / (begin - place_at[h, b])
                     rate_x, rate_y = ax * rounding, ay * rounding
                 for c in range(count[k]):
+                    bx, by = float(place[k, c, 0] - from_x), float(place[k, c, 1] - from_y)
+                    span = place_at[k, c] - begin
+                    far = alone or hop(bx, by, z[k] - z[j], corexy) >= least
+                    if span < _SHORT or not far:
+                        continue
                     # What would not be followed on need not be known.
                     total, most = cost[j, d], min(rank[k, c], kept[_WAYS - 1])
-                    span = place_at[k, c] - begin
-                    if total >= most or span < _SHORT:
+                    if total >= most:
+                        some = True
                         continue
-                    bx, by = float(place[k, c, 0] - from_x), float(place[k, c, 1] - from_y)
-                    if hop(bx, by, z[k] - z[j], corexy) < least and not alone:
-                        continue
-                    per = 1.0 / span
                     if careful and nearly_back(ax, ay, bx, by):
                         continue
+                    some = True
+                    per = 1.0 / span
                     jump = per + rounding
                     total += _jolt(bx * per - rate_x, by * per - rate_y, jump, step, corexy)
                     if last:
@@ -299,7 +377,6 @@ def choose_vertices(
                         came[k, c] = j * MOST_PLACES + d
                         for q in range(width):
                             states[k, c, q] = x[q]
-                        some = True
             found += int(some)
         # The best first: then the others of a vertex are soon seen to be worse.
         for way in range(_WAYS):
