@@ -69,9 +69,9 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         _alone(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
-        _tell_where(settings)
         # The application does so again; what uvicorn makes of an error there nobody can read.
         open_database(settings).dispose()
+        _tell_where(settings)
         for address in _addresses(host, listener.getsockname()[1]):
             sys.stdout.write(f"stillpath: {address}\n")
         sys.stdout.flush()
