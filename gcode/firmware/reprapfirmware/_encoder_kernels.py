@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcode.firmware._writing_kernels import printed_feedrate
+from gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
 from models.jit import kernel
 
 __all__ = ["assign_speeds", "keep_apart"]
@@ -31,7 +32,7 @@ def assign_speeds(
     junction_mm_s: NDArray[np.float64],
     missed_s: NDArray[np.float64],
     start_s: float,
-    short_s: float,
+    clock_hz: float,
     feedrate: NDArray[np.float64],
     predicted_s: NDArray[np.float64],
 ) -> None:
@@ -49,9 +50,11 @@ def assign_speeds(
     ----------
     missed_s : ndarray
         How much longer each move took than foreseen, when it was planned before.
-    short_s : float
-        Accelerations shorter than this are left out.
+    clock_hz : float
+        Of the motors' steps. Phases last whole clocks; rounded by themselves, those of a long
+        stretch would add up to some tenths of a ms.
     """
+    short_s = SHORT_CLOCKS / clock_hz
     count = len(length_mm)
     begin = start_s  # of the move before
     enter_before = 0.0
@@ -66,6 +69,11 @@ def assign_speeds(
         # By how much a peak of speed must stand out.
         band = accel_mm_s2[i] * short_s
         band_before = accel_mm_s2[i - 1] * short_s if i > 0 else 0.0
+        # As the newest of the ring a move begins so that it can brake to rest within its length. If
+        # that cuts off the peak of the move before, the look-ahead does not raise it later.
+        brakes = float(np.sqrt(2.0 * accel_mm_s2[i] * length_mm[i]))
+        if enter_before < brakes < fastest and before < brakes + band_before:
+            fastest = brakes
         band_next = 0.0
         following = 0.0  # what the next move will ask for
         if i + 1 < count and ours[i + 1]:
@@ -78,7 +86,7 @@ def assign_speeds(
             lasts = 0.0
             if i > 0:
                 lasts = missed_s[i - 1] + _lasts_s(
-                    length_mm[i - 1], enter_before, enter, before, accel_mm_s2[i - 1], short_s
+                    length_mm[i - 1], enter_before, enter, before, accel_mm_s2[i - 1], clock_hz
                 )
             if not ours[i] or k == _ROUNDS:
                 break
@@ -120,7 +128,7 @@ def assign_speeds(
         before, enter_before = v, enter
     if count:
         predicted_s[count - 1] = missed_s[count - 1] + _lasts_s(
-            length_mm[count - 1], enter_before, 0.0, before, accel_mm_s2[count - 1], short_s
+            length_mm[count - 1], enter_before, 0.0, before, accel_mm_s2[count - 1], clock_hz
         )
 
 
@@ -143,15 +151,15 @@ def _speed(length: float, lasts_s: float, enter: float, accel: float) -> float:
 
 @kernel
 def _lasts_s(
-    length: float, enter: float, leave: float, speed: float, accel: float, short_s: float
+    length: float, enter: float, leave: float, speed: float, accel: float, clock_hz: float
 ) -> float:
-    """Time of a move between the speeds at its ends."""
+    """Time of a move between the speeds at its ends: whole clocks for each phase."""
     up = (speed * speed - enter * enter) / (2.0 * accel)
     down = (speed * speed - leave * leave) / (2.0 * accel)
     top = speed
     if up + down < length:
         higher = max(enter, leave)
-        if higher + accel * short_s > speed and higher >= 0.9 * speed:
+        if higher + accel * SHORT_CLOCKS / clock_hz > speed and higher >= 0.9 * speed:
             top = higher
             if enter >= leave:
                 up = 0.0
@@ -161,7 +169,8 @@ def _lasts_s(
         top = float(np.sqrt(max(accel * length + 0.5 * (enter * enter + leave * leave), 0.0)))
         top = max(top, enter, leave)
         up, down = length, 0.0
-    return (2.0 * top - enter - leave) / accel + (length - up - down) / top
+    ramps = np.rint((top - enter) / accel * clock_hz) + np.rint((top - leave) / accel * clock_hz)
+    return float(ramps + np.rint((length - up - down) / top * clock_hz)) / clock_hz
 
 
 @kernel

@@ -26,7 +26,6 @@ from gcode.firmware.encoding import (
     limits_in_force,
 )
 from gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
-from gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
 from gcode.firmware.reprapfirmware.limits import RepRapLimits
 from gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
 from gcode.pieces import Piece
@@ -49,6 +48,7 @@ deceleration the firmware's own pressure advance steps by twice the jerk."""
 _DIAGONAL = 1.5
 """A CoreXY motor may run so much faster than the path, and Z's direction change so much more."""
 _PASSES = 2
+_EXACT_S = 1e-9
 _POLL_S = 2e-3
 """The firmware looks every 2 ms whether moves are to be frozen."""
 _SHIFT = 0.3
@@ -138,14 +138,17 @@ class RepRapEncoder:
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 
         foreseen = (length, moves.end_s, moves.planned_s, speed, accel, junction)
-        begin_s, short_s = float(timeline.start_s[0]), SHORT_CLOCKS / self._firmware.step_clock_hz
+        begin_s, clock_hz = float(timeline.start_s[0]), self._firmware.step_clock_hz
         feedrate, predicted, missed = (np.zeros(len(rows)) for _ in range(3))
         for _ in range(_PASSES):
-            assign_speeds(ours, *foreseen, missed, begin_s, short_s, feedrate, predicted)
+            assign_speeds(ours, *foreseen, missed, begin_s, clock_hz, feedrate, predicted)
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             # Only rests, whose moves brake for what comes later, are foreseen a little wrong.
-            missed += phases.accel_s + phases.cruise_s + phases.decel_s - predicted
+            miss = phases.accel_s + phases.cruise_s + phases.decel_s - predicted
+            if np.max(np.abs(miss), initial=0.0) < _EXACT_S:
+                break
+            missed += miss
         self._check_rate(phases, piece)
         return encoded_piece(timeline, moves, self._limits, feedrate, phases)
 
@@ -184,7 +187,9 @@ class RepRapEncoder:
         if len(end_s) == 0:
             return segments
         final = final_segments(segments)
-        end_mm[:3] = on_steps(end_mm[:3].T, self._firmware, self._kinematics).T
+        # Not Z: the firmware limits speeds at corners by directions as they are written, and a slow
+        # climb, a vase's, in steps is flat and then too steep.
+        end_mm[:2] = on_steps(end_mm[:3].T, self._firmware, self._kinematics)[:, :2].T
         end_mm[:, final] = segments.end_mm[:, final]
         fresh = np.append(True, final[:-1])
         start_mm = np.roll(segments.end_mm[:2], 1, axis=1)
