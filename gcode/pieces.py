@@ -264,8 +264,7 @@ class Splitter:
             if not closed and _shortest_s(moves) < self._longest_s:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
-            limits = self._tables[0]
-            phases = plan_moves(rows_of(moves, slice(0, last)), limits, self._machine)
+            phases = self._plan(rows_of(moves, slice(0, last)))
             if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
                 # A move of no length has no plan; leave its neighbourhood as it is.
                 self._raw[:last] |= xy[:last]
@@ -286,8 +285,11 @@ class Splitter:
             if natural and self._kit.extruder_alone_stops:
                 phases = rows_of(phases, slice(0, last))
             else:
-                phases = plan_moves(rows_of(moves, slice(0, last)), limits, self._machine)
+                phases = self._plan(rows_of(moves, slice(0, last)))
             yield self._piece(last, phases)
+
+    def _plan(self, moves: Moves) -> Phases:
+        return plan_moves(moves, self._tables[0], self._machine, rests_apart=True)
 
     def _most_moves(self, moves: Moves, events: Events) -> int:
         """Return how many of the moves a piece may have: all, or less where too much is held."""
@@ -357,7 +359,7 @@ def excerpt(piece: Piece, first: int, last: int, machine: Machine) -> Piece:
         moves=moves,
         events=rows_of(piece.events, slice(0, 0)),
         text=b"",
-        phases=plan_moves(moves, piece.limits, machine),
+        phases=plan_moves(moves, piece.limits, machine, rests_apart=True),
     )
 
 

@@ -99,6 +99,10 @@ class Voice(Protocol):
         """A second G or M in a line is no command of its own (not so in RepRapFirmware)."""
 
     @property
+    def folds_case(self) -> bool:
+        """Lower case is read as upper case."""
+
+    @property
     def coarse_extruder(self) -> bool:
         """Relative E adds up in 32-bit floats: far from 0 small moves lose digits (Marlin)."""
 
@@ -238,8 +242,13 @@ class FirmwareKit(Protocol):
         Limits of Z and of the extruder stay.
         """
 
-    def planner(self) -> Planner:
-        """Return a planner at rest."""
+    def planner(self, *, rests_apart: bool = False) -> Planner:
+        """Return a planner at rest.
+
+        A firmware may join moves that are too short for it with the next one. With `rests_apart`
+        it does not where that is of Z or of the extruder alone, so that rests are what they are in
+        the file.
+        """
 
     def encoder(self) -> Encoder:
         """Return an encoder of the stream."""

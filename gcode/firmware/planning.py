@@ -40,7 +40,9 @@ def stops(events: Events) -> NDArray[np.bool_]:
     return np.asarray(_STOPS[events.kind])
 
 
-def plan_moves(moves: Moves, limits: Sequence[Limits], machine: Machine) -> Phases:
+def plan_moves(
+    moves: Moves, limits: Sequence[Limits], machine: Machine, *, rests_apart: bool = False
+) -> Phases:
     """Plan moves from rest to rest.
 
     Parameters
@@ -49,13 +51,15 @@ def plan_moves(moves: Moves, limits: Sequence[Limits], machine: Machine) -> Phas
     limits : sequence of Limits
         The table of `Moves.limits_id`.
     machine : Machine
+    rests_apart : bool
+        See `FirmwareKit.planner`.
 
     Raises
     ------
     GcodeError
         For a move that the firmware refuses, or that takes more than 20 minutes.
     """
-    planner = kit(machine).planner()
+    planner = kit(machine).planner(rests_apart=rests_apart)
     planner.queue_moves(moves, limits)
     phases = planner.flush()
     check_moves_end(phases, lambda index: int(moves.line[index]))

@@ -29,7 +29,8 @@ _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
 _SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 _POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")
 _EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)")
-_E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)", re.IGNORECASE)
+_E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)")
+_E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
 _NUMBERED = re.compile(rb"^\s*N\d+\s*")
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
@@ -66,6 +67,7 @@ class StreamWriter:
 
     def __init__(self, firmware: FirmwareKit, stamp: str) -> None:
         self._voice = firmware.voice()
+        self._e_word = _E_WORD_FOLDED if self._voice.folds_case else _E_WORD
         self._extruder_alone_stops = firmware.extruder_alone_stops
         self._limits_now: Limits | None = None
         """What the printer plans with, while streaming."""
@@ -257,7 +259,7 @@ class StreamWriter:
         if _SET_POSITION.match(code) and (state.absolute_e or piece.modal_after.absolute_e):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
-            line = _shifted_e(line, (extruded_mm - planned) / state.extrude_factor)
+            line = self._shifted_e(line, (extruded_mm - planned) / state.extrude_factor)
             self._set_by(line)
             return self._file_modes(state) + line
         if _SET_POSITION.match(code):
@@ -280,7 +282,7 @@ class StreamWriter:
         own = piece.limits[int(moves.limits_id[row])]
         lead = self._limits_to(self._voice.in_stream(own))
         lead += self._file_modes(state)
-        word = _E_WORD.search(code) if state.absolute_e else None
+        word = self._e_word.search(code) if state.absolute_e else None
         if word is not None:
             ends = float(word.group(1))
             fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
@@ -318,10 +320,19 @@ class StreamWriter:
 
     def _set_by(self, line: bytes) -> None:
         """Take note of a line that sets E to where the file counts from."""
-        word = _E_WORD.search(line.split(b";", 1)[0])
+        word = self._e_word.search(line.split(b";", 1)[0])
         if word is not None:
             self._zero_mm = 0.0
             self._reads(float(word.group(1)))
+
+    def _shifted_e(self, line: bytes, gap_mm: float) -> bytes:
+        """Return a G92 line whose E is larger by `gap_mm`: the extruder is that far ahead."""
+        code, mark, comment = line.partition(b";")
+        word = self._e_word.search(code)
+        if word is None or abs(gap_mm) < _LEAST_GAP_MM:
+            return line
+        value = f"E{float(word.group(1)) + gap_mm:.7f}".encode()
+        return code[: word.start()] + value + code[word.end() :] + mark + comment
 
     def _file_extruder(self, file_mm: float) -> bytes:
         """Line after which the printer's E reads what the file's does."""
@@ -431,16 +442,6 @@ class StreamWriter:
 
 def _held_back(line: bytes) -> bytes:
     return b"; stillpath, held back: " + line
-
-
-def _shifted_e(line: bytes, gap_mm: float) -> bytes:
-    """Return a G92 line whose E is larger by `gap_mm`: the extruder is that far ahead."""
-    code, mark, comment = line.partition(b";")
-    word = _E_WORD.search(code)
-    if word is None or abs(gap_mm) < _LEAST_GAP_MM:
-        return line
-    value = f"E{float(word.group(1)) + gap_mm:.7f}".encode()
-    return code[: word.start()] + value + code[word.end() :] + mark + comment
 
 
 def _feed_line(feedrate_mm_min: float) -> bytes:

@@ -105,6 +105,20 @@ FLOW = (
     "G1 X158.284 Y148.156 F18000\nG1 X159.747 Y147.662\nM221 S90\nG1 X161.243 Y147.662 E0.04643\n"
     "G1 X160.917 Y149.687 F18000\nG1 F1208\nG1 E0.75000 F1800\n"
 )
+RETRACTION = (
+    "M83\nG1 X138.259 Y118.237 E-.01404\nG1 X138.32 Y118.237 E-.01404\nG1 E-.92978 F2100\n"
+    "G1 Z4.8 F720\nG1 X133.71 Y117.819 E.02766\n"
+)
+"""The second move has fewer than 6 steps: Marlin joins it with the retraction."""
+SWALLOWED = (
+    "G1 X141.741 Y142.018 E0.00346\nG1 X141.831 Y141.917 E0.00414\nG10 L2 P1 X5\n"
+    "G1 X141.888 Y141.859 E0.00249\nSET_VELOCITY_LIMIT ACCEL=5\nG1 X142.577 Y141.394 E0.00382\n"
+)
+SMALL_LETTER = (
+    "G1 X33.564 Y24.219 E-.10216\nG1 X33.239 Y23.894 E-.10913\nG1 Z1e263.913290592 F9000\n"
+    "G1 X38.525 Y10.46\nG1 X35.574 Y4.357 E.01566\n"
+)
+"""Where small letters are no words, Z1e263 is Z1."""
 NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
 NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
@@ -117,7 +131,7 @@ NO_TIME = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS, FLOW])
+@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER])
 def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
     through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)

@@ -306,6 +306,22 @@ def test_short_moves_are_swallowed_and_made_up_for() -> None:
     assert np.all(duration(plan(machine(min_steps_per_segment=1), [[0], [0.05], [0.1]], 20.0)) > 0)
 
 
+def test_rests_of_a_file_stay_apart_from_what_the_firmware_joins_with_them() -> None:
+    """4 steps of X at 80 per mm, then a retraction: joined by the firmware, apart in a file."""
+    firmware = machine(min_steps_per_segment=6)
+    points = [[0, 0, 0, 0], [10, 0, 0, 1], [10.05, 0, 0, 1], [10.05, 0, 0, 0.2]]
+    moves = moves_through(points, 50.0)
+    joined, apart = (Planner(firmware, rests_apart=rests_apart) for rests_apart in (False, True))
+    for planner in (joined, apart):
+        planner.queue_moves(moves, [initial_limits(firmware)])
+    swallowed, told = joined.flush(), apart.flush()
+    assert duration(swallowed)[1] == 0.0
+    assert swallowed.direction[2, 0] > 0.0
+    assert np.all(duration(told) > 0.0)
+    assert told.direction[2, 0] == 0.0
+    np.testing.assert_allclose(told.start_mm[2, :2], [10.05, 0.0], atol=1e-9)
+
+
 def test_a_short_way_with_a_retraction_is_measured_along_the_filament() -> None:
     # 4 steps of X and 100 of E: the path is 1 mm of filament, at 10 mm/s.
     phases = plan(machine(), [[0, 0, 0, 0], [0.05, 0, 0, -1]], 10.0, retract_accel_mm_s2=1e5)

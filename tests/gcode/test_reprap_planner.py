@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gcode.firmware.planning import join_phases
@@ -374,6 +374,8 @@ def plan_plainly(moves: Moves, limits: RepRapLimits, firmware: RepRapFirmware) -
                     new.enter = last.leave
         while open_moves and 2 * len(frozen) < ring:
             lead = end - now
+            # On the edge of being late the kernels' whole clocks may decide otherwise.
+            assume(abs(lead - firmware.prepare_least_s) > 1e-5)
             if not frozen:
                 start = now + firmware.prepare_ahead_s
             elif lead > firmware.prepare_ahead_s + 1e-9:

@@ -85,8 +85,8 @@ class KlipperKit:
             square_corner_velocity_mm_s=corner,
         )
 
-    def planner(self) -> Planner:
-        """Return a planner at rest."""
+    def planner(self, *, rests_apart: bool = False) -> Planner:  # noqa: ARG002
+        """Return a planner at rest; this firmware joins no moves."""
         return Planner(self._firmware)
 
     def encoder(self) -> KlipperEncoder:

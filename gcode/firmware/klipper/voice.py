@@ -26,6 +26,7 @@ class KlipperVoice:
     )
     stand_still = b"G4 P0 ; stand still\n"
     positioning_sets_extruder = False
+    folds_case = True
     coarse_extruder = False
     one_command = True
     shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"

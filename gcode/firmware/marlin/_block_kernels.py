@@ -57,7 +57,8 @@ C_STEPS_PER_MM = 0  # x y z e
 C_FAMILY, C_CORE, C_CLASSIC_JERK, C_SMALL_SEGMENTS = 4, 5, 6, 7
 C_MIN_STEPS, C_QUEUE, C_SLOWDOWN, C_MIN_SPEED, C_ADVANCE = 8, 9, 10, 11, 12
 C_TIMER_HZ, C_SMOOTHING_HZ, C_MIN_RATE, C_S_CURVE = 13, 14, 15, 16
-C_SIZE = 17
+C_RESTS_APART = 17  # short moves are not joined with moves of Z or the extruder alone
+C_SIZE = 18
 
 RELEASE, BUGFIX, PRUSA = 0, 1, 2
 
@@ -102,9 +103,13 @@ def append(
         New number of rows; OK or what is wrong with which move.
     """
     rounds = facts[C_FAMILY] != PRUSA
+    apart, last = facts[C_RESTS_APART] != 0.0, len(speed) - 1
     for m in range(len(speed)):
         row = queue[count]
         limit = limits[limits_id[m]]
+        fewest = facts[C_MIN_STEPS]
+        if apart and (m == last or not _moves_xy(start, end, m + 1)):
+            fewest = 1.0
         if not (speed[m] > 0.0):
             return count, BAD_SPEED, m
         # After homing, G92 of an axis and the like the machine is where the file says.
@@ -116,20 +121,26 @@ def append(
             state[S_ASKED + k] = end[m, k]
         state[S_KNOWN] = 1.0
         row[Q_INDEX] = first_index + m
-        _block(start[m], end[m], speed[m], limit, facts, state, row)
+        _block(start[m], end[m], speed[m], limit, facts, fewest, state, row)
         count += 1
     return count, OK, 0
 
 
 @kernel
 def _block(
-    start: Any, end: Any, speed: float, limit: Any, facts: Any, state: Any, row: Any
+    start: Any,
+    end: Any,
+    speed: float,
+    limit: Any,
+    facts: Any,
+    fewest: float,
+    state: Any,
+    row: Any,
 ) -> None:
-    """Fill the row of one move and move the state on."""
+    """Fill the row of one move and move the state on; one of fewer steps is swallowed."""
     family = facts[C_FAMILY]
     rounds = family != PRUSA
     core = facts[C_CORE] != 0.0
-    fewest = facts[C_MIN_STEPS]
     s0 = end[0] * facts[C_STEPS_PER_MM]
     s1 = end[1] * facts[C_STEPS_PER_MM + 1]
     s2 = end[2] * facts[C_STEPS_PER_MM + 2]
@@ -260,6 +271,11 @@ def _block(
     state[S_SPEED + 3] = v3
     state[S_NOMINAL] = nominal
     state[S_BLOCKS] = blocks + 1.0
+
+
+@kernel(inline=True)
+def _moves_xy(start: Any, end: Any, m: int) -> bool:
+    return bool(start[m, 0] != end[m, 0] or start[m, 1] != end[m, 1])
 
 
 @kernel

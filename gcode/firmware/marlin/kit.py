@@ -142,9 +142,9 @@ class MarlinKit:
             jerk_y_mm_s=jerk * mine.jerk_y_mm_s,
         )
 
-    def planner(self) -> Planner:
+    def planner(self, *, rests_apart: bool = False) -> Planner:
         """Return a planner at rest."""
-        return Planner(self._firmware, corexy=self._corexy)
+        return Planner(self._firmware, corexy=self._corexy, rests_apart=rests_apart)
 
     def encoder(self) -> MarlinEncoder:
         """Return an encoder of the stream."""

@@ -40,6 +40,8 @@ class Planner(QueuePlanner):
         Limits that G-code can change come with the moves.
     corexy : bool
         Steps and caps are those of the motors A = X + Y and B = X - Y.
+    rests_apart : bool
+        A move before one of Z or the extruder alone, and the last one, are executed however short.
 
     Notes
     -----
@@ -47,9 +49,12 @@ class Planner(QueuePlanner):
     duration, and the next row starts where the machine stands.
     """
 
-    def __init__(self, firmware: Marlin, *, corexy: bool = False) -> None:
+    def __init__(
+        self, firmware: Marlin, *, corexy: bool = False, rests_apart: bool = False
+    ) -> None:
         super().__init__(blocks.Q_SIZE)
         self._facts = planner_facts(firmware, corexy=corexy)
+        self._facts[blocks.C_RESTS_APART] = rests_apart
         self._s_curve = firmware.s_curve
         self._state = np.zeros(blocks.S_SIZE)
         self._state[blocks.S_ENTRY2] = -1.0

@@ -35,6 +35,7 @@ class MarlinVoice:
     file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:
+        self.folds_case = firmware.case_insensitive
         self._shaper = firmware.shaper
         self._has_shaper = firmware.variant != "2.0"
         if firmware.shaper is not None:

@@ -79,8 +79,8 @@ class RepRapKit:
         raised |= {name: jerk * getattr(mine, name) for name in _JERKS}
         return replace(mine, **raised)
 
-    def planner(self) -> RepRapPlanner:
-        """Return a planner at rest."""
+    def planner(self, *, rests_apart: bool = False) -> RepRapPlanner:  # noqa: ARG002
+        """Return a planner at rest; this firmware joins no moves."""
         return RepRapPlanner(self._firmware, self._machine.kinematics)
 
     def encoder(self) -> RepRapEncoder:

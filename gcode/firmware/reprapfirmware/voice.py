@@ -36,6 +36,7 @@ class RepRapVoice:
     )
     stand_still = b"M400\n"
     positioning_sets_extruder = False
+    folds_case = True
     coarse_extruder = False
     one_command = False
 
