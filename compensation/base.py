@@ -47,6 +47,10 @@ class Compensator(Protocol):
         """Say where the machine is during the next piece; it stands still now."""
         ...
 
+    def ease(self, accel_share: float) -> bool:
+        """Ask for at most this share of the machine's acceleration; return whether it can."""
+        ...
+
     def compensate(
         self,
         y_d_mm: NDArray[np.float64],
@@ -87,3 +91,7 @@ class Memoryless:
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Do nothing."""
+
+    def ease(self, accel_share: float) -> bool:
+        """Return false unless it is 1: the path decides."""
+        return accel_share == 1.0

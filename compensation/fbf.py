@@ -129,6 +129,7 @@ class PreviewFbf:
         self._dt_s = dt_s
         self.along = along
         self._limits = machine.command
+        self._accel_share = 1.0
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
         self._last: list[AxisCommand] = []
         self.rungs: tuple[int, ...] = ()
@@ -161,6 +162,11 @@ class PreviewFbf:
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Do nothing: the plants of this machine stay."""
+
+    def ease(self, accel_share: float) -> bool:
+        """Ask for at most this share of the machine's acceleration from now on."""
+        self._accel_share = accel_share
+        return True
 
     def compensate(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> Array:
         """Command of a piece that starts and ends standing still on the path.
@@ -214,7 +220,7 @@ class PreviewFbf:
         return self._accel_limit_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm])
 
     def _accel_limit_mm_s2(self, asked: list[Extremes]) -> float:
-        ceiling = self._limits.accel_mm_s2
+        ceiling = self._accel_share * self._limits.accel_mm_s2
         path_accel = max(one.accel for one in asked) / self._dt_s**2
         return min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
 

@@ -210,6 +210,10 @@ class RippleCompensator:
         """See `compensation.base.Compensator.operate_at`."""
         self._inner.operate_at(point)
 
+    def ease(self, accel_share: float) -> bool:
+        """See `compensation.base.Compensator.ease`."""
+        return self._inner.ease(accel_share)
+
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
     ) -> Array:

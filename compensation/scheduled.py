@@ -62,6 +62,7 @@ class ScheduledCompensator:
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s)
         self._made: dict[OperatingPoint, Compensator] = {}
+        self._share = 1.0
         self._knowing: set[OperatingPoint] = set()
         """Points whose compensators know the state of the machine."""
         self._past = np.zeros((2, 1))
@@ -119,6 +120,11 @@ class ScheduledCompensator:
         # Others need no standing time anywhere; the nodes that a print never touches are not made.
         self.lead_s, self.tail_s = max(c.lead_s for c in made), max(c.tail_s for c in made)
 
+    def ease(self, accel_share: float) -> bool:
+        """See `compensation.base.Compensator.ease`."""
+        self._share = accel_share
+        return all(one.ease(accel_share) for one in list(self._made.values()))
+
     def compensate(
         self,
         y_d_mm: Array,
@@ -155,6 +161,7 @@ class ScheduledCompensator:
                 }
                 then = then.model_copy(update={"command": limits.model_copy(update=room)})
             self._made[point] = self._make(then)
+            self._made[point].ease(self._share)
         return self._made[point]
 
     def _told(self, point: OperatingPoint) -> Compensator:

@@ -34,10 +34,16 @@ DT_S = 1e-3
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
+_ACCEL_SHARES = (1.0, 0.8, 0.6)
+"""Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
 
 
 class Unfit(ValueError):
     """A piece that had better leave as it came; the message is the reason."""
+
+
+class _Jerky(Unfit):
+    """A motor's speed would step by too much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,9 +118,27 @@ class PieceCompensator:
         try:
             if self._machine.schedules:
                 self._operate_at(point)
-            return self._compensate(piece)
+            return self._eased(piece)
         except (DesignError, GcodeError) as error:
             raise Unfit(str(error)) from error
+
+    def _eased(self, piece: Piece) -> CompensatedPiece:
+        """Compensate, with less acceleration where the motors need it."""
+        jerky: _Jerky | None = None
+        for share in _ACCEL_SHARES:
+            if not self.compensator.ease(share):
+                break
+            try:
+                return self._compensate(piece)
+            except _Jerky as error:
+                jerky = jerky or error
+            except DesignError:
+                # With less it does not follow the path.
+                if jerky is None:
+                    raise
+                break
+        assert jerky is not None
+        raise jerky
 
     def _operate_at(self, point: OperatingPoint) -> None:
         self.compensator.operate_at(point)
@@ -181,7 +205,7 @@ class PieceCompensator:
             if step <= limit:
                 return segments, encoded
             tolerance *= 0.5
-        raise Unfit(
+        raise _Jerky(
             f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
             f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
         )

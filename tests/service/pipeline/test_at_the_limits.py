@@ -57,6 +57,28 @@ def test_a_vase_on_a_machine_with_a_slow_z() -> None:
     assert deviation(made, made.encoded.phases)[made.extruding].max() < 5e-3
 
 
+def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far() -> None:
+    """20 m/s2 of X and of Y are 40 m/s2 for a motor, 40 mm/s in a segment of 1 ms."""
+    ring = "G1 X60 Y84.6 E1.1\nG1 X35.4 Y60 E1.1\nG1 X60 Y35.4 E1.1\nG1 X84.6 Y60 E1.1\n"
+    text = f"{HEAD}SET_VELOCITY_LIMIT ACCEL=12000\nG1 X84.6 F24000\n{ring}"
+    bends_mm = []
+    for step_mm_s in (100.0, 27.0):
+        command = CommandLimits(accel_mm_s2=20_000.0, speed_step_mm_s=step_mm_s)
+        changes = {"kinematics": "corexy", "command": command}
+        machine = load_machine("ender3").model_copy(update=changes)
+        piece = pieces_of(text, machine)[-1]
+        work = PieceCompensator(machine, Options())
+        work.compensator.reset(piece.phases.start_mm[0, :2])
+        made = work.compensate(piece)
+        phases = made.encoded.phases
+        speed = phases.direction[:, :2] * phases.cruise_mm_s[:, None]
+        motors = speed @ np.array([[1.0, 1.0], [1.0, -1.0]])
+        assert np.max(np.abs(np.diff(motors, axis=0))) <= step_mm_s
+        bends_mm.append(made.bend_mm)
+    assert bends_mm[0] == pytest.approx(20e-3, rel=0.02)
+    assert bends_mm[1] <= 16e-3 * 1.001
+
+
 def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
     """Moves that keep their own lines because Z could not follow are no secret."""
     machine = load_machine("voron-v0")
