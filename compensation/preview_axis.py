@@ -114,7 +114,7 @@ class _Drive:
     ----------
     task : AxisTask
     rung : int
-    path_mm, weight : ndarray, shape (windows * update + window,)
+    path_mm : ndarray, shape (windows * update + window,)
         Of the task, relative to where the path begins, and beyond its end.
     targets_mm : ndarray, shape (components, windows * update + window)
     command : ndarray, shape (windows, update)
@@ -129,7 +129,6 @@ class _Drive:
     rung: int
     path_mm: Array
     targets_mm: Array
-    weight: Array
     command: Array
     state: Array
     solved: dict[int, tuple[Array, Array]] = field(default_factory=dict)
@@ -327,12 +326,14 @@ class PreviewAxis:
             if not (at in drive.solved and np.array_equal(drive.solved[at][0], z)):
                 rests = task.stops[met[at] : behind[at]] - start
                 span = slice(start, start + window)
+                weight = np.full(window, WEIGHT_REST)
+                weight[: n - start] = task.weight[span]
                 command = solve_window(
                     self._designs.design(rung, REST_FUNCTIONS) if len(rests) else design,
                     z,
                     drive.path_mm[span],
                     drive.targets_mm[:, span],
-                    drive.weight[span],
+                    weight,
                     rests,
                     bounds,
                 )
@@ -345,7 +346,8 @@ class PreviewAxis:
         u[n - 1] = end_mm - origin
         states = self._advanced(last_states, u[(windows - 1) * update : n - 1])
         # Off the rounding by which a bounded solution may miss the end of the travel.
-        position = _snapped(u[:n] + origin, task.bounds)
+        u += origin
+        position = _snapped(u[:n], task.bounds)
         position[-1] = end_mm
         return AxisCommand(position, states - self._resting(end_mm - origin))
 
@@ -364,17 +366,17 @@ class PreviewAxis:
         padded = np.empty(len(path) + padding)
         np.subtract(path, path[0], out=padded[: len(path)])
         padded[len(path) :] = path[-1] - path[0]
-        command = _products(padded, design.path_gain)
+        nodes = _products(padded, design.path_gain[design.nodes], update)
         targets = self._designs.lifted.target[:, None] * padded
         if targets_mm is not None:
             slid = self._designs.lifted.mix @ (targets_mm - path)
             targets[:, : len(path)] += slid
             for component, gain in zip(slid, design.target_gain, strict=True):
                 behind = np.append(component, np.zeros(padding))
-                command += _products(behind, gain)
-        weight = np.append(task.weight, np.full(padding, WEIGHT_REST))
-        state = command @ design.state_drive.T
-        made = _Drive(task, rung, padded, targets, weight, command, state)
+                nodes += _products(behind, gain, update)
+        command = nodes @ design.spread.T
+        state = nodes @ (design.state_drive @ design.spread).T
+        made = _Drive(task, rung, padded, targets, command, state)
         # Targets of the members' own come in an array that changes.
         self._made = made if targets_mm is None else None
         return made
@@ -401,20 +403,19 @@ def _changes(command: Array) -> tuple[Array, Array]:
     return np.diff(standing, 2), np.diff(standing)[:-1]
 
 
-def _products(samples: Array, gain: Array) -> Array:
-    """Products of a gain, (update, window), with all windows, one row each.
+def _products(samples: Array, gain: Array, update: int) -> Array:
+    """Products of a gain, (k, window), with all windows, one row each.
 
     Windows overlap; so the gain is taken apart, and no sample has to be copied.
     """
-    update, window = gain.shape
+    window = gain.shape[1]
     windows = (len(samples) - window) // update
-    blocks = samples[: windows * update].reshape(windows, update)
-    total = blocks @ gain[:, :update].T
-    for first in range(update, window, update):
-        blocks = samples[first : first + windows * update].reshape(windows, update)
+    total = np.zeros((windows, len(gain)))
+    for first in range(0, window, update):
         part = gain[:, first : first + update]
+        blocks = samples[first : first + windows * update].reshape(windows, update)
         total += blocks[:, : part.shape[1]] @ part.T
-    return np.asarray(total)
+    return total
 
 
 def _snapped(position: Array, bounds: Bounds) -> Array:

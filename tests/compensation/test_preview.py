@@ -320,3 +320,16 @@ def test_components_are_the_members(seed: int, count: int) -> None:
     # The part that no command changes drops out of differences.
     a, b = (costs(0.01 * rng.normal(size=60)) for _ in range(2))
     assert a[0] - b[0] == pytest.approx(a[1] - b[1], rel=1e-3, abs=1e-3 * max(a[0], b[0]))
+
+
+@pytest.mark.parametrize(("n", "price"), [(90, 0.03), (90, 1.0), (18, 3.0)])
+@pytest.mark.parametrize("count", [1, 4])
+def test_nodes_tell_the_whole_command(count: int, n: int, price: float) -> None:
+    design = PreviewDesign(members(count), n, price=price)
+    at_nodes = design.path_gain[design.nodes]
+    assert len(design.nodes) < (100 if n == 90 else 19)
+    missed = np.abs(design.spread @ at_nodes - design.path_gain)
+    # Of a path that is 200 mm away all the time, with whatever signs: nm.
+    assert 200.0 * missed.sum(axis=1).max() < 1e-6
+    of_components = np.einsum("k,knw->nw", design.lifted.target, design.target_gain)
+    np.testing.assert_allclose(of_components, at_nodes, atol=1e-12)
