@@ -43,6 +43,7 @@ _BLOCKS = (
 )
 """How blocks of settings begin and end: to be looked for one after the other, as a pattern of both
 takes the square of the time where many begin and none ends."""
+_COMMENT = re.compile(rb"\n;[^\n]*")
 _SETTING = re.compile(rb"^; ([a-z][a-z0-9_]*) = ?([^\r\n]*)", re.MULTILINE)
 _CURA_SETTING = re.compile(rb"^;SETTING_3 ([^\r\n]*)", re.MULTILINE)
 _GAP = re.compile(r"[^\S\n]{2,}")
@@ -129,9 +130,11 @@ def read_facts(file: BinaryIO) -> SlicerFacts:
 
 def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
     """Return what the two ends of a text say."""
+    estimate, silent, first_layer = _estimates(head, tail)
+    # Nearly all of it are moves, which no pattern below looks at.
+    head, tail = _comments(head), _comments(tail)
     slicer, version = _identity(head)
     settings = _settings(head, tail)
-    estimate, silent, first_layer = _estimates(head, tail)
     flavor = _FLAVOR.search(head)
     return SlicerFacts(
         slicer=slicer,
@@ -142,6 +145,11 @@ def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
         first_layer_s=first_layer,
         settings=MappingProxyType(settings),
     )
+
+
+def _comments(text: bytes) -> bytes:
+    """Return the lines that are nothing but a comment."""
+    return b"".join(_COMMENT.findall(b"\n" + text))
 
 
 def _identity(head: bytes) -> tuple[str, str]:
