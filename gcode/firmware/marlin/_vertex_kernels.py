@@ -41,6 +41,10 @@ _JOLT = 20.0
 """Samples. What makes steps of an excess of speed; large, so that there is none where it can be."""
 _SEEN = 0.1
 """What the square of an error counts by itself, that of the printer's answer being 1."""
+_ALONG = 0.1
+"""What a square along the path counts, one across it being 1: only the latter is seen on a part."""
+_FAR, _FAR_COUNTS = 1.2, 1.0
+"""What a squared error is above the former, in steps of X, counts by the latter too."""
 
 
 @kernel(inline=True)
@@ -166,8 +170,9 @@ def choose_vertices(
     slow: Any,
     z: Any,
     command: Any,
+    heading: Any,
     least: int,
-    y_weight: float,
+    unit: Any,
     step: Any,
     corexy: bool,
     pole: Any,
@@ -186,8 +191,10 @@ def choose_vertices(
     command : ndarray, shape (m, 3)
         X and Y in steps and the filament at the samples 0, 1, ..., in lengths that count as much as
         a step of X.
-    y_weight : float
-        What a squared step of Y counts, one of X being 1.
+    heading : ndarray, shape (m, 2)
+        The path's direction there, a unit vector.
+    unit : ndarray, shape (2,)
+        How long a step of X and one of Y are, in steps of X.
     step : ndarray, shape (2,)
         By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
         at a vertex, beyond what rounding brings; more is made to cost much.
@@ -223,8 +230,9 @@ def choose_vertices(
         slow,
         z,
         command,
+        heading,
         least,
-        y_weight,
+        unit,
         step,
         corexy,
         pole,
@@ -251,8 +259,9 @@ def _follow(
     slow: Any,
     z: Any,
     command: Any,
+    heading: Any,
     least: int,
-    y_weight: float,
+    unit: Any,
     step: Any,
     corexy: bool,
     pole: Any,
@@ -346,6 +355,7 @@ def _follow(
                     fed_per = (_fed(command, place_at[k, c]) - fed) * per
                     while s <= end and total < most:
                         t = s - begin
+                        answer_along = error_along = square = 0.0
                         for axis in range(2):
                             start, leg = (from_x, bx) if axis == 0 else (from_y, by)
                             error = start + leg * per * t - command[s, axis]
@@ -356,8 +366,13 @@ def _follow(
                                 answer += weight[axis, r] * re - weight[axis, r + 1] * im
                                 x[q] = pole[axis, r] * re - pole[axis, r + 1] * im + error
                                 x[q + 1] = pole[axis, r] * im + pole[axis, r + 1] * re
-                            square = answer * answer + _SEEN * error * error
-                            total += square if axis == 0 else y_weight * square
+                            answer, error = answer * unit[axis], error * unit[axis]
+                            total += answer * answer + _SEEN * error * error
+                            square += error * error
+                            answer_along += heading[s, axis] * answer
+                            error_along += heading[s, axis] * error
+                        along = answer_along * answer_along + _SEEN * error_along * error_along
+                        total += _FAR_COUNTS * max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
                         gap = fed + fed_per * t - command[s, 2]
                         total += gap * gap
                         s += 1
@@ -370,7 +385,8 @@ def _follow(
                                 for q in range(2 * order):
                                     part += energy[axis, r, q] * x[2 * order * axis + q]
                                 square += part * x[2 * order * axis + r]
-                            later += square if axis == 0 else y_weight * square
+                            counts = 1.0 - (1.0 - _ALONG) * heading[end, axis] ** 2
+                            later += counts * unit[axis] ** 2 * square
                     if total + later < most:
                         _keep(kept, rank[k, c], total + later)
                         cost[k, c], rank[k, c] = total, total + later

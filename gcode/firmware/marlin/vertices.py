@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode._segment_kernels import path_directions
 from gcode.firmware.marlin._vertex_kernels import MOST_PLACES, choose_vertices, list_places
 from gcode.segments import ErrorFilter, Segments
 from gcode.timeline import Timeline
@@ -70,13 +71,15 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
         for a stretch where there is no such choice: its vertices are rounded.
     """
     answers = _Answers.of(segments.error_filter)
+    direction = np.empty((2, timeline.position_mm.shape[1]))
+    path_directions(timeline.position_mm[:2], direction)
     firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
     end_s, end_mm, groups = [], [], []
     for first, stop in itertools.pairwise((*firsts.tolist(), len(segments))):
         group = int(segments.group[first])
         at_s = np.append(timeline.start_s[group], segments.end_s[first:stop])
         at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, first:stop].T])
-        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answers)
+        at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answers, direction)
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])
         groups.append(np.full(len(at_s) - 1, group, np.int64))
@@ -126,6 +129,7 @@ def _chosen(
     at_s: NDArray[np.float64],
     at_mm: NDArray[np.float64],
     answers: _Answers,
+    direction: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
     at_s, at_mm = _often(lattice, at_s, at_mm)
@@ -141,6 +145,7 @@ def _chosen(
     at = at_s / dt_s - first
     k = np.arange(int(np.ceil(at[-1])) + 2, dtype=np.float64)
     command = np.column_stack([np.interp(k, at, row) for row in steps.T])
+    heading = direction[:, np.minimum(k.astype(np.int64) + int(first), direction.shape[1] - 1)].T
     slow, count = np.zeros(n, np.bool_), np.zeros(n, np.int64)
     place, place_at = np.zeros((n, MOST_PLACES, 2), np.int64), np.zeros((n, MOST_PLACES))
     list_places(
@@ -165,8 +170,9 @@ def _chosen(
         slow,
         z,
         command,
+        heading.copy(),
         lattice.least,
-        float((scale[0] / scale[1]) ** 2),
+        scale[0] / scale[:2],
         _CALM * lattice.speed_step_mm_s * scale[:2] * dt_s,
         lattice.corexy,
         answers.pole,
