@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
 import sys
 import tempfile
@@ -14,6 +15,8 @@ __all__ = ["prepare_environment"]
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's mallopt (malloc.h)."""
 _KEPT_BYTES, _STEP_BYTES = 256 << 20, 16 << 20
+_NEW_OBJECTS = 50_000
+"""So many more objects than before make the search for cycles worth its time."""
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -27,11 +30,14 @@ def prepare_environment(*, computing: bool = True) -> None:
     Parameters
     ----------
     computing : bool
-        Whether this process computes: then memory that is freed stays with it. One that lasts and
-        leaves computing to others gives it back.
+        Whether this process computes: then memory that is freed stays with it, and cycles of
+        objects are looked for seldom. One that lasts and leaves computing to others gives it back.
     """
     if computing:
         _keep_freed_memory()
+        # Modules and kernels are very many objects, and all of them stay: to look through them
+        # whenever 700 have come, as Python does, only makes the start longer.
+        gc.set_threshold(_NEW_OBJECTS)
     for name in _ONE_THREAD:
         os.environ.setdefault(name, "1")
     if "NUMBA_CACHE_DIR" not in os.environ and not _package_is_writable():

@@ -653,7 +653,7 @@ class _Sums:
         seconds = executed.duration_s + float(timeline.start_s[0])
         self.time_s += seconds
         self.compensated_s += seconds
-        self.extruding_s += DT_S * float(np.sum(made.extruding))
+        self.extruding_s += DT_S * np.count_nonzero(made.extruding)
         self.segments += len(segments)
         if len(segments):
             rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
