@@ -209,7 +209,7 @@ def cost_of_all(
         return float(np.sum(value**2) - (1.0 - kernels._ALONG) * np.sum(along**2))
 
     square = np.sum(error**2, axis=1)
-    far = kernels._FAR_COUNTS * np.sum(np.maximum(square - kernels._FAR, 0.0))
+    far = np.sum(np.maximum(square - kernels._FAR, 0.0))
     ringing_on = np.sum(answer[len(error) :] ** 2, axis=0)
     later = np.sum(ringing_on * (1.0 - (1.0 - kernels._ALONG) * heading[-1] ** 2))
     return counted(answer[: len(error)]) + kernels._SEEN * counted(error) + float(far + later)

@@ -43,8 +43,8 @@ _SEEN = 0.1
 """What the square of an error counts by itself, that of the printer's answer being 1."""
 _ALONG = 0.1
 """What a square along the path counts, one across it being 1: only the latter is seen on a part."""
-_FAR, _FAR_COUNTS = 1.2, 1.0
-"""What a squared error is above the former, in steps of X, counts by the latter too."""
+_FAR = 1.2
+"""What a squared error is above that, in steps of X, counts too, wherever the error points."""
 
 
 @kernel(inline=True)
@@ -372,7 +372,7 @@ def _follow(
                             answer_along += heading[s, axis] * answer
                             error_along += heading[s, axis] * error
                         along = answer_along * answer_along + _SEEN * error_along * error_along
-                        total += _FAR_COUNTS * max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
+                        total += max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
                         gap = fed + fed_per * t - command[s, 2]
                         total += gap * gap
                         s += 1
