@@ -197,9 +197,13 @@ class StreamWriter:
         rest = encoded.row >= 0
         rows, places = encoded.row[rest], np.flatnonzero(rest)
         first[rows] = places
-        # An event never moves past a rest, not even one that takes no time, or back behind one.
+        # An event never moves past a rest, not even one that takes no time or lies behind a stretch
+        # of which nothing was written, or back behind one.
         first[rows + 1] = np.maximum(first[rows + 1], places + 1)
         first = np.maximum.accumulate(first)
+        until = np.full(len(first), len(encoded.row))
+        until[rows] = places
+        first = np.minimum(first, np.minimum.accumulate(until[::-1])[::-1])
         return first[np.minimum(piece.events.move_index, len(piece.moves))]
 
     def _modes(self, piece: Piece, index: NDArray[np.int64]) -> _Modes:

@@ -119,6 +119,12 @@ SMALL_LETTER = (
     "G1 X38.525 Y10.46\nG1 X35.574 Y4.357 E.01566\n"
 )
 """Where small letters are no words, Z1e263 is Z1."""
+THERE_AND_BACK = (
+    "M83\nG1 X114.506 Y117.493 E.02432\nG1 X138.32 Y118.237 F10800\nG1 Z.3 F720\nG1 E1 F2100\n"
+    "G1 X138.32 Y118.342 E.00369\nG1 F8640\nG1 X138.32 Y118.237 E-.01404\nG1 Z.5 F720\n"
+    "G1 X129.322 Y118.166 F10800\n"
+)
+"""Nothing is left of X Y between two rests: the F between them stays between them."""
 NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
 NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
@@ -131,7 +137,9 @@ NO_TIME = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER])
+@pytest.mark.parametrize(
+    "text", [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER, THERE_AND_BACK]
+)
 def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
     through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)

@@ -88,22 +88,22 @@ class MarlinVoice:
         own = cast(MarlinLimits, limits)
         if self._classic_jerk:
             corner = (
-                f"X{own.jerk_x_mm_s:.8g} Y{own.jerk_y_mm_s:.8g} "
-                f"Z{own.jerk_z_mm_s:.8g} E{own.jerk_e_mm_s:.8g}"
+                f"X{own.jerk_x_mm_s:.10g} Y{own.jerk_y_mm_s:.10g} "
+                f"Z{own.jerk_z_mm_s:.10g} E{own.jerk_e_mm_s:.10g}"
             )
         else:
-            corner = f"J{own.junction_deviation_mm:.8g}"
+            corner = f"J{own.junction_deviation_mm:.10g}"
         k_s = 0.0 if own.advance_in_filament else own.linear_advance_k_s
-        advance = f"M900 K{k_s:.8g}\n" if self._advances and own.linear_advance_k_s else ""
+        advance = f"M900 K{k_s:.10g}\n" if self._advances and own.linear_advance_k_s else ""
         return (
-            f"M201 X{own.accel_x_mm_s2:.8g} Y{own.accel_y_mm_s2:.8g} "
-            f"Z{own.accel_z_mm_s2:.8g} E{own.accel_e_mm_s2:.8g}\n"
-            f"M203 X{own.feedrate_x_mm_s:.8g} Y{own.feedrate_y_mm_s:.8g} "
-            f"Z{own.feedrate_z_mm_s:.8g} E{own.feedrate_e_mm_s:.8g}\n"
-            f"M204 P{own.print_accel_mm_s2:.8g} R{own.retract_accel_mm_s2:.8g} "
-            f"T{own.travel_accel_mm_s2:.8g}\n"
-            f"M205 B{own.min_segment_time_us:.8g} S{own.min_feedrate_mm_s:.8g} "
-            f"T{own.min_travel_feedrate_mm_s:.8g} {corner}\n{advance}"
+            f"M201 X{own.accel_x_mm_s2:.10g} Y{own.accel_y_mm_s2:.10g} "
+            f"Z{own.accel_z_mm_s2:.10g} E{own.accel_e_mm_s2:.10g}\n"
+            f"M203 X{own.feedrate_x_mm_s:.10g} Y{own.feedrate_y_mm_s:.10g} "
+            f"Z{own.feedrate_z_mm_s:.10g} E{own.feedrate_e_mm_s:.10g}\n"
+            f"M204 P{own.print_accel_mm_s2:.10g} R{own.retract_accel_mm_s2:.10g} "
+            f"T{own.travel_accel_mm_s2:.10g}\n"
+            f"M205 B{own.min_segment_time_us:.10g} S{own.min_feedrate_mm_s:.10g} "
+            f"T{own.min_travel_feedrate_mm_s:.10g} {corner}\n{advance}"
         ).encode()
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
