@@ -28,6 +28,7 @@ from service.pipeline import road
 from service.pipeline.compensating import CompensatedPiece
 from service.pipeline.files import default_cache_dir
 from service.pipeline.options import Options
+from service.pipeline.passages import last_length_mm
 from service.pipeline.result import Result
 
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
@@ -110,7 +111,7 @@ class Watched(road._Job):
         stretch_s = float(timeline.end_s[-1] - timeline.start_s[-1])
         self.late_s += taken_s - (float(encoded.group_start_s[-1]) + stretch_s - origin_s)
         self.off_grid_s += taken_s - (float(timeline.end_s[-1]) - origin_s)
-        end = executed.start_mm[-1] + executed.direction[-1] * road._length_mm(executed)
+        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
         gap_mm = float(np.max(np.abs(end[:3] - piece.moves.end_mm[-1, :3])))
         self.end_mm = max(self.end_mm, gap_mm)
 

@@ -12,7 +12,6 @@ import copy
 import io
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -21,7 +20,7 @@ import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
-from gcode.firmware.planning import join_phases, plan_moves, stops
+from gcode.firmware.planning import join_phases, plan_moves
 from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
@@ -29,7 +28,7 @@ from gcode.pieces import Passage, Piece, Splitter
 from gcode.sampler import sample_phases, sample_until
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import Retiming
-from gcode.types import EventKind, Events, Moves, Phases, rows_of
+from gcode.types import EventKind, Events, Moves, Phases
 from models.errors import ModelError
 from models.machine import Machine
 from service.pipeline.budget import SpeedBudget
@@ -50,11 +49,13 @@ from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options, stamp
+from service.pipeline.passages import feeding, last_length_mm, plan_passage, takes_s
 from service.pipeline.points import MotionSamples, part_of
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
+from service.pipeline.sums import Sums
 from service.pipeline.tracing import Trace
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
@@ -69,7 +70,8 @@ _EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
 _TIME_EXCESS_S = 20e-3
-_WARN_SHARE = 0.2
+_NEGLIGIBLE_UM = 1.0
+"""Contour error that nobody sees, whoever has less of it."""
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 """How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
 
@@ -236,7 +238,7 @@ class _Job:
             self._writer = StreamWriter(self._kit, stamp(machine, options))
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum = _Sums()
+        self._sum = Sums()
         self._sum.warnings += doubts(source, machine, options.dialect)
         if options.budget_um is not None and not self._changes:
             self._sum.warnings.append("The method none changes nothing: the budget was not used.")
@@ -393,7 +395,7 @@ class _Job:
         phases = piece.phases
         count = max(round(phases.duration_s / DT_S), 1)
         position, row = sample_phases(phases, (0.0, DT_S, count))
-        sliced = self._samples(piece, row, position, position, _feeding(phases)[row])
+        sliced = self._samples(piece, row, position, position, feeding(phases)[row])
         self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
         self._budget.correct(self._pairs.sums())
 
@@ -401,7 +403,7 @@ class _Job:
         """Let a piece leave as it came."""
         phases = piece.phases
         row_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        extruding_s = float(np.sum(row_s[_feeding(phases)]))
+        extruding_s = float(np.sum(row_s[feeding(phases)]))
         self._sum.put_back.append(
             PutBack(
                 line_first=int(piece.moves.line[0]),
@@ -428,7 +430,7 @@ class _Job:
         self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
         with self._clock.stage("plan"):
             parts = list(plan_passage(passage, self._machine))
-        seconds = sum(_takes_s(part) for part in parts)
+        seconds = sum(takes_s(part) for part in parts)
         self._check_end(passage, seconds)
         if self._budget is not None:
             self._budget.passed(seconds)
@@ -452,13 +454,13 @@ class _Job:
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
         self._sum.time_s += motion_s
-        feeding = _feeding(phases)
-        self._sum.extruding_s += float(np.sum(duration[feeding]))
-        if np.any(feeding):
-            self._sum.passed_s += float(np.sum(duration[feeding]))
-            first = phases.move_index[int(np.argmax(feeding))]
+        feeds = feeding(phases)
+        self._sum.extruding_s += float(np.sum(duration[feeds]))
+        if np.any(feeds):
+            self._sum.passed_s += float(np.sum(duration[feeds]))
+            first = phases.move_index[int(np.argmax(feeds))]
             self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
-        until = np.where(feeding, phases.t_s + duration, -np.inf)
+        until = np.where(feeds, phases.t_s + duration, -np.inf)
         samples = max(round(motion_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             n = min(_CHUNK, samples - start)
@@ -545,7 +547,7 @@ class _Job:
         late = executed.duration_s - float(planned_end)
         if abs(late) > _TIME_EXCESS_S:
             raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
-        end = executed.start_mm[-1] + executed.direction[-1] * _length_mm(executed)
+        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
         wanted = piece.moves.end_mm[-1]
         if np.any(np.abs(end - wanted) > step + _END_MM):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
@@ -560,9 +562,21 @@ class _Job:
     def _say(self, stage: str, fraction: float) -> None:
         self._teller.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
 
+    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
+        """Yield a warning where the firmware's shaper, without compensation, would do better."""
+        ours, shaper = rms_um["after"], rms_um["shaper"]
+        compared = self._budget is None and not self._options.method.startswith("shaper:")
+        if not compared or ours < max(shaper, _NEGLIGIBLE_UM):
+            return
+        steps = ", not counting the motors' steps" if max(self._kit.step_mm) > 0.0 else ""
+        yield (
+            f"The firmware's own shaper would serve this file better: {self._shaper.label} alone "
+            f"would leave {shaper:.2g} um rms of contour error{steps}, this file {ours:.2g} um. "
+            "Print it as sliced with that shaper, or let --method advise write the commands"
+        )
+
     def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
         total, measured = self._sum, self._measurement
-        put_back_s = sum(p.extruding_seconds for p in total.put_back)
         warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
         if self._changes and self._writer.shaper_unknown:
             warnings.append(
@@ -571,22 +585,10 @@ class _Job:
             )
         if self._changes and self._writer.shaper_note is not None:
             warnings.append(self._writer.shaper_note)
-        put_back_share = put_back_s / total.extruding_s if total.extruding_s else 0.0
-        if put_back_share > _WARN_SHARE:
-            longest = max(total.put_back, key=lambda piece: piece.extruding_seconds)
-            warnings.append(
-                f"{put_back_share:.0%} of the extruding time left as it came and is not "
-                f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
-                f"{longest.reason}"
-            )
-        elif self._changes and total.passed_s - put_back_s > _WARN_SHARE * total.extruding_s:
-            share = (total.passed_s - put_back_s) / total.extruding_s
-            warnings.append(
-                f"{share:.0%} of the extruding time lies in moves that keep their own lines and is "
-                f"not compensated, from line {total.passed_line} on: they climb faster than Z can "
-                "follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), take long for their "
-                "length, or start where the position is not known"
-            )
+        channels = measured.channels()
+        if self._changes:
+            warnings += total.left_alone()
+            warnings += self._outdone({c.name: c.extruding.contour_rms_um for c in channels})
         shaper, notes, budget = self._shaper, self._operation.notes(), None
         if self._budget is not None and self._pairs is not None:
             names, sums = self._reader.feature_names, self._pairs.sums()
@@ -600,7 +602,7 @@ class _Job:
             machine_revision=self._machine.revision,
             settings=self._options.model_dump(exclude_none=True),
             source_name=name,
-            channels=measured.channels(),
+            channels=channels,
             best_shaper=shaper.label,
             original_time_s=total.original_s,
             time_s=total.time_s,
@@ -620,7 +622,7 @@ class _Job:
             extruding_s=total.extruding_s,
             pieces=total.pieces,
             put_back=total.put_back,
-            put_back_extruding_share=put_back_share,
+            put_back_extruding_share=total.put_back_share,
             warnings=warnings,
             notes=notes,
             layers=measured.layers(),
@@ -631,89 +633,3 @@ class _Job:
             stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
             budget=budget,
         )
-
-
-class _Sums:
-    """What adds up along a file."""
-
-    def __init__(self) -> None:
-        self.moves = self.pieces = self.segments = self.written = 0
-        self.original_s = self.time_s = self.compensated_s = self.extruding_s = 0.0
-        self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
-        self.gap2 = self.gap_max = self.filament_error = 0.0
-        self.passed_s, self.passed_line = 0.0, 0
-        self.gap_count = 0
-        self.put_back: list[PutBack] = []
-        self.warnings: list[str] = []
-        self.newline = True
-        self.jumped = True
-
-    def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
-        timeline, segments = made.timeline, made.segments
-        seconds = executed.duration_s + float(timeline.start_s[0])
-        self.time_s += seconds
-        self.compensated_s += seconds
-        self.extruding_s += DT_S * np.count_nonzero(made.extruding)
-        self.segments += len(segments)
-        if len(segments):
-            rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
-            self.peak_rate = max(self.peak_rate, float(rate.max()))
-        self.peak_velocity = max(self.peak_velocity, made.step_mm / DT_S)
-        self.peak_accel = max(self.peak_accel, made.bend_mm / DT_S**2)
-        self.gap2 += float(gap @ gap)
-        self.gap_count += len(gap)
-        self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
-        end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * _length_mm(executed)
-        self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
-
-
-def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float | None]:
-    """Plan the moves of a passage between its stops.
-
-    Yields
-    ------
-    Phases
-        Motion from rest to rest, from time 0 on; `move_index` counts within the passage.
-    float
-        Seconds of standing.
-    None
-        The position becomes unknown here.
-    """
-    if isinstance(passage, Piece):
-        yield passage.phases
-        return
-    events = passage.events
-    done = 0
-    for k in [*np.flatnonzero(stops(events)).tolist(), None]:
-        end = len(passage.moves) if k is None else int(events.move_index[k])
-        if end > done:
-            rows = rows_of(passage.moves, slice(done, end))
-            phases = plan_moves(rows, passage.limits, machine)
-            if len(phases):
-                numbers = phases.move_index - phases.move_index[0] + done
-                yield replace(phases, move_index=numbers)
-            done = end
-        if k is not None and events.dwell_s[k] > 0.0:
-            yield float(events.dwell_s[k])
-        if k is not None and events.kind[k] == EventKind.UNKNOWN:
-            yield None
-
-
-def _takes_s(part: Phases | float | None) -> float:
-    return part.duration_s if isinstance(part, Phases) else part or 0.0
-
-
-def _length_mm(phases: Phases) -> float:
-    """Length of the last move."""
-    v0, v1, v2 = phases.start_mm_s[-1], phases.cruise_mm_s[-1], phases.end_mm_s[-1]
-    return float(
-        0.5 * (v0 + v1) * phases.accel_s[-1]
-        + v1 * phases.cruise_s[-1]
-        + 0.5 * (v1 + v2) * phases.decel_s[-1]
-    )
-
-
-def _feeding(phases: Phases) -> np.ndarray:
-    direction = phases.direction
-    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
-    return np.asarray(moves_xy & (direction[:, 3] > 0.0))

@@ -19,7 +19,8 @@ from gcode.pieces import Splitter
 from gcode.types import Moves, Phases, ProgramBlock
 from models.machine import AxisTravel, Machine
 from service.pipeline.options import Options
-from service.pipeline.road import compensate_file, plan_passage
+from service.pipeline.passages import plan_passage
+from service.pipeline.road import compensate_file
 from tests.gcode.states import differences, has_code
 
 __all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_road", "walk"]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from gcode.firmware.registry import kit
+from models.firmware import RepRapFirmware
+from models.firmware.reprapfirmware import Drive
 from models.machine import AxisTravel, CommandLimits, Machine
 from models.store import load_machine
 from service.pipeline.compensating import PieceCompensator, deviation
@@ -88,6 +90,22 @@ def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
     result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
     assert result.put_back == []
     assert any("climb faster than Z can follow" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(("steps_per_mm", "told"), [(25.0, True), (400.0, False)])
+def test_where_the_shaper_would_serve_better_it_is_said(
+    steps_per_mm: float, told: bool, tmp_path: Path
+) -> None:
+    """Vertices on steps of .04 mm shake the printer more than a shaper would."""
+    drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
+    own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
+    machine = load_machine("annex-k3").model_copy(update={"firmware": own})
+    source = tmp_path / "ring.gcode"
+    ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
+    source.write_text(HEAD + "G1 F6000\n" + 4 * ring)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+    assert any("shaper would serve this file better" in w for w in result.warnings) is told
 
 
 def fast(machine: Machine, speed_mm_s: float) -> Machine:
