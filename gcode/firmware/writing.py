@@ -23,8 +23,8 @@ from gcode.types import EventKind, Limits, ModalState
 __all__ = ["StreamWriter"]
 
 _BYTES_PER_LINE = 96
-_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
-_FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G0*[0-35](?![\d.])", re.IGNORECASE)
+_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
+_FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
 _SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 _POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")

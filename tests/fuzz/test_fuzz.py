@@ -125,6 +125,11 @@ THERE_AND_BACK = (
     "G1 X129.322 Y118.166 F10800\n"
 )
 """Nothing is left of X Y between two rests: the F between them stays between them."""
+MINUS_ZERO = (
+    "G1 X151.694 Y156.136 E0.07375 F3000\nG1 Z2.000000 F18000\nG1 X141.011 Y157.006\n"
+    "G-0 Z1.600000\nG1 X137.602 Y157.403 E0.11812\n"
+)
+"""G-0 is G0, whose speed is the file's."""
 NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
 NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
@@ -138,7 +143,8 @@ NO_TIME = (
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "text", [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER, THERE_AND_BACK]
+    "text",
+    [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER, THERE_AND_BACK, MINUS_ZERO],
 )
 def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
