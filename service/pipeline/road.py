@@ -211,7 +211,7 @@ class _Job:
             self._say("designing", 0.0)
             with self._clock.stage("design"):
                 self._work = PieceCompensator(machine, options)
-        self._say("tuning the yardstick", 0.0)
+        self._say("tuning the shaper to compare with", 0.0)
         with self._clock.stage("yardstick"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
         if tuned_first:
