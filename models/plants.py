@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from models.errors import ModelError
-from models.exponential import exponential
 from models.plant_specs import (
     FirSpec,
     Mode,
@@ -118,6 +117,8 @@ class ContinuousPlant(_StateSpace):
 
     def discretise(self, dt_s: float) -> DiscretePlant:
         """Return the first-order-hold equivalent, exact for commands linear between samples."""
+        from scipy.linalg import expm  # slow to import, and checking a document needs it not
+
         n = self.order
         if n == 0:
             return DiscretePlant(self.a, self.b, self.c, self.d, self.notes, dt_s)
@@ -127,7 +128,7 @@ class ContinuousPlant(_StateSpace):
         block[:n, :n] = self.a * dt_s
         block[:n, n] = self.b * dt_s
         block[n, n + 1] = 1.0
-        grown = exponential(block)
+        grown = expm(block)
         phi, step, ramp = grown[:n, :n], grown[:n, n], grown[:n, n + 1]
         # The true state is x = xi + ramp u; xi needs no command of the future.
         return balanced_discrete(
@@ -306,7 +307,7 @@ def _as_sampled(spec: PlantSpec) -> DiscretePlant:
 
 def _undo_hold(plant: DiscretePlant, spec: PlantSpec) -> ContinuousPlant:
     """Invert the first-order hold."""
-    from scipy.linalg import logm  # slow to import, seldom needed
+    from scipy.linalg import expm, logm
 
     roots: Roots = spec.roots()
     negative = (roots.poles.imag == 0) & (roots.poles.real <= 0)
@@ -324,7 +325,7 @@ def _undo_hold(plant: DiscretePlant, spec: PlantSpec) -> ContinuousPlant:
     block[:n, :n] = rate * dt_s
     block[:n, n : 2 * n] = np.eye(n) * dt_s
     block[n : 2 * n, 2 * n :] = np.eye(n)
-    grown = exponential(block)
+    grown = expm(block)
     step, ramp = grown[:n, n : 2 * n], grown[:n, 2 * n :]
     b = np.asarray(np.linalg.solve(step - ramp + plant.a @ ramp, plant.b), np.float64)
     d = plant.d - float(plant.c @ ramp @ b)

@@ -17,9 +17,6 @@ Matrix = NDArray[np.float64]
 System = tuple[Matrix, Matrix, Matrix, float]
 _Group = NDArray[np.complex128]
 
-_FEW_STATES = 9
-"""Up to here the equations of a Gramian, the square of as many, are solved as they stand."""
-
 
 def cascade(roots: Roots) -> System:
     """Realise `roots` with DC gain 1 as a chain of sections, each with DC gain 1.
@@ -48,10 +45,14 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
     Diagonal balancing: equal diagonals of both Gramians. Unlike a full balancing it needs no
     inverse, and so it survives zeros that almost cancel poles.
     """
+    # Slow to import, and checking a document needs it not.
+    from scipy.linalg import solve_discrete_lyapunov
+
     if len(b) == 0:
         return a, b, c, d
-    reached = np.abs(np.diag(_gramian(a, b, discrete=discrete)))
-    seen = np.abs(np.diag(_gramian(a.T, c, discrete=discrete)))
+    solve = solve_discrete_lyapunov if discrete else _solve_continuous
+    reached = np.abs(np.diag(solve(a, np.outer(b, b))))
+    seen = np.abs(np.diag(solve(a.T, np.outer(c, c))))
     used = (reached > 0) & (seen > 0)
     scale = np.where(used, (np.where(used, seen, 1.0) / np.where(used, reached, 1.0)) ** 0.25, 1.0)
     return a * scale[:, None] / scale, b * scale, c / scale, d
@@ -74,21 +75,10 @@ def transmission_zeros(a: Matrix, b: Matrix, c: Matrix, d: float) -> NDArray[np.
     return zeros
 
 
-def _gramian(a: Matrix, b: Matrix, *, discrete: bool) -> Matrix:
-    """Return X of a X a' - X = -b b', or in continuous time of a X + X a' = -b b'."""
-    n, driven = len(b), np.outer(b, b)
-    if n <= _FEW_STATES:
-        one = np.eye(n)
-        if discrete:
-            equations = np.eye(n * n) - np.kron(a, a)
-        else:
-            equations = -(np.kron(a, one) + np.kron(one, a))
-        return np.asarray(np.linalg.solve(equations, driven.ravel()).reshape(n, n), np.float64)
-    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov  # slow to import
+def _solve_continuous(a: Matrix, q: Matrix) -> Matrix:
+    from scipy.linalg import solve_continuous_lyapunov
 
-    if discrete:
-        return np.asarray(solve_discrete_lyapunov(a, driven), np.float64)
-    return np.asarray(solve_continuous_lyapunov(a, -driven), np.float64)
+    return np.asarray(solve_continuous_lyapunov(a, -q), dtype=np.float64)
 
 
 def _groups(roots: NDArray[np.complex128]) -> list[_Group]:
