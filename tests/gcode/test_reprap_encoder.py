@@ -136,6 +136,16 @@ def test_long_stretches_stay_in_time(body: str) -> None:
     assert np.max(gap[made.extruding]) <= tolerance + 2.5 * np.hypot(1.0, 1.0) / 160.0
 
 
+@pytest.mark.parametrize("slower", [5, 15, 25])
+def test_slow_lines_of_nearly_the_same_speed_stay_in_time(slower: int) -> None:
+    """The firmware cuts off peaks of speed that do not stand out by a tenth of it."""
+    lines = [(50.0 + 0.9 * i, 50.0 + 0.02 * i * i, 300 - slower * (i % 2)) for i in range(1, 60)]
+    body = "".join(f"G1 X{x:.2f} Y{y:.2f} E.03 F{f}\n" for x, y, f in lines)
+    made = compensated(machine_of(firmware(160.0)), "M204 P6000\n" + body)
+    gap = deviation(made, made.encoded.phases)
+    assert np.max(gap[made.extruding]) <= 0.02
+
+
 def test_filament_holds_the_advance_that_the_firmware_has_switched_off() -> None:
     machine = machine_of(firmware(), advance_s=ADVANCE_S)
     made = compensated(machine, ADVANCED)

@@ -104,7 +104,8 @@ def assign_speeds(
             high = fastest + _OVER * band
             low = max(following - _UNDER * band_next, 0.5 * wanted)
             for choice in (wanted, before, following, high, low):
-                choice = min(choice, speed_mm_s[i])
+                # As it will be printed: a digit decides whether a peak is cut off.
+                choice = printed_feedrate(60.0 * min(choice, speed_mm_s[i])) / 60.0
                 cost = planned_s[i] * abs(choice - wanted)
                 if i > 0 and ours[i - 1]:
                     side = max(enter_before, min(choice, fastest))
@@ -117,7 +118,6 @@ def assign_speeds(
                     cost += planned_s[i + 1] * _lost(following, choice, _OVER * band_next)
                 if cost < least_cost:
                     v, least_cost = choice, cost
-            v = printed_feedrate(60.0 * v) / 60.0
         if i > 0:
             predicted_s[i - 1] = lasts
             begin += lasts
