@@ -73,14 +73,12 @@ class Watched(road._Job):
         """What of the extruding motion's distance lies along the command and across it."""
         self.late_s = self.off_grid_s = self.end_mm = 0.0
 
-    def _verify(
-        self,
-        piece: Piece,
-        made: CompensatedPiece,
-        gap: NDArray[np.float64],
-        executed: Phases,
-    ) -> None:
-        super()._verify(piece, made, gap, executed)
+    def _attempt(self, piece: Piece, paced: Piece) -> road._Attempt:
+        found = super()._attempt(piece, paced)
+        self._watch(piece, found.made, found.executed)
+        return found
+
+    def _watch(self, piece: Piece, made: CompensatedPiece, executed: Phases) -> None:
         timeline, encoded = made.timeline, made.encoded
         origin_s = float(timeline.start_s[0])
         grid_s = timeline.dt_s * np.arange(made.command_mm.shape[1])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.shapers import shape, shaper_pulses
-from gcode.firmware.planning import STOPPING, join_phases
+from gcode.firmware.planning import STOPPING, intended, join_phases
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.sampler import sample_phases
@@ -106,6 +106,8 @@ class Motion:
     ----------
     phases : Phases
         `move_index` counts the moves of the file.
+    asked : Phases
+        The same without the firmware's rounding to motor steps.
     end_mm : ndarray, shape (moves, 4)
         Where each move ends.
     line : ndarray of int64, shape (moves,)
@@ -116,6 +118,7 @@ class Motion:
     """
 
     phases: Phases
+    asked: Phases
     end_mm: Array
     line: Ints
     stops: Ints
@@ -154,6 +157,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     reader, planner = Interpreter(machine), kit(machine).planner()
     parts: list[Phases] = []
     ends: list[Array] = []
+    starts: list[Array] = []
     lines: list[Ints] = []
     stops: list[Ints] = [np.array(forced, dtype=np.int64)]
     with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
@@ -175,13 +179,16 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
                     done = at
                 parts.append(planner.push_moves(_rows(block.moves, done, n), block.limits))
                 ends.append(block.moves.end_mm.copy())
+                starts.append(block.moves.start_mm.copy())
                 lines.append(block.moves.line.copy())
             if not data:
                 break
     parts.append(planner.flush())
+    phases, end_mm = join_phases(parts), np.concatenate(ends)
     return Motion(
-        phases=join_phases(parts),
-        end_mm=np.concatenate(ends),
+        phases=phases,
+        asked=intended(phases, np.concatenate(starts), end_mm, kit(machine).step_mm),
+        end_mm=end_mm,
         line=np.concatenate(lines),
         stops=np.sort(np.concatenate(stops)),
         time_s=planner.time_s,
@@ -224,10 +231,11 @@ class Timed:
 
 
 class Own(Timed):
-    """A file as it is: commanded and planned motion are the same."""
+    """A file as it is: commanded is what is planned, but for the rounding to motor steps."""
 
     def __init__(self, motion: Motion, first_row: int, last_row: int) -> None:
         self._phases = _rows(motion.phases, first_row, last_row)
+        self._asked = _rows(motion.asked, first_row, last_row)
         self._start_s = float(self._phases.t_s[0])
         self._end_s = motion.row_end_s()[first_row:last_row]
         self.samples = int(np.ceil((self._end_s[-1] - self._start_s) / DT_S)) + 1
@@ -240,13 +248,14 @@ class Own(Timed):
 
     def path(self, first: int, last: int) -> tuple[Array, Mask]:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
-        phases, offset = _around(self._phases, t_s)
+        phases, offset = _around(self._asked, t_s)
         position, row = sample_phases(phases, t_s)
         moving = t_s <= self._end_s[offset + row]
         return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
-        return self.path(first, last)[0]
+        t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
+        return sample_phases(_around(self._phases, t_s)[0], t_s)[0][:2]
 
 
 class Shaped(Own):
@@ -257,9 +266,9 @@ class Shaped(Own):
     def command(self, first: int, last: int) -> Array:
         kind, fx_hz, fy_hz, zeta = self.shaper
         reach = round(_SHAPER_REACH_S / DT_S)
-        path, _ = self.path(first - reach, last + reach)
+        own = super().command(first - reach, last + reach)
         pulses = [shaper_pulses(kind, f, zeta) for f in (fx_hz, fy_hz)]
-        rows = [shape(row, DT_S, p) for row, p in zip(path, pulses, strict=True)]
+        rows = [shape(row, DT_S, p) for row, p in zip(own, pulses, strict=True)]
         return np.stack(rows)[:, reach:-reach]
 
 
@@ -272,7 +281,7 @@ class Aligned(Timed):
     """
 
     def __init__(self, original: Motion, written: Motion) -> None:
-        self._path, self._written = original.phases, written.phases
+        self._path, self._written = original.asked, written.phases
         self.original_rows, self.written_rows = _match(original, written)
         ends = original.row_end_s()
         self._from_s = self._path.t_s[self.original_rows[0]]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ __all__ = [
     "check_moves_end",
     "check_print_ends",
     "empty_phases",
+    "intended",
     "join_phases",
     "plan_moves",
     "stops",
@@ -30,6 +33,9 @@ LONGEST_MOVE_S = 1200.0
 """A single move that takes longer is taken for a mistake; a bed that is lowered takes minutes."""
 LONGEST_PRINT_S = 3.6e6
 """So is a print that takes longer: a small file must not keep a computer busy for days."""
+
+_HALF = 0.501
+"""Of a step: what rounding may bring, and the last digits."""
 
 _STOPS = np.array([kind in STOPPING for kind in EventKind])
 """By the number of an event's kind."""
@@ -64,6 +70,56 @@ def plan_moves(
     phases = planner.flush()
     check_moves_end(phases, lambda index: int(moves.line[index]))
     return phases
+
+
+def intended(
+    phases: Phases,
+    start_mm: NDArray[np.float64],
+    end_mm: NDArray[np.float64],
+    step_mm: Sequence[float],
+) -> Phases:
+    """Return a plan whose moves end in X and Y where the file says instead of on motor steps.
+
+    What the firmware makes of a file, in its times, but for the rounding to whole steps: that is
+    an error like any other.
+
+    Parameters
+    ----------
+    phases : Phases
+        `move_index` counts the rows of the tables.
+    start_mm, end_mm : ndarray, shape (moves, 4)
+        Where the file says that moves begin and end.
+    step_mm : sequence of float
+        One step of X's and of Y's motor; 0 for firmware that keeps all digits.
+    """
+    if len(phases) == 0 or max(step_mm[:2]) == 0.0:
+        return phases
+    half_step_mm = _HALF * np.asarray(step_mm[:2])
+
+    def rounded_by(told_mm: NDArray[np.float64], there_mm: NDArray[np.float64]) -> Any:
+        # Farther is no rounding: a move that was swallowed, say.
+        by_mm = told_mm[..., :2] - there_mm[..., :2]
+        return np.where(np.all(np.abs(by_mm) <= half_step_mm, axis=-1, keepdims=True), by_mm, 0.0)
+
+    length_mm = _length_mm(phases)
+    moves_xy = np.any(phases.direction[:, :2] != 0.0, axis=1) & (length_mm > 0.0)
+    there_mm = phases.start_mm + phases.direction * length_mm[:, None]
+    first = rounded_by(start_mm[phases.move_index[0]], phases.start_mm[0])
+    by_mm = np.vstack([first, rounded_by(end_mm[phases.move_index], there_mm)])
+    # The others leave X and Y where they are.
+    kept = np.maximum.accumulate(np.where(moves_xy, np.arange(1, len(phases) + 1), 0))
+    begins, ends = by_mm[np.append(0, kept[:-1])], by_mm[kept]
+    starts_mm, direction = phases.start_mm.copy(), phases.direction.copy()
+    starts_mm[:, :2] += begins
+    direction[moves_xy, :2] += ((ends - begins)[moves_xy].T / length_mm[moves_xy]).T
+    return replace(phases, start_mm=starts_mm, direction=direction)
+
+
+def _length_mm(phases: Phases) -> NDArray[np.float64]:
+    """How long each move is."""
+    begin, top, end = phases.start_mm_s, phases.cruise_mm_s, phases.end_mm_s
+    ramps = (begin + top) * phases.accel_s + (top + end) * phases.decel_s
+    return np.asarray(0.5 * ramps + top * phases.cruise_s)
 
 
 def check_moves_end(phases: Phases, line: Callable[[int], int]) -> None:

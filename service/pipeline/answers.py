@@ -52,8 +52,8 @@ class Answers:
     shaper : BestShaper
         Its delay is taken out.
     names : sequence of str
-        Channels: `before` is the planned path (the executed motion, if nothing is compensated),
-        `after` the executed motion, `shaper` the shaped path.
+        Channels: `before` is the file as it came (the executed motion, if nothing is compensated),
+        `after` the executed motion, `shaper` the file as it came, shaped.
     compensated : bool
     """
 
@@ -79,7 +79,8 @@ class Answers:
         linear = not machine.schedules and not machine.ripple
         self._shapes_answer = linear and compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
-        self._path, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
+        self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
+        """Planned: the path, and below it the file as it came, where that is not the same."""
         self._extruding = np.zeros(0, bool)
         self._answer = np.zeros((2, 0))
         """To the path, from `reach` samples before what is held, as far as it is known."""
@@ -92,12 +93,15 @@ class Answers:
 
     def push(self, samples: MotionSamples) -> Answered | None:
         """Return answers to what was pushed so far, all but the last few samples."""
-        if self._path.shape[1] == 0:
+        fresh = samples.path_mm
+        if samples.sliced_mm is not None:
+            fresh = np.concatenate([fresh, samples.sliced_mm])
+        if self._planned.shape[1] == 0:
             # The machine stood where it begins.
-            self._path = np.repeat(samples.path_mm[:, :1], self._reach, axis=1)
-            self._answer = self._path
+            self._planned = np.repeat(fresh[:, :1], self._reach, axis=1)
+            self._answer = self._planned[-2:]
             self._stand()
-        self._path = np.concatenate([self._path, samples.path_mm], axis=1)
+        self._planned = np.concatenate([self._planned, fresh], axis=1)
         self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
         self._extruding = np.concatenate([self._extruding, samples.extruding])
         ready = len(self._extruding) - self._reach
@@ -105,12 +109,12 @@ class Answers:
 
     def flush(self) -> Answered | None:
         """Return what is held, as if the machine stood still from now on."""
-        if self._path.shape[1] == 0:
+        if self._planned.shape[1] == 0:
             return None
-        end = np.repeat(self._path[:, -1:], self._reach, axis=1)
-        self._path = np.concatenate([self._path, end], axis=1)
+        end = np.repeat(self._planned[:, -1:], self._reach, axis=1)
+        self._planned = np.concatenate([self._planned, end], axis=1)
         out = self._release(len(self._extruding))
-        self._path = self._path[:, :0]
+        self._planned = self._planned[:, :0]
         return out
 
     def _stand(self) -> None:
@@ -124,13 +128,14 @@ class Answers:
             }
 
     def _release(self, ready: int) -> Answered:
-        # The path begins `reach` samples before what is held.
+        # What is planned begins `reach` samples before what is held.
         span = slice(self._reach, self._reach + ready)
-        path, executed = self._path[:, span], self._executed[:, :ready]
+        sliced = self._planned[-2:]
+        path, executed = self._planned[:2, span], self._executed[:, :ready]
         answers = np.empty((len(self._names), 2, ready))
         for name, answer in zip(self._names, answers, strict=True):
             if name == "before" and self._shapes_answer:
-                fresh = self._path[:, self._answer.shape[1] :]
+                fresh = sliced[:, self._answer.shape[1] :]
                 found = self._streams[name].push(fresh, fresh)
                 self._answer = np.concatenate([self._answer, found], axis=1)
                 answer[:] = self._answer[:, span]
@@ -138,13 +143,13 @@ class Answers:
                 self._shape(self._answer, span, answer)
             elif name == "shaper":
                 command = np.empty((2, ready))
-                self._shape(self._path, span, command)
+                self._shape(sliced, span, command)
                 self._streams[name].push(command, path, answer)
             else:
-                planned = name == "before" and self._compensated
-                self._streams[name].push(path if planned else executed, path, answer)
+                came = name == "before" and self._compensated
+                self._streams[name].push(sliced[:, span] if came else executed, path, answer)
         out = Answered(path, executed, self._extruding[:ready], answers)
-        self._path, self._answer = self._path[:, ready:], self._answer[:, ready:]
+        self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:]
         self._executed, self._extruding = self._executed[:, ready:], self._extruding[ready:]
         return out
 

@@ -12,6 +12,7 @@ from compensation.registry import compensator
 from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
 from gcode.firmware.encoding import Encoded
+from gcode.firmware.planning import intended
 from gcode.firmware.registry import kit
 from gcode.pieces import Piece
 from gcode.sampler import distances, sample_phases, sample_until
@@ -149,7 +150,7 @@ class PieceCompensator:
             self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
 
     def _compensate(self, piece: Piece) -> CompensatedPiece:
-        phases = piece.phases
+        phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
         groups = group_rows(phases)
         resting = np.array([group.rest for group in groups])
         rest_s = self.encoder.rest_durations(piece, groups)
@@ -309,6 +310,13 @@ def as_executed(
     piece: CompensatedPiece, phases: Phases, executed: Phases
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
     """Planned and executed motion of a piece on one grid of real time.
+
+    Parameters
+    ----------
+    piece : CompensatedPiece
+    phases : Phases
+        What the file asks for (`gcode.firmware.planning.intended`).
+    executed : Phases
 
     Returns
     -------

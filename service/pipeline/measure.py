@@ -137,6 +137,7 @@ class Measurement:
                 row=last.row[rows],
                 moves=last.moves,
                 first_move=last.first_move,
+                sliced_mm=None if last.sliced_mm is None else last.sliced_mm[:, rows],
             )
         )
         return position

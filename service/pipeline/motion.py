@@ -7,7 +7,6 @@ import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,7 +15,7 @@ import numpy as np
 from gcode.containers.opening import open_text
 from gcode.dialect import Dialect
 from gcode.errors import GcodeError
-from gcode.firmware.planning import check_moves_end, check_print_ends
+from gcode.firmware.planning import check_moves_end, check_print_ends, intended
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.sampler import Sampler, Samples
@@ -224,11 +223,13 @@ def simulate_file(
 class MotionPart:
     """Samples with the moves they belong to.
 
+    `path_mm`, shape (2, n), is where the file wants X and Y, if the firmware rounds to motor steps.
     `jumped`: the position was lost before them. `shaping`: what the file has set the firmware's
     shaper to.
     """
 
     samples: Samples
+    path_mm: np.ndarray | None
     moves: Moves
     first_move: int
     jumped: bool
@@ -245,14 +246,16 @@ class MotionPart:
         moves = self.moves
         travel = moves.end_mm - moves.start_mm
         feeds = ((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)) & (travel[:, 3] > 0.0)
+        executed_mm = self.samples.xyz_mm[:2]
         return MotionSamples(
-            path_mm=self.samples.xyz_mm[:2],
-            executed_mm=self.samples.xyz_mm[:2],
+            path_mm=executed_mm if self.path_mm is None else self.path_mm,
+            executed_mm=executed_mm,
             z_mm=self.samples.xyz_mm[2],
             extruding=feeds[row] & self.samples.moving,
             row=row,
             moves=moves,
             first_move=self.first_move,
+            sliced_mm=None if self.path_mm is None else executed_mm,
         )
 
 
@@ -297,7 +300,7 @@ class TextMotion:
         each: Callable[[ProgramBlock], None] = lambda _block: None,
     ) -> None:
         self._file, self._machine, self._dialect = file, machine, dialect
-        self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
+        self._longest_stand_s = longest_stand_s
         self._told, self._each = told, each
         self._left_out_s = self._end_s = 0.0
         self._held: list[tuple[int, Moves]] = []
@@ -306,6 +309,8 @@ class TextMotion:
         self._shaping = self._read_shaping = shaping
         self._changes: list[tuple[int, Shaping]] = []
         """Moves in front of which the shaper was set, and to what."""
+        self._step_mm = kit(machine).step_mm
+        self._sampler, self._path_sampler = Sampler(dt_s), Sampler(dt_s)
         self._adviser = kit(machine).adviser(dialect)
         self._unmodelled: set[str] = set()
         self.shapers: list[str] = []
@@ -320,7 +325,6 @@ class TextMotion:
     def __iter__(self) -> Iterator[MotionPart]:
         file = self._file
         planner = kit(self._machine).planner()
-        sampler = Sampler(self._dt_s)
         moves = 0
         guard = LengthGuard(file, self._machine, self._dialect)
         size = max(file.seek(0, io.SEEK_END), 1)
@@ -333,16 +337,16 @@ class TextMotion:
                 self._hold(block)
                 phases = planner.push(block)
                 self._check(phases, planner.time_s, guard.check)
-                for samples in sampler.push(self._shortened(phases)):
-                    yield from self._parts(samples)
+                for samples, path_mm in self._sampled(self._shortened(phases), final=False):
+                    yield from self._parts(samples, path_mm)
             self.time_s = planner.time_s
             self._told(file.tell() / size, self.time_s)
             if not data:
                 break
         phases = planner.flush()
         self._check(phases, planner.time_s, check_print_ends)
-        for samples in chain(sampler.push(self._shortened(phases)), sampler.flush()):
-            yield from self._parts(samples)
+        for samples, path_mm in self._sampled(self._shortened(phases), final=True):
+            yield from self._parts(samples, path_mm)
         self.time_s = planner.time_s
         if moves == 0:
             raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
@@ -395,7 +399,27 @@ class TextMotion:
         self._left_out_s, self._end_s = float(left_out_s[-1]), float(end_s[-1])
         return replace(phases, t_s=phases.t_s - left_out_s)
 
-    def _parts(self, samples: Samples) -> Iterator[MotionPart]:
+    def _sampled(
+        self, phases: Phases, *, final: bool
+    ) -> Iterator[tuple[Samples, np.ndarray | None]]:
+        """Sample motion, and where the file wants it, if the firmware rounds to motor steps."""
+        if max(self._step_mm[:2]) == 0.0:
+            for samples in _all(self._sampler, phases, final=final):
+                yield samples, None
+            return
+        if len(phases):
+            moves, first = _joined([m for _, m in self._held]), self._held[0][0]
+            numbered = replace(phases, move_index=phases.move_index - first)
+            asked = intended(numbered, moves.start_mm, moves.end_mm, self._step_mm)
+        else:
+            asked = phases
+        executed = _all(self._sampler, phases, final=final)
+        for samples, path in zip(
+            executed, _all(self._path_sampler, asked, final=final), strict=True
+        ):
+            yield samples, path.xyz_mm[:2]
+
+    def _parts(self, samples: Samples, path_mm: np.ndarray | None) -> Iterator[MotionPart]:
         """Cut samples where the position is lost or the shaper changes between two moves."""
         begun, jumped, last = 0, False, int(samples.move_index[-1])
         while True:
@@ -405,21 +429,25 @@ class TextMotion:
                 break
             at = int(np.searchsorted(samples.move_index, min(jump, change)))
             if at > begun:
-                yield self._part(samples.part(begun, at), jumped)
+                yield self._part(samples, path_mm, slice(begun, at), jumped)
                 begun, jumped = at, False
             if jump <= change:
                 self._jumps.pop(0)
                 jumped = True
             else:
                 self._shaping = self._changes.pop(0)[1]
-        yield self._part(samples.part(begun, len(samples)), jumped)
+        yield self._part(samples, path_mm, slice(begun, len(samples)), jumped)
 
-    def _part(self, samples: Samples, jumped: bool) -> MotionPart:
+    def _part(
+        self, samples: Samples, path_mm: np.ndarray | None, rows: slice, jumped: bool
+    ) -> MotionPart:
+        samples = samples.part(rows.start, rows.stop)
+        path_mm = None if path_mm is None else path_mm[:, rows]
         first = int(samples.move_index[0])
         while len(self._held) > 1 and self._held[1][0] <= first:
             self._held.pop(0)
         moves = _joined([m for _, m in self._held])
-        return MotionPart(samples, moves, self._held[0][0], jumped, self._shaping)
+        return MotionPart(samples, path_mm, moves, self._held[0][0], jumped, self._shaping)
 
 
 class _Motion:
@@ -464,6 +492,12 @@ class _Motion:
             yield from motion
         self.time_s, self.shapers = motion.time_s, motion.shapers
         self.warnings = [*doubtful, *motion.warnings]
+
+
+def _all(sampler: Sampler, phases: Phases, *, final: bool) -> Iterator[Samples]:
+    yield from sampler.push(phases)
+    if final:
+        yield from sampler.flush()
 
 
 def _joined(parts: list[Moves]) -> Moves:

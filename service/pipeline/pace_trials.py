@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from compensation.shapers import shape, shaper_pulses
 from gcode.errors import GcodeError
+from gcode.firmware.planning import intended
+from gcode.firmware.registry import kit
 from gcode.pieces import Piece
 from gcode.quickening import AS_SLICED, Pace, quickened
 from gcode.sampler import sample_phases
@@ -133,13 +135,15 @@ def compensated(
         The method cannot be designed for this machine.
     """
     work = PieceCompensator(machine, options, shaper)
+    step_mm = kit(machine).step_mm
 
     def motion(sample: Sample, piece: Piece) -> Motion:
         work.compensator.reset(piece.phases.start_mm[0, :2])
         made = work.compensate(piece, sample.point)
         # The next one begins with the design that did here, as pieces do.
         work.compensator.commit()
-        planned, position, row, extruding = as_executed(made, piece.phases, made.encoded.phases)
+        asked = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, step_mm)
+        planned, position, row, extruding = as_executed(made, asked, made.encoded.phases)
         return planned[:2], position[:2], extruding, sample.classes[row]
 
     return motion

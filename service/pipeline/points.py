@@ -29,6 +29,8 @@ class MotionSamples:
     moves : Moves
     first_move : int
         Number of the first of them in the file.
+    sliced_mm : ndarray, shape (2, n), optional
+        X and Y as the firmware executes the file as it came, where that is not as planned.
     """
 
     path_mm: Array
@@ -38,6 +40,7 @@ class MotionSamples:
     row: NDArray[np.int64]
     moves: Moves
     first_move: int = 0
+    sliced_mm: Array | None = None
 
     def __len__(self) -> int:
         return int(self.path_mm.shape[1])
@@ -53,6 +56,7 @@ def part_of(samples: MotionSamples, start: int, stop: int) -> MotionSamples:
         samples.row[start:stop],
         samples.moves,
         samples.first_move,
+        None if samples.sliced_mm is None else samples.sliced_mm[:, start:stop],
     )
 
 

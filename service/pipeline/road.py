@@ -12,6 +12,7 @@ import copy
 import io
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -20,7 +21,7 @@ import numpy as np
 
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
-from gcode.firmware.planning import join_phases, plan_moves
+from gcode.firmware.planning import intended, join_phases, plan_moves
 from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
@@ -49,7 +50,7 @@ from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options, stamp
-from service.pipeline.passages import feeding, last_length_mm, plan_passage, takes_s
+from service.pipeline.passages import feeding, plan_passage, takes_s
 from service.pipeline.points import MotionSamples, part_of
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
@@ -57,6 +58,7 @@ from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
 from service.pipeline.sums import Sums
 from service.pipeline.tracing import Trace
+from service.pipeline.verifying import NEGLIGIBLE_UM, Verifier
 from service.pipeline.yardstick import cached_shaper
 from service.version import __version__
 
@@ -66,14 +68,6 @@ T = TypeVar("T", bound=Passage)
 
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
-_EXTRUDING_EXCESS_MM = 15e-3
-_TRAVEL_EXCESS_MM = 200e-3
-"""How far the executed motion may be from the command beyond the tolerance, at worst."""
-_TIME_EXCESS_S = 20e-3
-_NEGLIGIBLE_UM = 1.0
-"""Contour error that nobody sees, whoever has less of it."""
-_END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
-"""How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
 
 
 def compensate_file(
@@ -178,6 +172,17 @@ def compensate_file(
         return result.model_copy(update=sizes)
 
 
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A piece as it may be written."""
+
+    made: CompensatedPiece
+    executed: Phases
+    gap_mm: np.ndarray
+    text: bytes
+    motion: MotionSamples
+
+
 class _Job:
     """State of one file on its way.
 
@@ -203,6 +208,7 @@ class _Job:
         self._clock = StageClock()
         self._changes = options.method != "none"
         self._kit = kit(machine)
+        self._rounds = max(self._kit.step_mm[:2]) > 0.0
         if self._changes and self._kit.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._kit.refusal}")
         # A method that cannot be designed says so before the yardstick takes its seconds.
@@ -235,6 +241,7 @@ class _Job:
                 machine, DT_S, self._shaper, compensated=True, take_layer=take_layer, trace=trace
             )
         if self._changes:
+            self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._kit, stamp(machine, options))
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
@@ -336,11 +343,11 @@ class _Job:
         self._sum.original_s += original_s
         if self._sum.jumped:
             # Homed, say: the machine did not come here along the path.
-            self._work.compensator.reset(piece.phases.start_mm[0, :2])
+            self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
             self._sum.jumped = False
         for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
             try:
-                made, executed, gap, text = self._attempt(piece, paced)
+                attempt = self._attempt(piece, paced)
                 break
             except Unfit as error:
                 reason = str(error)
@@ -350,19 +357,14 @@ class _Job:
             self._put_back(piece, original_s, reason)
             return
         self._work.compensator.commit()
-        self._sum.add_piece(made, executed, gap)
+        self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
-            planned, position, row, extruding = as_executed(made, paced.phases, executed)
-            last = len(row) - 1
-            samples = self._samples(piece, row, planned, position, extruding)
             # The last sample of an item is the first one of the next.
-            self._measure_piece(piece, part_of(samples, 0, last))
-        late_s = made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
-        self._emit(text, piece, np.append(delay_s + late_s, self.delay_s))
+            self._measure_piece(piece, part_of(attempt.motion, 0, len(attempt.motion) - 1))
+        late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
+        self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
 
-    def _attempt(
-        self, piece: Piece, paced: Piece
-    ) -> tuple[CompensatedPiece, Phases, np.ndarray, bytes]:
+    def _attempt(self, piece: Piece, paced: Piece) -> _Attempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
 
         Parameters
@@ -379,23 +381,40 @@ class _Job:
             with self._clock.stage("read back"):
                 checker = self._checker.snapshot()
                 executed = self._read_back(text)
-                gap = deviation(made, executed)
-                self._verify(piece, made, gap, executed)
+                gap_mm = deviation(made, executed)
+                self._verifier.check_motion(piece, made, gap_mm, executed)
+            with self._clock.stage("measure"):
+                motion = self._motion(piece, paced, made, executed)
+                if self._budget is None:
+                    self._verifier.check_gain(motion, self._point)
         except (Unfit, GcodeError):
             self._writer = writer
             if checker is not None:
                 self._checker = checker
             raise
-        return made, executed, gap, text
+        return _Attempt(made, executed, gap_mm, text, motion)
+
+    def _motion(
+        self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
+    ) -> MotionSamples:
+        """Planned and executed motion of a piece on one grid of real time."""
+        asked = self._asked(paced, paced.phases)
+        planned, position, row, extruding = as_executed(made, asked, executed)
+        came = planned
+        if self._rounds:
+            moved = replace(paced.phases, t_s=made.encoded.row_start_s)
+            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
+        return self._samples(piece, row, planned, position, extruding, came)
 
     def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
         if self._budget is None or self._pairs is None:
             self._measurement.add(written)
             return
         phases = piece.phases
-        count = max(round(phases.duration_s / DT_S), 1)
-        position, row = sample_phases(phases, (0.0, DT_S, count))
-        sliced = self._samples(piece, row, position, position, feeding(phases)[row])
+        grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
+        path, row = sample_phases(self._asked(piece, phases), grid)
+        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+        sliced = self._samples(piece, row, path, came, feeding(phases)[row], came)
         self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
         self._budget.correct(self._pairs.sums())
 
@@ -461,14 +480,16 @@ class _Job:
             first = phases.move_index[int(np.argmax(feeds))]
             self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
         until = np.where(feeds, phases.t_s + duration, -np.inf)
+        asked = self._asked(passage, phases)
         samples = max(round(motion_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             n = min(_CHUNK, samples - start)
             grid = (start * DT_S, DT_S, n)
-            position, row, extruding = sample_until(phases, grid, until, axes=3)
+            path, row, extruding = sample_until(asked, grid, until, axes=3)
+            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
             at = phases.move_index[row]
-            self._measurement.add(self._samples(passage, at, position, position, extruding))
-            self._observe(position[:2])
+            self._measurement.add(self._samples(passage, at, path, came, extruding, came))
+            self._observe(path[:2])
 
     def _samples(
         self,
@@ -477,8 +498,12 @@ class _Job:
         planned: np.ndarray,
         executed: np.ndarray,
         extruding: np.ndarray,
+        sliced: np.ndarray,
     ) -> MotionSamples:
-        """Return the samples of an item whose moves have been counted."""
+        """Return the samples of an item whose moves have been counted.
+
+        `sliced` is how the file as it came is executed, where the firmware rounds.
+        """
         return MotionSamples(
             path_mm=planned[:2],
             executed_mm=executed[:2],
@@ -487,7 +512,11 @@ class _Job:
             row=row,
             moves=item.moves,
             first_move=self._sum.moves - len(item.moves),
+            sliced_mm=sliced if self._rounds else None,
         )
+
+    def _asked(self, item: Piece | Passage, phases: Phases) -> Phases:
+        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._kit.step_mm)
 
     def _stand(self, dwell_s: float) -> None:
         """Let the machine stand where it is."""
@@ -519,39 +548,6 @@ class _Job:
         phases.append(planner.flush())
         return join_phases(phases)
 
-    def _verify(
-        self,
-        piece: Piece,
-        made: CompensatedPiece,
-        gap: np.ndarray,
-        executed: Phases,
-    ) -> None:
-        """Compare executed with intended motion; raise `Unfit` with the reason."""
-        step = np.array(self._kit.step_mm)
-        # Where vertices lie on steps, and when steps come, are off by up to a step each; what turns
-        # back within the shortest move is off by up to that.
-        coarse_mm = max(2.0 * float(np.hypot(*step[:2])), self._kit.shortest_move_mm)
-        tolerance = 1e-3 * self._options.tolerance_um + coarse_mm
-        worst = float(np.max(gap, initial=0.0))
-        if worst > tolerance + _EXTRUDING_EXCESS_MM:
-            printed = float(np.max(gap[made.extruding], initial=0.0))
-            if printed > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
-                raise Unfit(
-                    f"read back, the motion is {1e3 * printed:.1f} um from its command while "
-                    f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
-                    f"{1e3 * tolerance:g} um)"
-                )
-        encoded = made.encoded
-        stretch = made.timeline.end_s[-1] - made.timeline.start_s[-1]
-        planned_end = encoded.group_start_s[-1] + stretch - made.timeline.start_s[0]
-        late = executed.duration_s - float(planned_end)
-        if abs(late) > _TIME_EXCESS_S:
-            raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
-        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
-        wanted = piece.moves.end_mm[-1]
-        if np.any(np.abs(end - wanted) > step + _END_MM):
-            raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
-
     def _emit(
         self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
     ) -> None:
@@ -566,12 +562,11 @@ class _Job:
         """Yield a warning where the firmware's shaper, without compensation, would do better."""
         ours, shaper = rms_um["after"], rms_um["shaper"]
         compared = self._budget is None and not self._options.method.startswith("shaper:")
-        if not compared or ours < max(shaper, _NEGLIGIBLE_UM):
+        if not compared or ours < max(shaper, NEGLIGIBLE_UM):
             return
-        steps = ", not counting the motors' steps" if max(self._kit.step_mm) > 0.0 else ""
         yield (
             f"The firmware's own shaper would serve this file better: {self._shaper.label} alone "
-            f"would leave {shaper:.2g} um rms of contour error{steps}, this file {ours:.2g} um. "
+            f"would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
             "Print it as sliced with that shaper, or let --method advise write the commands"
         )
 

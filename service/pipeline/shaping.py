@@ -45,11 +45,11 @@ class ShapedMotion:
     def push(
         self, samples: MotionSamples, shaping: Shaping, point: OperatingPoint
     ) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
-        """Take motion; yield what is ready, `executed_mm` being the command."""
+        """Take unshaped motion; yield what is ready, `executed_mm` being the command."""
         if len(samples) == 0:
             return
         self._held.append((samples, point))
-        self._spread(samples.path_mm, shaping)
+        self._spread(samples.executed_mm, shaping)
         yield from self._ready()
 
     def flush(self) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
@@ -100,7 +100,8 @@ class ShapedMotion:
             if count < len(samples):
                 self._held.appendleft((part_of(samples, count, len(samples)), point))
                 samples = part_of(samples, 0, count)
-            yield replace(samples, executed_mm=samples.path_mm + away[:, :count]), point
+            command_mm = samples.executed_mm + away[:, :count]
+            yield replace(samples, executed_mm=command_mm), point
 
 
 def shaped(path_mm: Array, shaping: Shaping, dt_s: float) -> Array:

@@ -1,0 +1,125 @@
+"""Whether a compensated piece may be printed: executed as commanded, and better than it came."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.registry import kit
+from gcode.pieces import Piece
+from gcode.types import Phases
+from models.machine import Machine
+from models.schedule import OperatingPoint
+from service.pipeline.compensating import DT_S, CompensatedPiece, Unfit
+from service.pipeline.passages import last_length_mm
+from service.pipeline.points import MotionSamples
+from simulation.measures import MotionMeter
+from simulation.scheduled import MachineStream
+
+__all__ = ["NEGLIGIBLE_UM", "Verifier"]
+
+NEGLIGIBLE_UM = 1.0
+"""Contour error that nobody sees, whoever has less of it."""
+
+_EXTRUDING_EXCESS_MM = 15e-3
+_TRAVEL_EXCESS_MM = 200e-3
+"""How far the executed motion may be from the command beyond the tolerance, at worst."""
+_TIME_EXCESS_S = 20e-3
+_END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
+"""How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
+_STRIDE = 6
+_CLEARLY = 1.1
+
+
+class Verifier:
+    """Judge compensated pieces by their read-back motion.
+
+    Parameters
+    ----------
+    machine : Machine
+    tolerance_um : float
+    """
+
+    def __init__(self, machine: Machine, tolerance_um: float) -> None:
+        firmware = kit(machine)
+        self._machine = machine
+        self._step_mm = np.array(firmware.step_mm)
+        # Where vertices lie on steps, and when steps come, are off by up to a step each. What is
+        # shorter than the shortest move goes another way, there and back.
+        coarse_mm = max(2.0 * np.hypot(*self._step_mm[:2]), 2.0 * firmware.shortest_move_mm)
+        self._tolerance_mm = 1e-3 * tolerance_um + float(coarse_mm)
+
+    def check_motion(
+        self, piece: Piece, made: CompensatedPiece, gap_mm: NDArray[np.float64], executed: Phases
+    ) -> None:
+        """Compare executed with intended motion.
+
+        Parameters
+        ----------
+        piece : Piece
+            As it came.
+        made : CompensatedPiece
+        gap_mm : ndarray
+            Distance from the command, as `service.pipeline.compensating.deviation` gives it.
+        executed : Phases
+
+        Raises
+        ------
+        Unfit
+            With the reason.
+        """
+        tolerance = self._tolerance_mm
+        worst = float(np.max(gap_mm, initial=0.0))
+        if worst > tolerance + _EXTRUDING_EXCESS_MM:
+            printed = float(np.max(gap_mm[made.extruding], initial=0.0))
+            if printed > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
+                raise Unfit(
+                    f"read back, the motion is {1e3 * printed:.1f} um from its command while "
+                    f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
+                    f"{1e3 * tolerance:g} um)"
+                )
+        encoded = made.encoded
+        stretch = made.timeline.end_s[-1] - made.timeline.start_s[-1]
+        planned_end = encoded.group_start_s[-1] + stretch - made.timeline.start_s[0]
+        late = executed.duration_s - float(planned_end)
+        if abs(late) > _TIME_EXCESS_S:
+            raise Unfit(f"read back, the piece takes {1e3 * late:+.2f} ms longer than planned")
+        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
+        wanted = piece.moves.end_mm[-1]
+        if np.any(np.abs(end - wanted) > self._step_mm + _END_MM):
+            raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
+
+    def check_gain(self, motion: MotionSamples, point: OperatingPoint) -> None:
+        """Compare a piece with what came, on motors with steps: those cost fine motion most.
+
+        The machine stands still before it.
+
+        Parameters
+        ----------
+        motion : MotionSamples
+            With what came. If that is as planned, nothing is done.
+        point : OperatingPoint
+            Where the machine is.
+
+        Raises
+        ------
+        Unfit
+            When what came would print better.
+        """
+        if motion.sliced_mm is None:
+            return
+        commands = (motion.sliced_mm, motion.executed_mm)
+        meter = MotionMeter(DT_S, stride=_STRIDE, channels=len(commands))
+        path_mm = np.ascontiguousarray(motion.path_mm)
+        answers = [
+            MachineStream(self._machine, DT_S, point).push(np.ascontiguousarray(command), path_mm)
+            for command in commands
+        ]
+        meter.push(path_mm, np.stack(answers), motion.extruding)
+        meter.flush()
+        came_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
+        if ours_um > max(_CLEARLY * came_um, NEGLIGIBLE_UM):
+            raise Unfit(
+                f"on the motors' steps its contour error would be {ours_um:.1f} um rms, and it is "
+                f"{came_um:.1f} um as it came"
+            )

@@ -1,0 +1,88 @@
+"""Motors that stand on whole steps: errors are those from what the file asks for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcode.pieces import Piece
+from models.machine import Machine
+from models.schedule import EMPTY
+from models.store import load_machine
+from service.pipeline.compensating import Unfit
+from service.pipeline.motion import simulate_file
+from service.pipeline.options import Options
+from service.pipeline.points import MotionSamples
+from service.pipeline.result import Result
+from service.pipeline.road import compensate_file
+from service.pipeline.verifying import Verifier
+from tests.gcode.cutting import HEAD, pieces_of
+
+FIRMWARES = Path(__file__).parents[3] / "examples" / "firmware"
+LINES = "G28\nG90\nM83\nG1 X60 Y60.005 Z5 F1200\n" + "".join(
+    f"G1 X{60 + 10 * i} Y60.005 E1 F300\n" for i in range(1, 6)
+)
+"""Along Y 60.005, slowly: the nearest step is 60.000 at 80 steps/mm."""
+
+
+def machine_with(kind: str) -> Machine:
+    section = json.loads((FIRMWARES / f"{kind}.json").read_text())
+    if kind == "reprapfirmware":
+        section["y"]["steps_per_mm"] = 80.0
+    document = load_machine("ender3").model_dump(mode="json")
+    return Machine.model_validate(document | {"firmware": section})
+
+
+def rms_um(result: Result) -> dict[str, float]:
+    return {c.name: c.extruding.contour_rms_um for c in result.channels}
+
+
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path) -> None:
+    machine = machine_with(kind)
+    source = tmp_path / "lines.gcode"
+    source.write_text(LINES)
+    seen = rms_um(simulate_file(source, machine, cache_dir=tmp_path))
+    for method in ("none", "fbf"):
+        options = Options(method=method)
+        result = compensate_file(
+            source, tmp_path / "out.gcode", machine, options, cache_dir=tmp_path
+        )
+        found = rms_um(result)
+        assert found["before"] == pytest.approx(5.0, abs=0.3)
+        assert found["before"] == pytest.approx(seen["before"], abs=0.05)
+        assert found["shaper"] == pytest.approx(seen["shaper"], abs=0.05)
+        assert found["after"] <= found["before"] + 0.1
+
+
+def samples(executed_um: float, sliced_um: float | None) -> MotionSamples:
+    """Motion along X for 2 s, off by so much in Y."""
+    piece: Piece = pieces_of(HEAD + "G1 X70 E1 F300\n", load_machine("ender3"))[-1]
+    x = np.linspace(60.0, 70.0, 2001)
+
+    def line(off_um: float) -> np.ndarray:
+        return np.stack([x, np.full_like(x, 50.0 + 1e-3 * off_um)])
+
+    return MotionSamples(
+        path_mm=line(0.0),
+        executed_mm=line(executed_um),
+        z_mm=np.full_like(x, 5.0),
+        extruding=np.ones(len(x), np.bool_),
+        row=np.zeros(len(x), np.int64),
+        moves=piece.moves,
+        sliced_mm=None if sliced_um is None else line(sliced_um),
+    )
+
+
+def test_what_would_print_worse_stays_as_it_came() -> None:
+    verifier = Verifier(load_machine("ender3"), 2.0)
+    with pytest.raises(Unfit, match=r"6.0 um rms, and it is 3.0 um as it came"):
+        verifier.check_gain(samples(6.0, 3.0), EMPTY)
+    verifier.check_gain(samples(3.0, 6.0), EMPTY)
+    # A little more is no reason, nor is what nobody sees, nor where nothing is rounded.
+    verifier.check_gain(samples(3.2, 3.0), EMPTY)
+    verifier.check_gain(samples(0.9, 0.1), EMPTY)
+    verifier.check_gain(samples(6.0, None), EMPTY)
