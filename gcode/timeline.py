@@ -53,7 +53,8 @@ class Timeline:
         Ranges [a, b) of samples in which u(i) = u(i - 1) must hold; the path stands at a - 1.
     groups : list of Group
     start_s, end_s : ndarray, shape (len(groups),)
-        When each group starts and ends; a stretch is padded to the grid at its end.
+        When each group starts and ends, standing time before and after a stretch included, in which
+        a command may move already; a stretch is padded to the grid at its end.
     group_start_mm : ndarray, shape (len(groups), 4)
         x y z e where each group starts.
     row_start_s : ndarray, shape (rows,)
@@ -137,9 +138,9 @@ def build_timeline(
             rests.append((first, max(last, first + 1)))
             now = end[i]
         else:
-            start[i] = now + lead_s
-            row_start[rows] = start[i] + offset[:-1]
-            now = dt_s * np.ceil((start[i] + offset[-1] + tail_s) / dt_s - _GRID_EPS)
+            start[i] = now
+            row_start[rows] = now + lead_s + offset[:-1]
+            now = dt_s * np.ceil((now + lead_s + offset[-1] + tail_s) / dt_s - _GRID_EPS)
             # However short: a stretch has a sample of its own behind the rest.
             now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now

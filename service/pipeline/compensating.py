@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,6 +38,8 @@ _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
 _ACCEL_SHARES = (1.0, 0.8, 0.6)
 """Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
+_SOFT_S = (2e-3, 4e-3, 8e-3)
+"""Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
 
 
 class Unfit(ValueError):
@@ -124,22 +127,26 @@ class PieceCompensator:
             raise Unfit(str(error)) from error
 
     def _eased(self, piece: Piece) -> CompensatedPiece:
-        """Compensate, with less acceleration where the motors need it."""
-        jerky: _Jerky | None = None
+        """Compensate, with less acceleration or rounder corners where the motors need it."""
+        first: _Jerky | DesignError | None = None
         for share in _ACCEL_SHARES:
             if not self.compensator.ease(share):
-                break
+                assert first is not None
+                raise first
             try:
                 return self._compensate(piece)
             except _Jerky as error:
-                jerky = jerky or error
-            except DesignError:
+                first = first or error
+            except DesignError as error:
                 # With less it does not follow the path.
-                if jerky is None:
-                    raise
+                first = first or error
                 break
-        assert jerky is not None
-        raise jerky
+        self.compensator.ease(1.0)
+        for soft_s in _SOFT_S:
+            with contextlib.suppress(_Jerky, DesignError):
+                return self._compensate(piece, soft_s)
+        assert first is not None
+        raise first
 
     def _operate_at(self, point: OperatingPoint) -> None:
         self.compensator.operate_at(point)
@@ -149,7 +156,8 @@ class PieceCompensator:
             nodes = self._grid.at_level(level)
             self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
 
-    def _compensate(self, piece: Piece) -> CompensatedPiece:
+    def _compensate(self, piece: Piece, soft_s: float = 0.0) -> CompensatedPiece:
+        """Compensate the path, or its mean over `soft_s` before and after."""
         phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
         groups = group_rows(phases)
         resting = np.array([group.rest for group in groups])
@@ -162,12 +170,13 @@ class PieceCompensator:
                 groups,
                 rest_s,
                 DT_S,
-                lead_s=self.compensator.lead_s,
-                tail_s=self.compensator.tail_s,
+                lead_s=self.compensator.lead_s + soft_s,
+                tail_s=self.compensator.tail_s + soft_s,
             )
             extruding = timeline.moving & feeds[timeline.row]
             path = timeline.position_mm
-            xy_mm = self.compensator.compensate(path[:2], extruding, timeline.rests)
+            wanted = _mean(path[:2], round(soft_s / DT_S))
+            xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
             command = np.concatenate([xy_mm, path[2:]])
             _retract_along(command, timeline, phases)
             self._check_travel(command[:2], timeline.row, piece)
@@ -253,6 +262,17 @@ class PieceCompensator:
                     f"line {line}: the command would take {axis} to {place_mm[i, worst]:.4f} mm, "
                     f"outside {travel.min_mm:.7g} to {travel.max_mm:.7g} mm"
                 )
+
+
+def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Mean over `reach` samples before and after each, shape (2, n); it stood and will stand."""
+    if reach == 0:
+        return path_mm
+    padded = np.pad(path_mm, ((0, 0), (reach + 1, reach)), mode="edge")
+    # From the start: sums of large numbers would lose digits.
+    total = np.cumsum(padded - path_mm[:, :1], axis=1)
+    width = 2 * reach + 1
+    return np.asarray(path_mm[:, :1] + (total[:, width:] - total[:, :-width]) / width)
 
 
 def _error_filter(machine: Machine) -> ErrorFilter:

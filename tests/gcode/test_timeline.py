@@ -67,9 +67,10 @@ def test_layout(piece: Piece, rest_s: float, lead: float, tail: float) -> None:
             assert line.end_s[i] - line.start_s[i] == pytest.approx(rest_s, abs=1e-12)
         else:
             begin = line.end_s[i - 1] if i else 0.0
-            assert line.start_s[i] == pytest.approx(begin + lead, abs=1e-12)
+            assert line.start_s[i] == begin
+            assert line.row_start_s[group.first] == pytest.approx(begin + lead, abs=1e-12)
             moving = duration[group.first : group.last].sum()
-            spare = line.end_s[i] - line.start_s[i] - moving
+            spare = line.end_s[i] - line.row_start_s[group.first] - moving
             assert tail - 1e-8 <= spare <= tail + DT_S
     np.testing.assert_allclose(line.group_start_mm, p.start_mm[[g.first for g in line.groups]])
     assert line.position_mm.shape[1] == round(line.end_s[-1] / DT_S) + 1

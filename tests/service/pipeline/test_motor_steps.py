@@ -58,6 +58,31 @@ def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path) -> None:
         assert found["after"] <= found["before"] + 0.1
 
 
+def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
+    """Marlin passes these corners without slowing down: no command follows all of them at once."""
+    document = machine_with("marlin").model_dump(mode="json")
+    document["firmware"]["min_steps_per_segment"] = 1
+    document["firmware"]["planner"]["max_accel_mm_s2"] |= {"x": 20000.0, "y": 20000.0}
+    for axis, f_hz, zeta in (("x", 83.01, 0.021), ("y", 91.26, 0.102)):
+        pole = {"f_hz": f_hz, "zeta": zeta}
+        document["axes"][axis]["nominal"] = {"kind": "pairs", "poles": [pole], "zeros": []}
+    lines = ["G28", "G90", "M83", "M204 P12000 T12000"]
+    for layer in range(3):
+        lines += [f"G1 Z{0.2 * (layer + 1):.1f} F600", "G1 E-.8 F2400", "G1 X79.293 Y60 F9000"]
+        lines += ["G1 E.8 F2400"]
+        for radius in (19.293, 18.843, 18.393):
+            places = 60.0 + 60.0j + radius * np.exp(0.25j * np.pi * np.arange(9))
+            sides = [f"G1 X{p.real:.3f} Y{p.imag:.3f}" for p in places.tolist()]
+            lines += [f"{sides[0]} F6000", *(f"{side} E.5" for side in sides[1:])]
+    source = tmp_path / "rings.gcode"
+    source.write_text("\n".join(lines) + "\n")
+    machine = Machine.model_validate(document)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+    found = rms_um(result)
+    assert found["after"] < 0.5 * found["shaper"] < 0.5 * found["before"]
+
+
 def samples(executed_um: float, sliced_um: float | None) -> MotionSamples:
     """Motion along X for 2 s, off by so much in Y."""
     piece: Piece = pieces_of(HEAD + "G1 X70 E1 F300\n", load_machine("ender3"))[-1]
