@@ -357,6 +357,7 @@ class _Job:
             self._put_back(piece, original_s, reason)
             return
         self._work.compensator.commit()
+        self._verifier.passed(attempt.motion.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
             # The last sample of an item is the first one of the next.
@@ -529,6 +530,7 @@ class _Job:
     def _observe(self, command: np.ndarray | None) -> None:
         if not self._changes:
             return
+        self._verifier.passed(command)
         if command is None:
             self._sum.jumped = True
             return

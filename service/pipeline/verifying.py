@@ -28,6 +28,8 @@ _TIME_EXCESS_S = 20e-3
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 """How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
 _STRIDE = 6
+_PAST = 2000
+"""Samples of motion before a piece, whose vibration may last into it."""
 _CLEARLY = 1.1
 
 
@@ -48,6 +50,7 @@ class Verifier:
         # shorter than the shortest move goes another way, there and back.
         coarse_mm = max(2.0 * np.hypot(*self._step_mm[:2]), 2.0 * firmware.shortest_move_mm)
         self._tolerance_mm = 1e-3 * tolerance_um + float(coarse_mm)
+        self._past_mm = np.zeros((2, 0))
 
     def check_motion(
         self, piece: Piece, made: CompensatedPiece, gap_mm: NDArray[np.float64], executed: Phases
@@ -89,10 +92,20 @@ class Verifier:
         if np.any(np.abs(end - wanted) > self._step_mm + _END_MM):
             raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
 
+    def passed(self, command_mm: NDArray[np.float64] | None) -> None:
+        """Take note of motion, shape (2, n): the machine vibrates on when a piece begins.
+
+        None: the position is lost, and the machine stands still when motion goes on.
+        """
+        if command_mm is None:
+            self._past_mm = self._past_mm[:, :0]
+        elif command_mm.shape[1] >= _PAST:
+            self._past_mm = command_mm[:2, -_PAST:].copy()
+        else:
+            self._past_mm = np.hstack([self._past_mm, command_mm[:2]])[:, -_PAST:]
+
     def check_gain(self, motion: MotionSamples, point: OperatingPoint) -> None:
         """Compare a piece with what came, on motors with steps: those cost fine motion most.
-
-        The machine stands still before it.
 
         Parameters
         ----------
@@ -110,12 +123,14 @@ class Verifier:
             return
         commands = (motion.sliced_mm, motion.executed_mm)
         meter = MotionMeter(DT_S, stride=_STRIDE, channels=len(commands))
-        path_mm = np.ascontiguousarray(motion.path_mm)
+        past = self._past_mm
+        path_mm = np.hstack([past, motion.path_mm])
         answers = [
-            MachineStream(self._machine, DT_S, point).push(np.ascontiguousarray(command), path_mm)
+            MachineStream(self._machine, DT_S, point).push(np.hstack([past, command]), path_mm)
             for command in commands
         ]
-        meter.push(path_mm, np.stack(answers), motion.extruding)
+        extruding = np.append(np.zeros(past.shape[1], np.bool_), motion.extruding)
+        meter.push(path_mm, np.stack(answers), extruding)
         meter.flush()
         came_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
         if ours_um > max(_CLEARLY * came_um, NEGLIGIBLE_UM):

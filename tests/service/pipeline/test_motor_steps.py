@@ -111,3 +111,15 @@ def test_what_would_print_worse_stays_as_it_came() -> None:
     verifier.check_gain(samples(3.2, 3.0), EMPTY)
     verifier.check_gain(samples(0.9, 0.1), EMPTY)
     verifier.check_gain(samples(6.0, None), EMPTY)
+
+
+def test_what_vibrates_on_from_before_counts_for_both() -> None:
+    """As it came it is a little better where the machine stood before, and not where it shakes."""
+    verifier = Verifier(load_machine("ender3"), 2.0)
+    motion = samples(4.0, 2.0)
+    x = np.append(np.linspace(40.0, 60.0, 100), np.full(10, 60.0))
+    verifier.passed(np.stack([x, np.linspace(30.0, 50.0, 110)]))
+    verifier.check_gain(motion, EMPTY)
+    verifier.passed(None)
+    with pytest.raises(Unfit, match="as it came"):
+        verifier.check_gain(motion, EMPTY)
