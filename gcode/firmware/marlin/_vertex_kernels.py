@@ -8,8 +8,7 @@ choose which vertices to leave out.
 
 The error of a segment moves the printer long after: so all of a stretch is one shortest path
 (Viterbi, 1967) over times and places, each carrying the printer's state. Of the ways that end at
-about one time only the best few are followed on. What drives the printer is where the motors
-stand, from step to step, in the mean of each sample.
+about one time only the best few are followed on.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ _BESIDE = 2
 """How many steps, along X and Y together, the former lie beside the nearest one."""
 _REACH = 2.0
 """How much earlier or later a vertex may come, in samples."""
-_WAYS = 6
+_WAYS = 4
 """Ways that are followed on from a vertex."""
-_LOOK_BACK, _LOOK_BACK_SLOW = 2, 16
+_LOOK_BACK, _LOOK_BACK_SLOW = 2, 4
 """Earlier vertices that a segment may come from, counted from the nearest that is far enough."""
 _LONG, _LONGEST = 25.0, 1000.0
 """Samples. Longer segments are tried only where there is none shorter, and longer ones not at all:
@@ -40,14 +39,12 @@ _SHORT = 0.5
 _NEARLY_BACK = 0.9999
 _JOLT = 20.0
 """Samples. What makes steps of an excess of speed; large, so that there is none where it can be."""
-_SEEN = 0.03
+_SEEN = 0.1
 """What the square of an error counts by itself, that of the printer's answer being 1."""
-_ALONG = 0.04
+_ALONG = 0.1
 """What a square along the path counts, one across it being 1: only the latter is seen on a part."""
-_FAR, _TOO_FAR = 2.0, 4.0
-"""What a squared error is above the first, in steps of X, counts that much, wherever it points."""
-_LATER = 0.3
-"""What ringing on behind a vertex counts where ways are compared: the next errors damp it."""
+_FAR = 1.2
+"""What a squared error is above that, in steps of X, counts too, wherever the error points."""
 
 
 @kernel(inline=True)
@@ -351,43 +348,23 @@ def _follow(
                     total += _jolt(bx * per - rate_x, by * per - rate_y, jump, step, corexy)
                     if last:
                         total += _jolt(bx * per, by * per, per, step, corexy)
-                    # Most ways are seen to be worse in the middle of the segment.
-                    s = min(int(0.5 * (begin + place_at[k, c])) + 1, len(command) - 1)
-                    if s <= place_at[k, c]:
-                        t = per * (s - begin)
-                        square = ((from_x + bx * t - command[s, 0]) * unit[0]) ** 2
-                        square += ((from_y + by * t - command[s, 1]) * unit[1]) ** 2
-                        if total + _TOO_FAR * (square - _FAR) >= most:
-                            continue
                     for q in range(width):
                         x[q] = states[j, d, q]
                     s = int(np.ceil(begin + 1e-6))
                     end = min(int(np.floor(place_at[k, c] + 1e-6)), len(command) - 1)
                     fed_per = (_fed(command, place_at[k, c]) - fed) * per
-                    # The motors are X and Y, on a CoreXY their sum and difference.
-                    rate_a = (bx + by if corexy else bx) * per
-                    rate_b = (bx - by if corexy else by) * per
-                    area_a = _stair_area(rate_a * (s - begin - 0.5))
-                    area_b = _stair_area(rate_b * (s - begin - 0.5))
                     while s <= end and total < most:
                         t = s - begin
-                        before_a, area_a = area_a, _stair_area(rate_a * (t + 0.5))
-                        before_b, area_b = area_b, _stair_area(rate_b * (t + 0.5))
-                        x_moved = (area_a - before_a) / rate_a if rate_a != 0.0 else 0.0
-                        y_moved = (area_b - before_b) / rate_b if rate_b != 0.0 else 0.0
-                        if corexy:
-                            x_moved, y_moved = 0.5 * (x_moved + y_moved), 0.5 * (x_moved - y_moved)
                         answer_along = error_along = square = 0.0
                         for axis in range(2):
                             start, leg = (from_x, bx) if axis == 0 else (from_y, by)
                             error = start + leg * per * t - command[s, axis]
-                            driven = start + (x_moved, y_moved)[axis] - command[s, axis]
-                            answer = direct[axis] * driven
+                            answer = direct[axis] * error
                             for r in range(0, 2 * order, 2):
                                 q = 2 * order * axis + r
                                 re, im = x[q], x[q + 1]
                                 answer += weight[axis, r] * re - weight[axis, r + 1] * im
-                                x[q] = pole[axis, r] * re - pole[axis, r + 1] * im + driven
+                                x[q] = pole[axis, r] * re - pole[axis, r + 1] * im + error
                                 x[q + 1] = pole[axis, r] * im + pole[axis, r + 1] * re
                             answer, error = answer * unit[axis], error * unit[axis]
                             total += answer * answer + _SEEN * error * error
@@ -395,7 +372,7 @@ def _follow(
                             answer_along += heading[s, axis] * answer
                             error_along += heading[s, axis] * error
                         along = answer_along * answer_along + _SEEN * error_along * error_along
-                        total += _TOO_FAR * max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
+                        total += max(square - _FAR, 0.0) - (1.0 - _ALONG) * along
                         gap = fed + fed_per * t - command[s, 2]
                         total += gap * gap
                         s += 1
@@ -409,7 +386,7 @@ def _follow(
                                     part += energy[axis, r, q] * x[2 * order * axis + q]
                                 square += part * x[2 * order * axis + r]
                             counts = 1.0 - (1.0 - _ALONG) * heading[end, axis] ** 2
-                            later += _LATER * counts * unit[axis] ** 2 * square
+                            later += counts * unit[axis] ** 2 * square
                     if total + later < most:
                         _keep(kept, rank[k, c], total + later)
                         cost[k, c], rank[k, c] = total, total + later
@@ -440,13 +417,6 @@ def _follow(
         k, c = before // MOST_PLACES, before % MOST_PLACES
     chosen[0] = 0
     return True
-
-
-@kernel(inline=True)
-def _stair_area(way: float) -> float:
-    """Integral of the nearest whole step from 0 to a way: over the way, where a motor is."""
-    step = np.rint(way)
-    return float(step * (way - 0.5 * step))
 
 
 @kernel(inline=True)

@@ -24,10 +24,6 @@ _CALM = 0.6
 """Of the machine's step of speed: what makes up for lost time comes on top."""
 _OFTEN_S = 4e-3
 """Straight lines get a vertex that often, to lie on the command in the mean."""
-_FINE_S, _FINER_S = 2e-3, 1e-3
-_SLOW_S, _SLOWER_S = 2e-3, 3e-3
-"""Where the shortest move takes longer than these, vertices to choose from come that often: few
-moves make the way there, and much lies in where and when they begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,16 +197,11 @@ def _chosen(
 def _often(
     lattice: Lattice, at_s: NDArray[np.float64], at_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Put vertices between those of a fit: to choose from where few are taken, or where all fit."""
+    """Put vertices between those of a fit, where both they and the lines have room for them."""
     way = np.abs(np.diff(at_mm, axis=0)) * lattice.per_mm
     hops = way[:, 0] + way[:, 1] if lattice.corexy else np.maximum(way[:, 0], way[:, 1])
-    lasts_s = np.diff(at_s)
     often_s = max(_OFTEN_S, 2.0 / lattice.moves_per_s)
-    parts = np.ceil(np.minimum(lasts_s / often_s - 1e-9, hops / (2.0 * lattice.least)))
-    if lattice.least > 1:
-        shortest_s = lattice.least * lasts_s / np.maximum(hops, 1e-9)
-        fine_s = np.where(shortest_s > _SLOWER_S, _FINER_S, _FINE_S)
-        parts = np.where(shortest_s > _SLOW_S, np.ceil(lasts_s / fine_s - 1e-9), parts)
+    parts = np.ceil(np.minimum(np.diff(at_s) / often_s - 1e-9, hops / (2.0 * lattice.least)))
     parts = np.maximum(parts, 1.0).astype(np.int64)
     index = np.arange(len(at_s), dtype=np.float64)
     before = np.repeat(index[:-1], parts)
