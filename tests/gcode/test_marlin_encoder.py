@@ -140,7 +140,7 @@ def test_limits_of_a_stream() -> None:
     lines = MarlinVoice(FIRMWARE).limits(stream).decode().splitlines()
     assert lines == [
         "M201 X300000 Y300000 Z20000 E300000",
-        "M203 X500 Y500 Z20 E200",
+        "M203 X525 Y525 Z20 E200",
         "M204 P300000 R500 T300000",
         "M205 B0 S0 T0 J0.3",
     ]

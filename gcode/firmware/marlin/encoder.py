@@ -59,6 +59,9 @@ STREAM_Z_JERK_MM_S = 10.0
 
 _MOST_FEED = 3.0
 """Filament per mm, above which the firmware takes a move for a retraction and advances none."""
+_ROOM, _DIAGONAL = 1.05, 1.5
+"""So much faster than a command may be: an axis between vertices on whole steps, and the way that
+X and Y make together."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
@@ -80,8 +83,8 @@ def stream_limits(own: MarlinLimits, velocity_mm_s: float) -> MarlinLimits:
         accel_y_mm_s2=STREAM_ACCEL_MM_S2,
         accel_z_mm_s2=max(own.accel_z_mm_s2, STREAM_Z_ACCEL_MM_S2),
         accel_e_mm_s2=STREAM_ACCEL_MM_S2,
-        feedrate_x_mm_s=max(own.feedrate_x_mm_s, velocity_mm_s),
-        feedrate_y_mm_s=max(own.feedrate_y_mm_s, velocity_mm_s),
+        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * velocity_mm_s),
+        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * velocity_mm_s),
         feedrate_e_mm_s=feed,
         print_accel_mm_s2=STREAM_ACCEL_MM_S2,
         travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
@@ -168,7 +171,7 @@ class MarlinEncoder:
         start_mm, end_mm = start / UNITS_PER_MM, moves.position / UNITS_PER_MM
         ours = rows < 0
         limits_id, table = limits_in_force(piece, rows, limits)
-        speed = np.where(ours, self._velocity, piece.moves.speed_mm_s[rows])
+        speed = np.where(ours, _DIAGONAL * self._velocity, piece.moves.speed_mm_s[rows])
         steps, path = self._blocks(start_mm, end_mm)
 
         phases = self._plan(start_mm, end_mm, speed, limits_id, table)

@@ -83,6 +83,22 @@ def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
     assert found["after"] < 0.5 * found["shaper"] < 0.5 * found["before"]
 
 
+def test_marlin_follows_travel_as_fast_as_commands_may_be(tmp_path: Path) -> None:
+    """Along an axis at the command's highest speed, and along a diagonal faster than that."""
+    document = machine_with("marlin").model_dump(mode="json")
+    planner = document["firmware"]["planner"]
+    planner["max_accel_mm_s2"] |= {"x": 8000.0, "y": 8000.0}
+    planner["max_feedrate_mm_s"] |= {"x": 300.0, "y": 300.0}
+    document["command"]["velocity_mm_s"] = 300.0
+    source = tmp_path / "travel.gcode"
+    fast = "G1 X160 F24000\nG1 Y61 E1\nG1 X20 Y60 F24000\nG1 X160 Y180 F24000\nG1 X20 Y60 F24000\n"
+    head = "G28\nG90\nM83\nM204 P8000 T8000\nG1 X20 Y60 Z5 F6000\n"
+    source.write_text(head + 4 * (fast + "G1 X40 Y70 E1 F6000\nG1 X20 Y60 E1\n"))
+    machine = Machine.model_validate(document)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+
+
 def samples(executed_um: float, sliced_um: float | None) -> MotionSamples:
     """Motion along X for 2 s, off by so much in Y."""
     piece: Piece = pieces_of(HEAD + "G1 X70 E1 F300\n", load_machine("ender3"))[-1]
