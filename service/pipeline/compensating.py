@@ -40,9 +40,6 @@ _ACCEL_SHARES = (1.0, 0.8, 0.6)
 """Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
-_SUDDEN = 1.3
-"""A path that asks for so much more than the largest acceleration is rounded at once: a command
-that can follow its corners only here and there leaves more error than rounder ones."""
 
 
 class Unfit(ValueError):
@@ -101,8 +98,6 @@ class PieceCompensator:
         self._machine = machine
         self._tolerance_mm = 1e-3 * options.tolerance_um
         self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
-        self._eases = self.compensator.ease(_ACCEL_SHARES[-1])
-        self.compensator.ease(1.0)
         firmware = kit(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
@@ -180,8 +175,6 @@ class PieceCompensator:
             )
             extruding = timeline.moving & feeds[timeline.row]
             path = timeline.position_mm
-            if soft_s == 0.0 and self._eases:
-                self._check_corners(path)
             wanted = _mean(path[:2], round(soft_s / DT_S))
             xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
             command = np.concatenate([xy_mm, path[2:]])
@@ -198,16 +191,6 @@ class PieceCompensator:
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
         return CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
-
-    def _check_corners(self, path: NDArray[np.float64]) -> None:
-        """Refuse a path with corners that the machine's commands are far from following."""
-        limit = self._machine.command.accel_mm_s2
-        asked = peaks(path)[1] / DT_S**2
-        if asked > _SUDDEN * limit:
-            raise DesignError(
-                f"the path itself asks for {asked:.0f} mm/s2 at a corner; commands may have "
-                f"{limit:.0f} mm/s2 (command.accel_mm_s2)"
-            )
 
     def _fit(
         self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
