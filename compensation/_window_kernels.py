@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,33 +14,233 @@ from compensation._least_squares_kernels import (
     forward,
     weighted_gram,
 )
+from compensation._preview_kernels import advance_window, run_windows
 from models.jit import kernel
 
-__all__ = ["command_of", "constraints_at", "extremes", "tied_window"]
+__all__ = [
+    "Functions",
+    "Memory",
+    "Stepping",
+    "Tied",
+    "command_of",
+    "constraints_at",
+    "extremes",
+    "solve_windows",
+    "tied_window",
+]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
+class Functions(NamedTuple):
+    """Functions of a design, and what the plants make of them.
+
+    Attributes
+    ----------
+    basis, summed : ndarray, shape (window, n)
+        Increments of the functions, and their double running sums: the commands.
+    efforts, grams : ndarray, shape (blocks + 1, n, n)
+        Running Gram matrices (`weighted_gram`) of `basis` and `filtered`.
+    filtered : ndarray, shape (components, window, n)
+    free : ndarray, shape (components, window, nz)
+        What states do by themselves.
+    reach : ndarray, shape (nz - 2, window)
+        From commands to states at the window's end.
+    stop : ndarray, shape (components, window)
+        Response to a step of the command's speed.
+    price : float
+        Of squared increments.
+    """
+
+    basis: Array
+    summed: Array
+    efforts: Array
+    filtered: Array
+    grams: Array
+    free: Array
+    reach: Array
+    stop: Array
+    price: float
+
+
+class Stepping(NamedTuple):
+    """How a design's windows without rests go on, and how the plants do.
+
+    Attributes
+    ----------
+    command_gain, state_gain : ndarray, shapes (update, nz) and (nz, nz)
+        E and F of `run_windows`.
+    advance, drive : ndarray, shapes (nz - 2, nz - 2) and (nz, update)
+        As `advance_window` has them.
+    command, state : ndarray, shapes (windows, update) and (windows, nz)
+        S y_d and H y_d of every window.
+    """
+
+    command_gain: Array
+    state_gain: Array
+    advance: Array
+    drive: Array
+    command: Array
+    state: Array
+
+
+class Memory(NamedTuple):
+    """Windows solved by themselves: z before, and the samples that were committed.
+
+    Attributes
+    ----------
+    known : ndarray of bool, shape (windows,)
+    z, committed : ndarray, shapes (windows, nz) and (windows, update)
+    """
+
+    known: Flags
+    z: Array
+    committed: Array
+
+
+class Tied(NamedTuple):
+    """A window solved by itself without bounds.
+
+    Attributes
+    ----------
+    command : ndarray, shape (window,)
+    kept : bool
+        Whether it keeps its limits all the same.
+    moving, fixed : ndarray, shapes (k, 2) and (window,)
+        Segments between the rests, and the command without functions.
+    factor, wish, ends
+        As in `_tied_problem`.
+    pinned, values : ndarray, shapes (pins, n) and (pins,)
+        Where the command stands on the path: pinned w = values.
+    """
+
+    command: Array
+    kept: bool
+    moving: Ints
+    fixed: Array
+    factor: Array
+    wish: Array
+    ends: Array
+    pinned: Array
+    values: Array
+
+
+@kernel
+def solve_windows(
+    stepping: Stepping,
+    functions: Functions,
+    rest_functions: Functions,
+    path: Array,
+    targets: Array,
+    weight: Array,
+    stops: Ints,
+    careful: Flags,
+    limits: Array,
+    memory: Memory,
+    z: Array,
+    first: int,
+    last: int,
+    u: Array,
+) -> tuple[int, Tied]:
+    """Step windows first..last - 1 until one does not keep its limits by itself.
+
+    Parameters
+    ----------
+    stepping, functions, rest_functions
+        `functions` solve `careful` windows, `rest_functions` those that meet a stop; all others
+        take their steps.
+    path, weight : ndarray, shape (windows update + window,)
+        As `tied_window` has them, of the whole piece.
+    targets : ndarray, shape (components, windows update + window)
+    stops : ndarray of int64, shape (k, 2)
+        Ranges [a, b) of samples, rising and apart.
+    careful : ndarray of bool, shape (windows,)
+    limits
+        As in `tied_window`.
+    memory : Memory
+        Windows that begin as they did before are not solved again.
+    z : ndarray, shape (nz,)
+        The plants' states and the last two commands, carried on.
+    u : ndarray, shape (windows update,)
+        The command.
+
+    Returns
+    -------
+    window : int
+        Which one does not keep its limits, with its solution; or `last`, and nothing.
+    tied : Tied
+    """
+    window, update = len(functions.basis), stepping.command.shape[1]
+    met = behind = 0
+    waiting = first
+    for w in range(first, last):
+        start = w * update
+        while met < len(stops) and stops[met, 1] <= start:
+            met += 1
+        while behind < len(stops) and stops[behind, 0] < start + window:
+            behind += 1
+        if behind <= met and not careful[w]:
+            continue
+        _step(stepping, z, waiting, w, u)
+        if not (memory.known[w] and _same(memory.z[w], z)):
+            tied = tied_window(
+                rest_functions if behind > met else functions,
+                z,
+                path[start : start + window],
+                targets[:, start : start + window],
+                weight[start : start + window],
+                stops[met:behind] - start,
+                limits,
+            )
+            if not tied.kept:
+                return w, tied
+            memory.known[w], memory.z[w] = True, z
+            memory.committed[w] = tied.command[:update]
+        u[start : start + update] = memory.committed[w]
+        advance_window(stepping.advance, stepping.drive, z, memory.committed[w])
+        waiting = w + 1
+    _step(stepping, z, waiting, last, u)
+    row, table = np.empty(0), np.empty((0, 0))
+    return last, Tied(row, True, np.empty((0, 2), np.int64), row, table, row, table, table, row)
+
+
+@kernel
+def _same(a: Array, b: Array) -> bool:
+    """Tell whether two rows of numbers are equal."""
+    differing = 0
+    for k in range(len(a)):
+        differing += a[k] != b[k]
+    return differing == 0
+
+
+@kernel(inline=True)
+def _step(stepping: Stepping, z: Array, first: int, last: int, u: Array) -> None:
+    """Step windows first..last - 1, which have no rests."""
+    if last > first:
+        run_windows(
+            stepping.command_gain,
+            stepping.state_gain,
+            stepping.command,
+            stepping.state,
+            z,
+            first,
+            last,
+            u,
+        )
+
+
 @kernel
 def tied_window(
-    basis: Array,
-    summed: Array,
-    efforts: Array,
-    filtered: Array,
-    grams: Array,
-    free: Array,
-    reach: Array,
-    stop: Array,
-    price: float,
+    functions: Functions,
     z: Array,
     path: Array,
     targets: Array,
     weight: Array,
     rests: Ints,
     limits: Array,
-) -> tuple[Array, bool, Ints, Array, Array, Array, Array, Array, Array]:
+) -> Tied:
     """Command of a window that stands on the path in its rests, and whether it keeps its limits.
 
     Parameters
@@ -52,39 +254,15 @@ def tied_window(
 
     Others as in `_tied_problem`.
 
-    Returns
-    -------
-    command : ndarray, shape (window,)
-    kept : bool
-    moving, fixed : ndarray, shapes (k, 2) and (window,)
-        Segments between the rests, and the command without functions.
-    factor, wish, ends
-        As in `_tied_problem`.
-    pinned, values : ndarray, shapes (pins, n) and (pins,)
-        Where the command stands on the path: pinned w = values.
-
     Raises
     ------
     numpy.linalg.LinAlgError
         When the problem is singular, or the rests contradict each other.
     """
+    basis = functions.basis
     last, previous = z[-2], z[-1]
     moving = _between(rests, len(basis))
-    factor, wish, ends = _tied_problem(
-        basis,
-        summed,
-        efforts,
-        filtered,
-        grams,
-        free,
-        reach,
-        stop,
-        price,
-        z,
-        targets,
-        weight,
-        moving,
-    )
+    factor, wish, ends = _tied_problem(functions, z, targets, weight, moving)
     fixed = tied_command(np.zeros(len(basis)), moving, last, previous)
     first = 1 if len(ends) > 0 and moving[0, 1] == 0 else 0
     pinned = ends[first:].copy()
@@ -106,7 +284,7 @@ def tied_window(
     command = command_of(factor, found, basis, moving, last, previous, path)
     accel, speed, low, high, _ = extremes(command, last, previous, False)
     kept = accel <= limits[0] and speed <= limits[1] and low >= limits[2] and high <= limits[3]
-    return command, kept, moving, fixed, factor, wish, ends, pinned, values
+    return Tied(command, kept, moving, fixed, factor, wish, ends, pinned, values)
 
 
 @kernel
@@ -122,19 +300,7 @@ def _between(rests: Ints, window: int) -> Ints:
 
 @kernel
 def _tied_problem(
-    basis: Array,
-    summed: Array,
-    efforts: Array,
-    filtered: Array,
-    grams: Array,
-    free: Array,
-    reach: Array,
-    stop: Array,
-    price: float,
-    z: Array,
-    targets: Array,
-    weight: Array,
-    moving: Ints,
+    functions: Functions, z: Array, targets: Array, weight: Array, moving: Ints
 ) -> tuple[Array, Array, Array]:
     """Weighted least squares of a window with rests, factored: least |w - wish|^2.
 
@@ -145,19 +311,7 @@ def _tied_problem(
 
     Parameters
     ----------
-    basis, summed : ndarray, shape (window, n)
-        Increments of the functions, and their double running sums: the commands.
-    efforts, grams : ndarray, shape (blocks + 1, n, n)
-        Running Gram matrices (`weighted_gram`) of `basis` and `filtered`.
-    filtered : ndarray, shape (components, window, n)
-    free : ndarray, shape (components, window, nz)
-        What states do by themselves.
-    reach : ndarray, shape (nz - 2, window)
-        From commands to states at the window's end.
-    stop : ndarray, shape (components, window)
-        Response to a step of the command's speed.
-    price : float
-        Of squared increments.
+    functions : Functions
     z, targets, weight
         As in `compensation.window_problem.solve_window`.
     moving : ndarray of int64, shape (k, 2)
@@ -171,6 +325,7 @@ def _tied_problem(
     ends : ndarray, shape (k - 1, n)
         Where the functions' commands stand in each rest.
     """
+    basis, summed, efforts, filtered, grams, free, reach, stop, price = functions
     window, n = basis.shape
     rests, states = len(moving) - 1, free.shape[2]
     first, speed = moving[0, 1], z[-2] - z[-1]

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._preview_kernels import advance_state, advance_window, run_windows
+from compensation._preview_kernels import advance_state, advance_window
+from compensation._window_kernels import Memory, Stepping, solve_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, ce_opt_basis, robust_basis
 from compensation.lifted_window import LiftedWindow, lifted_window
 from compensation.preview import PreviewDesign
-from compensation.window_problem import TRAVEL_SLACK_MM, Bounds, solve_window
+from compensation.window_problem import (
+    TRAVEL_SLACK_MM,
+    Bounds,
+    functions_of,
+    refusing_singular,
+    within_bounds,
+)
 from models.plants import DiscretePlant
 from models.response_kernels import dense_response
 
@@ -114,24 +121,25 @@ class _Drive:
     ----------
     task : AxisTask
     rung : int
-    path_mm : ndarray, shape (windows * update + window,)
+    path_mm, weight : ndarray, shape (windows * update + window,)
         Of the task, relative to where the path begins, and beyond its end.
     targets_mm : ndarray, shape (components, windows * update + window)
     command : ndarray, shape (windows, update)
         S y_d of every window.
     state : ndarray, shape (windows, nz)
         H y_d.
-    solved : dict
-        Windows solved one by one: z before, and the samples that were committed.
+    memory : Memory
+        Windows solved one by one.
     """
 
     task: AxisTask
     rung: int
     path_mm: Array
+    weight: Array
     targets_mm: Array
     command: Array
     state: Array
-    solved: dict[int, tuple[Array, Array]] = field(default_factory=dict)
+    memory: Memory
 
 
 class Designs:
@@ -303,44 +311,54 @@ class PreviewAxis:
         self._move_origin(float(task.path_mm[0]))
         origin = self._origin
         bounds = task.bounds.seen_from(origin)
-        # Stops that each window meets.
-        starts = update * np.arange(windows)
-        met = np.searchsorted(task.stops[:, 1], starts, "right")
-        behind = np.searchsorted(task.stops[:, 0], starts + window)
-        apart = behind > met
-        apart[list(careful)] = True
+        alone = np.zeros(windows, bool)
+        alone[list(careful)] = True
+        lifted, rested = self._designs.lifted, self._designs.design(rung, REST_FUNCTIONS)
+        functions = functions_of(design, at_rests=False)
+        rest_functions = functions_of(rested, at_rests=True)
+        stepping = Stepping(
+            design.command_gain,
+            design.state_gain,
+            lifted.advance,
+            design.state_drive,
+            drive.command,
+            drive.state,
+        )
 
         u = np.empty(windows * update)
-        z = np.append(self._states, [0.0, 0.0])
-        last_states, w = z[:-2], 0
-        for at in map(int, np.append(np.flatnonzero(apart), windows)):
-            run_windows(
-                design.command_gain, design.state_gain, drive.command, drive.state, z, w, at, u
-            )
-            if at == windows:
-                break
-            if at == windows - 1:
-                last_states = z[:-2].copy()
-            start = at * update
-            committed = u[start : start + update]
-            if not (at in drive.solved and np.array_equal(drive.solved[at][0], z)):
-                rests = task.stops[met[at] : behind[at]] - start
-                span = slice(start, start + window)
-                weight = np.full(window, WEIGHT_REST)
-                weight[: n - start] = task.weight[span]
-                command = solve_window(
-                    self._designs.design(rung, REST_FUNCTIONS) if len(rests) else design,
-                    z,
-                    drive.path_mm[span],
-                    drive.targets_mm[:, span],
-                    weight,
-                    rests,
-                    bounds,
-                )
-                drive.solved[at] = z.copy(), command[:update]
-            committed[:] = drive.solved[at][1]
-            advance_window(self._designs.lifted.advance, design.state_drive, z, committed)
-            w = at + 1
+        z, w = np.append(self._states, [0.0, 0.0]), 0
+        for until in (windows - 1, windows):
+            last_states = z[:-2].copy()
+            while w < until:
+                with refusing_singular():
+                    w, tied = solve_windows(
+                        stepping,
+                        functions,
+                        rest_functions,
+                        drive.path_mm,
+                        drive.targets_mm,
+                        drive.weight,
+                        task.stops,
+                        alone,
+                        bounds.limits(),
+                        drive.memory,
+                        z,
+                        w,
+                        until,
+                        u,
+                    )
+                if w == until:
+                    break
+                # It needs its bounds.
+                start = w * update
+                path_mm = drive.path_mm[start : start + window]
+                used = rest_functions if len(tied.moving) > 1 else functions
+                committed = u[start : start + update]
+                committed[:] = within_bounds(used, tied, z, path_mm, bounds)[:update]
+                drive.memory.known[w], drive.memory.z[w] = True, z
+                drive.memory.committed[w] = committed
+                advance_window(lifted.advance, design.state_drive, z, committed)
+                w += 1
         # The windows run on past the end of the path, where the command stands.
         end_mm = float(task.path_mm[-1])
         u[n - 1] = end_mm - origin
@@ -376,7 +394,12 @@ class PreviewAxis:
                 nodes += _products(behind, gain, update)
         command = nodes @ design.spread.T
         state = nodes @ (design.state_drive @ design.spread).T
-        made = _Drive(task, rung, padded, targets, command, state)
+        weight = np.full(len(padded), WEIGHT_REST)
+        weight[: len(path)] = task.weight
+        memory = Memory(
+            np.zeros(len(command), bool), np.empty(state.shape), np.empty(command.shape)
+        )
+        made = _Drive(task, rung, padded, weight, targets, command, state, memory)
         # Targets of the members' own come in an array that changes.
         self._made = made if targets_mm is None else None
         return made

@@ -12,6 +12,8 @@ programme (DAQP, a dual active-set method).
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation._window_kernels import (
+    Functions,
+    Tied,
     command_of,
     constraints_at,
     extremes,
@@ -28,7 +32,16 @@ from compensation._window_kernels import (
 from compensation.base import DesignError
 from compensation.preview import PreviewDesign
 
-__all__ = ["EFFORT_PRICE", "TRAVEL_SLACK_MM", "Bounds", "Extremes", "solve_window"]
+__all__ = [
+    "EFFORT_PRICE",
+    "TRAVEL_SLACK_MM",
+    "Bounds",
+    "Extremes",
+    "functions_of",
+    "refusing_singular",
+    "solve_window",
+    "within_bounds",
+]
 
 Array = NDArray[np.float64]
 
@@ -137,47 +150,79 @@ def solve_window(
     -------
     ndarray, shape (window,)
     """
-    lifted, summed = design.lifted, design.summed
+    functions = functions_of(design, at_rests=len(rests) > 0)
+    with refusing_singular():
+        tied = tied_window(functions, z, path_mm, targets_mm, weight, rests, bounds.limits())
+    return tied.command if tied.kept else within_bounds(functions, tied, z, path_mm, bounds)
+
+
+@contextlib.contextmanager
+def refusing_singular() -> Iterator[None]:
+    """Say in words that a window's problem cannot be solved."""
     try:
-        # In the coordinates w = L' c, normal = L L', the cost is |w - wish|^2: well conditioned
-        # even where a rest leaves few samples.
-        command, kept, moving, fixed, factor, wish, ends, pinned, values = tied_window(
-            design.basis,
-            summed,
-            design.efforts,
-            design.filtered,
-            design.grams,
-            lifted.from_state,
-            lifted.reach,
-            lifted.integrated[:, :, 0],
-            max(EFFORT_PRICE, design.price) if len(rests) else design.price,
-            z,
-            path_mm,
-            targets_mm,
-            weight,
-            rests,
-            bounds.limits(),
-        )
+        yield
     except np.linalg.LinAlgError as error:
         raise DesignError(f"the window problem at a rest is singular ({error})") from error
-    if kept:
-        return command
-    untied = command
+
+
+def functions_of(design: PreviewDesign, *, at_rests: bool) -> Functions:
+    """Return what windows solved by themselves need of a design."""
+    lifted = design.lifted
+    return Functions(
+        design.basis,
+        design.summed,
+        design.efforts,
+        design.filtered,
+        design.grams,
+        lifted.from_state,
+        lifted.reach,
+        np.ascontiguousarray(lifted.integrated[:, :, 0]),
+        max(EFFORT_PRICE, design.price) if at_rests else design.price,
+    )
+
+
+def within_bounds(
+    functions: Functions, tied: Tied, z: Array, path_mm: Array, bounds: Bounds
+) -> Array:
+    """Command of a window that keeps its bounds, where that is possible.
+
+    Parameters
+    ----------
+    functions : Functions
+    tied : Tied
+        Its solution without bounds. In the coordinates w = L' c, normal = L L', the cost is
+        |w - wish|^2: well conditioned even where a rest leaves few samples.
+    z, path_mm, bounds
+        As `solve_window` has them.
+    """
+    command, rows, low, high = tied.command, tied.pinned, tied.values, tied.values
     last, previous = float(z[-2]), float(z[-1])
-    rows, low, high = pinned, values, values
     taken = np.zeros((3, len(path_mm)), bool)
     while not bounds.kept(Extremes.of(command, last, previous)):
         # Constraints where the command leaves its bounds, then where it does so instead.
         more = constraints_at(
-            command, fixed, last, previous, bounds.table(), factor, summed, moving, ends, taken
+            command,
+            tied.fixed,
+            last,
+            previous,
+            bounds.table(),
+            tied.factor,
+            functions.summed,
+            tied.moving,
+            tied.ends,
+            taken,
         )
         if len(more[0]) == 0:
             break
         rows, low, high = map(np.concatenate, zip((rows, low, high), more, strict=True))
         kinds = np.zeros(len(rows), np.int32)
-        kinds[: len(values)] = _EQUAL
-        found, _, flag, _ = daqp.solve(np.eye(design.n), -wish, rows, high, low, kinds)
+        kinds[: len(tied.values)] = _EQUAL
+        one = np.eye(len(tied.wish))
+        found, _, flag, _ = daqp.solve(one, -tied.wish, rows, high, low, kinds)
         if flag <= 0:
-            return untied  # nothing keeps them; the caller sees that and takes a gentler design
-        command = command_of(factor, found, design.basis, moving, last, previous, path_mm)
+            # Nothing keeps them; the caller sees that and takes a gentler design.
+            return tied.command
+        command = command_of(
+            tied.factor, found, functions.basis, tied.moving, last, previous, path_mm
+        )
     return command

@@ -15,10 +15,11 @@ import hashlib
 import os
 import re
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast, overload
 
+import llvmlite.binding as llvm  # type: ignore[import-untyped]
 import numba
 from numba.core.caching import (
     CompileResultCacheImpl,
@@ -26,6 +27,7 @@ from numba.core.caching import (
     IndexDataCacheFile,
     UserProvidedCacheLocator,
 )
+from numba.core.compiler import CompileResult
 from numba.core.runtime.nrt import rtsys
 
 __all__ = ["kernel", "source_digest"]
@@ -50,6 +52,30 @@ class _ReadOnlyLocator(UserProvidedCacheLocator):
 
 class _CacheImpl(CompileResultCacheImpl):
     _locator_classes = [_ReadOnlyLocator, *CompileResultCacheImpl._locator_classes]  # noqa: RUF012
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """See `numba.core.caching.CacheImpl`, which would also read the kernel's LLVM code.
+
+        Only callers that are yet to be compiled need it, and reading it takes longer than the rest.
+        """
+        (name, kind, (machine_code, llvm_code)), fndesc, *others, environments = payload
+        engine = target_context.codegen()._engine
+        engine._defined_symbols |= {
+            fndesc.llvm_cpython_wrapper_name,
+            fndesc.env_name,
+            *(environment.env_name for environment in environments),
+        }
+        unread = name, kind, (machine_code, _nothing())
+        anew: Any = CompileResult._rebuild
+        result = anew(target_context, unread, fndesc, *others, environments)
+        result.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, llvm_code))
+        return result
+
+
+@cache
+def _nothing() -> bytes:
+    """Return an LLVM module without functions."""
+    return bytes(llvm.parse_assembly("").as_bitcode())
 
 
 class _KernelCache(FunctionCache):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import importlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -105,6 +107,28 @@ def test_a_kernel_from_disk_fills_arrays_as_a_fresh_one(tools) -> None:
     assert sum(loaded.fill.stats.cache_hits.values()) == 1
     np.testing.assert_array_equal(*results)
     np.testing.assert_array_equal(results[0], 3.0 * values + 0.5)
+
+
+def test_a_kernel_from_disk_is_called_by_one_that_is_not(tools, tmp_path: Path) -> None:
+    tools(2.0, 1.0)
+    script = "import sys; import tools.caller as c; from tools.inner import double; {}; print({})"
+    inner, outer = "double(3.0)", "c.outer(3.0)"
+    found = [
+        subprocess.run(
+            [sys.executable, "-B", "-c", script.format(first, f"{then}, c.outer.stats.cache_hits")],
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+            capture_output=True,
+            check=True,
+            text=True,
+        ).stdout.strip()
+        for first, then in ((inner, inner), (inner, outer), ("pass", outer))
+    ]
+    # Compiled for itself; read, and compiled into its caller; the caller read, it not.
+    assert found == [
+        "6.0 Counter()",
+        "7.0 Counter()",
+        "7.0 Counter({(float64,): 1})",
+    ]
 
 
 def _kernel_modules() -> list[Path]:
