@@ -42,6 +42,8 @@ WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
 """A move that feeds more filament than the first, and per mm of its way more than the second, is
 one of the extruder: X and Y creep, and would be cut into thousands of segments."""
 
+_AHEAD = 1.25
+"""How much more than a piece may last is planned before it is cut."""
 _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
 """What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
 moves of a micrometre it would have millions."""
@@ -183,16 +185,17 @@ class Splitter:
             self._events = replace(events, limits_id=limits_id[n:], modal_id=modal_id[n:])
         return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
-    def _first_barrier(self, events: Events) -> int | None:
-        """Return the first move behind which a piece cannot go on, by the number held; None: none.
+    def _first_barrier(self, events: Events, most: int) -> int | None:
+        """Return the first of `most` moves behind which a piece cannot go on; None: there is none.
 
         A stop ends a piece, G92 of more than E, M221, or a stream's other limits. What lies before
         the first move does not.
         """
         limits, modal = self._tables
-        behind_move = events.move_index > 0
-        found = np.flatnonzero((events.kind >= EventKind.STOP) & behind_move)
-        end = int(found[0]) if len(found) else len(events)
+        count = int(np.searchsorted(events.move_index, most, "right"))
+        behind_move = events.move_index[:count] > 0
+        found = np.flatnonzero((events.kind[:count] >= EventKind.STOP) & behind_move)
+        end = int(found[0]) if len(found) else count
         kind = events.kind[:end]
         of_limits, of_mode = (
             np.flatnonzero(kind == what) for what in (EventKind.LIMITS, EventKind.MODE)
@@ -211,7 +214,7 @@ class Splitter:
             if _shifts_origin(self._text[start - self._text_offset : stop - self._text_offset]):
                 end = row
                 break
-        return int(events.move_index[end]) if end < len(events) else None
+        return int(events.move_index[end]) if end < count else None
 
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
@@ -256,12 +259,13 @@ class Splitter:
             if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
                 yield self._take(int(moves.byte_start[head]))
                 continue
-            barrier = self._first_barrier(events)
             kept = np.flatnonzero(self._raw)
-            most = self._most_moves(moves, events)
+            lasting_s = np.cumsum(_shortest_s(moves))
+            most = min(self._most_moves(moves, events), self._enough(moves, lasting_s))
+            barrier = self._first_barrier(events, most)
             closed = final or barrier is not None or len(kept) > 0 or most < count
             end = min(count if barrier is None else barrier, most, *kept[:1].tolist())
-            if not closed and _shortest_s(moves) < self._longest_s:
+            if not closed and lasting_s[-1] < self._longest_s:
                 return
             last = int(np.flatnonzero(xy[:end])[-1]) + 1
             phases = self._plan(rows_of(moves, slice(0, last)))
@@ -290,6 +294,16 @@ class Splitter:
 
     def _plan(self, moves: Moves) -> Phases:
         return plan_moves(moves, self._tables[0], self._machine, rests_apart=True)
+
+    def _enough(self, moves: Moves, lasting_s: NDArray[np.float64]) -> int:
+        """Return how many of the moves are worth planning: they last longer than a piece may.
+
+        All pieces of an arc, and some more moves: the plan's end makes those before it slower.
+        """
+        rows = int(np.searchsorted(lasting_s, _AHEAD * self._longest_s)) + 1
+        if rows >= len(moves):
+            return len(moves)
+        return int(np.searchsorted(moves.line, moves.line[rows - 1], "right"))
 
     def _most_moves(self, moves: Moves, events: Events) -> int:
         """Return how many of the moves a piece may have: all, or less where too much is held."""
@@ -435,12 +449,12 @@ def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, 
     return int(rows[np.argmin(phases.end_mm_s[rows])]) + 1, False
 
 
-def _shortest_s(moves: Moves) -> float:
-    """Lower bound of the time that the moves take."""
+def _shortest_s(moves: Moves) -> NDArray[np.float64]:
+    """Lower bound of the time that each of the moves takes."""
     travel = moves.end_mm - moves.start_mm
     length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
     length = np.where(length > 0.0, length, np.abs(travel[:, 3]))
-    return float(np.sum(length / moves.speed_mm_s))
+    return np.asarray(length / moves.speed_mm_s)
 
 
 def _end_s(phases: Phases) -> float:
