@@ -8,6 +8,7 @@ Everything else is a *passage*.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -47,6 +48,10 @@ _AHEAD = 1.25
 _MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
 """What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
 moves of a micrometre it would have millions."""
+
+_SET_POSITION = re.compile(rb"G\s*0*92(?!\d)")
+_SET_EXTRUDER = re.compile(rb"\s*(?:N\d+\s*)?G92\s*E\s*[-+]?(?:\d+\.?\d*|\.\d+)\s*(?:\*\d+\s*)?")
+"""What every firmware reads alike; odder spellings end a piece."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +193,8 @@ class Splitter:
     def _first_barrier(self, events: Events, most: int) -> int | None:
         """Return the first of `most` moves behind which a piece cannot go on; None: there is none.
 
-        A stop ends a piece, G92 of more than E, M221, or a stream's other limits. What lies before
-        the first move does not.
+        A stop ends a piece, G92 unless it is of one plain E, M221, or a stream's other limits. What
+        lies before the first move does not.
         """
         limits, modal = self._tables
         count = int(np.searchsorted(events.move_index, most, "right"))
@@ -392,12 +397,9 @@ def _changes(
 
 @lru_cache(maxsize=64)
 def _shifts_origin(line: bytes) -> bool:
-    """Whether a line is a G92 of more than E; files repeat such lines thousands of times."""
-    line = line.upper()
-    if b"G92" not in line:
-        return False
-    code = line.split(b";", 1)[0]
-    return any(axis in code for axis in (b"X", b"Y", b"Z")) or b"E" not in code
+    """Whether a line is a G92 of more than a plain E; files repeat such lines by thousands."""
+    code = line.split(b";", 1)[0].upper()
+    return bool(_SET_POSITION.search(code)) and not _SET_EXTRUDER.fullmatch(code)
 
 
 def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:

@@ -99,6 +99,10 @@ class Voice(Protocol):
         """A second G or M in a line is no command of its own (not so in RepRapFirmware)."""
 
     @property
+    def factors_need_axes(self) -> bool:
+        """M220 and M221 do not hold for moves of the extruder alone (RepRapFirmware)."""
+
+    @property
     def folds_case(self) -> bool:
         """Lower case is read as upper case."""
 

@@ -25,11 +25,12 @@ __all__ = ["StreamWriter"]
 _BYTES_PER_LINE = 96
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
 _FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
+_AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
 _SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
-_POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G9[01](?!\d)")
-_EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M8[23](?!\d)")
-_E_WORD = re.compile(rb"E\s*([-+]?[\d.]+)")
+_POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G\s*0*9[01](?!\d)")
+_EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M\s*0*8[23](?!\d)")
+_E_WORD = re.compile(rb"E\s*([-+]?(?:\d+\.?\d*|\.\d+))")
 _E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
 _NUMBERED = re.compile(rb"^\s*N\d+\s*")
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
@@ -260,14 +261,10 @@ class StreamWriter:
         if self._is_move(code):
             # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
             return _held_back(line) if re.search(rb"[XYZEIJK]", code) else line
-        if _SET_POSITION.match(code) and (state.absolute_e or piece.modal_after.absolute_e):
+        if _SET_POSITION.match(code):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
-            line = self._shifted_e(line, (extruded_mm - planned) / state.extrude_factor)
-            self._set_by(line)
-            return self._file_modes(state) + line
-        if _SET_POSITION.match(code):
-            self._set_by(line)
+            return line + self._set_again(line, (extruded_mm - planned) / state.extrude_factor)
         # Only what the line itself says changes: our own modes differ from the file's.
         if _POSITIONING.match(code):
             self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
@@ -286,14 +283,20 @@ class StreamWriter:
         own = piece.limits[int(moves.limits_id[row])]
         lead = self._limits_to(self._voice.in_stream(own))
         lead += self._file_modes(state)
-        word = self._e_word.search(code) if state.absolute_e else None
-        if word is not None:
-            ends = float(word.group(1))
+        moves_on = self._is_move(code)
+        ends = self._extruder_word(code) if state.absolute_e else None
+        if ends is not None:
             fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
             lead += self._file_extruder(ends - fed)
             self._reads(ends)
-        if self._is_move(code) and not _FEED.search(code):
-            lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / state.speed_factor)
+        elif self._far_mm is not None and moves_on:
+            # Not G10 and G11: what E reads does not see them.
+            fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
+            self._reads(self._far_mm + fed / state.extrude_factor)
+        if moves_on and not _FEED.search(code):
+            alone = self._voice.factors_need_axes and not _AXES.search(code)
+            factor = 1.0 if alone else state.speed_factor
+            lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
 
     def _is_move(self, code: bytes) -> bool:
@@ -322,21 +325,23 @@ class StreamWriter:
         far = self._voice.coarse_extruder and abs(extruder_mm) > _FAR_MM
         self._far_mm = extruder_mm if far else None
 
-    def _set_by(self, line: bytes) -> None:
-        """Take note of a line that sets E to where the file counts from."""
-        word = self._e_word.search(line.split(b";", 1)[0])
-        if word is not None:
-            self._zero_mm = 0.0
-            self._reads(float(word.group(1)))
+    def _set_again(self, line: bytes, ahead_mm: float) -> bytes:
+        """Line behind a G92 E: the extruder is `ahead_mm` further than the plan, and says so.
 
-    def _shifted_e(self, line: bytes, gap_mm: float) -> bytes:
-        """Return a G92 line whose E is larger by `gap_mm`: the extruder is that far ahead."""
-        code, mark, comment = line.partition(b";")
-        word = self._e_word.search(code)
-        if word is None or abs(gap_mm) < _LEAST_GAP_MM:
-            return line
-        value = f"E{float(word.group(1)) + gap_mm:.7f}".encode()
-        return code[: word.start()] + value + code[word.end() :] + mark + comment
+        The file counts from there whenever its E is absolute, which may be much later.
+        """
+        value_mm = self._extruder_word(line.split(b";", 1)[0])
+        if value_mm is None:
+            return b""
+        reads_mm = value_mm + ahead_mm
+        self._zero_mm = 0.0
+        self._reads(reads_mm)
+        return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
+
+    def _extruder_word(self, code: bytes) -> float | None:
+        """Return the E of a line; of several the last, as Marlin does, which alone needs it."""
+        found = self._e_word.findall(code)
+        return float(found[-1]) if found else None
 
     def _file_extruder(self, file_mm: float) -> bytes:
         """Line after which the printer's E reads what the file's does."""

@@ -22,7 +22,6 @@ __all__ = ["State", "differences", "states", "tagged"]
 _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
-_G92_E = re.compile(rb"\s*G92\s*E([-+]?[\d.]+)")
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
     rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time"
@@ -156,10 +155,6 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
         if (old.kind == EventKind.LIMITS or still) and new.text == _HELD + old.text:
             return [] if new.stream else ["held back outside the stream"]
         return ["wrongly held back"]
-    if _G92_E.match(old.text) and new.text != old.text:
-        # The extruder is some microns ahead of the plan there, and says so.
-        shift = float(_G92_E.match(new.text)[1]) - float(_G92_E.match(old.text)[1])
-        return [] if new.stream and old.modal.absolute_e and abs(shift) < 0.05 else ["G92 moved"]
     if timeless(new.text) != timeless(old.text):
         return [f"became {new.text!r}"]
     problems = []

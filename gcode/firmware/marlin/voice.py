@@ -32,6 +32,7 @@ class MarlinVoice:
     positioning_sets_extruder = True
     coarse_extruder = True
     one_command = True
+    factors_need_axes = False
     file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:

@@ -1,0 +1,145 @@
+"""What a file feeds stays the same from line to line, whatever it counts E from, and how.
+
+Little prints with all that changes E among their moves go down the whole road of each firmware.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from tests.fuzz.machines import machine_of
+from tests.gcode.plain_reader import read
+from tests.gcode.states import differences, tagged
+
+KINDS = ("klipper", "marlin", "reprapfirmware")
+FILAMENT_MM = 1e-4
+SAID = ["M82", "M82", "M83", "M83", "G90", "G91", "G92", "T0", "T1", "M400", "G10", "G11"]
+SAID += ["M221 S95", "M221 S100", "M220 S80", "M220 S100", "M204 P800 T900", "M106 S99", "G92 E0"]
+STEPS = st.one_of(
+    st.tuples(
+        st.just("go"),
+        st.sampled_from([0.05, 0.1, 0.2, 1.5]),
+        st.sampled_from([0.3, 1.0, 2.0, 10.0]),
+        st.sampled_from([0.05, 0.05, 0.3333337, 0.0, -0.02]),
+    ),
+    st.tuples(st.just("feed"), st.sampled_from([-1.0, 1.0, 2.5, -0.3333337])),
+    st.tuples(st.just("set"), st.sampled_from(["0", "5", "-3", "12.5", "150.123457", ".001"])),
+    st.tuples(st.just("say"), st.sampled_from(SAID)),
+)
+NO_NUMBER = "no number, which only Marlin takes"
+CASES = {
+    "E absolute much later": "G92 E0\nG1 X60 E2.2\nG1 Y60 E1.7\nM400\nM82\nG1 X90 E5",
+    "E absolute for a while": (
+        "G92 E0\nG1 X60 E2.2\nM82\nG1 Y60 E3\nG1 E2\nG1 X20\nG1 E3\nM83\nG1 X60\nM400\nG1 X65"
+    ),
+    "far from 0 and retracted": (
+        "G92 E15\nG1 E-2\nG1 X60 E2.2\nG1 Y60 E1.7\nM400\nM82\nG1 X90 E20"
+    ),
+    "far from 0 and retracted by the firmware": (
+        "G92 E15\nM82\nG10\nG1 X60 E17.2\nG11\nG1 Y60 E19\nM400\nG1 X90 E20"
+    ),
+    "twice the same word": "G92 E4 E5\nG1 X60 E2.2\nM82\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
+    "twice the same word, far from 0": (
+        "M82\nG92 E15\nG1 X60 E16\nG1 E13 E14\nG1 Y60 E16\nM400\nG1 X90 E17"
+    ),
+    "an exponent": "G92 E1e1\nG1 X60 E2.2\nM82\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
+    NO_NUMBER: "G92 E.\nG1 X60 E2.2\nM82\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
+    "leading zeros": "G092 E5\nG1 X60 E2.2\nM082\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
+    "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
+}
+START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        *((kind, name) for kind in KINDS for name in CASES if name != NO_NUMBER),
+        ("marlin", NO_NUMBER),
+    ],
+)
+def test_filament(kind: str, name: str, cache: Path) -> None:
+    check(START + CASES[name] + "\n", kind, cache)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(deadline=None, max_examples=40)
+@given(steps=st.lists(STEPS, min_size=10, max_size=60))
+def test_filament_of_any_print(kind: str, cache: Path, steps: list[tuple]) -> None:
+    text = Print(kind).text(steps)
+    written = check(text, kind, cache)
+    before, after = (read(data, kind).extruded_mm for data in (text.encode(), written))
+    for tool in {*before, *after}:
+        assert after[tool] == pytest.approx(before[tool], abs=FILAMENT_MM)
+
+
+def check(text: str, kind: str, folder: Path) -> bytes:
+    """Every line finds the filament, place and modes of the original."""
+    data, machine = tagged(text.encode()), machine_of(kind)
+    source, target = folder / "in.gcode", folder / "out.gcode"
+    source.write_bytes(data)
+    compensate_file(source, target, machine, Options(), cache_dir=folder)
+    written = target.read_bytes()
+    assert differences(data, written, machine) == []
+    return written
+
+
+class Print:
+    """Writes E as the firmware counts it."""
+
+    def __init__(self, kind: str) -> None:
+        self._kind = kind
+        self._place = [60.0, 60.0]
+        self._heading = self._e = 0.0
+        self._absolute_xyz = self._absolute_e = True
+
+    def text(self, steps: list[tuple]) -> str:
+        lines = ["G28", "G90", "M82", "G92 E0", "G1 X60 Y60 Z5 F3000"]
+        return (
+            "\n".join([*lines, *(getattr(self, f"_{name}")(*how) for name, *how in steps)]) + "\n"
+        )
+
+    def _go(self, turn: float, length: float, fed: float) -> str:
+        self._heading += turn
+        way = length * math.cos(self._heading), length * math.sin(self._heading)
+        self._place = [a + b for a, b in zip(self._place, way, strict=True)]
+        x, y = self._place if self._absolute_xyz else way
+        return f"G1 X{x:.3f} Y{y:.3f}" + self._word(length * fed)
+
+    def _feed(self, by: float) -> str:
+        return "G1" + self._word(by)
+
+    def _set(self, value: str) -> str:
+        self._e = float(value)
+        return f"G92 E{value}"
+
+    def _say(self, line: str) -> str:
+        if line in ("G90", "G91"):
+            self._absolute_xyz = line == "G90"
+            if self._kind == "marlin":
+                self._absolute_e = self._absolute_xyz
+        elif line in ("M82", "M83"):
+            self._absolute_e = line == "M82"
+        elif line == "G92" and self._kind == "klipper":
+            self._place, self._e = [0.0, 0.0], 0.0
+        elif line == "G92 E0":
+            self._e = 0.0
+        return line
+
+    def _word(self, by: float) -> str:
+        if by == 0.0:
+            return ""
+        self._e += by
+        relative = not self._absolute_e or (self._kind == "klipper" and not self._absolute_xyz)
+        return f" E{by if relative else self._e:.7f}"
