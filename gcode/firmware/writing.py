@@ -348,7 +348,7 @@ class StreamWriter:
         if self._zero_mm == 0.0:
             return b""
         self._zero_mm = 0.0
-        return f"G92 E{file_mm:.5f}\n".encode()
+        return f"G92 E{file_mm:.7f}\n".encode()
 
     def _file_modes(self, state: ModalState) -> bytes:
         """Lines that make the printer read as the file expects (not the feedrate)."""

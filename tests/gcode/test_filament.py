@@ -84,6 +84,22 @@ def test_filament_of_any_print(kind: str, cache: Path, steps: list[tuple]) -> No
         assert after[tool] == pytest.approx(before[tool], abs=FILAMENT_MM)
 
 
+@pytest.mark.parametrize("decimals", [5, 7])
+def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> None:
+    """What Marlin's E is set back to has all digits of the file."""
+    e, lines = 20.0, ["G28", "G90", "M82", "G92 E20", "G1 X60 Y60 Z5 F6000"]
+    for k in range(150):
+        e += 0.123456789 + 0.01 * math.sin(k)
+        feeds = [f"G1 X{60 + 5 * (k % 2)} E{e:.{decimals}f} F9000"]
+        feeds += [f"G1 E{value:.{decimals}f} F2100" for value in (e - 0.5, e)]
+        lines += [*feeds, "M400"] if k % 30 == 7 else feeds
+    text = "\n".join(lines) + "\n"
+    before, after = (
+        read(d, "marlin").extruded_mm[0] for d in (text.encode(), check(text, "marlin", cache))
+    )
+    assert after == pytest.approx(before, abs=3e-6)
+
+
 def check(text: str, kind: str, folder: Path) -> bytes:
     """Every line finds the filament, place and modes of the original."""
     data, machine = tagged(text.encode()), machine_of(kind)
