@@ -38,7 +38,7 @@ from gcode._slots import (
 from gcode._table_kernels import note_modal, put_event, settle
 from models.jit import kernel
 
-_HARMLESS, _MODE, _STOP, _UNKNOWN = 0, 1, 3, 4
+_HARMLESS, _MODE, _STOP, _UNKNOWN, _STATE = 0, 1, 3, 4, 8
 _X, _E, _P, _S = 23, 4, 15, 18
 _MARLIN_E = 1
 _P_ONLY, _OR_NOTHING = 0, 2
@@ -71,11 +71,14 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
     if action == 23:
         return _dwell(w, mask, f, i, rows)
     settle(f, i, rows)
+    kind = _MODE
     if 24 <= action <= 26:
         i[I_PLANE] = action - 24
     elif action == 27 or action == 33:
-        f[F_UNIT_MM] = 25.4 if action == 27 else 1.0
-        f[F_UNIT_E_MM] = f[F_UNIT_MM]
+        unit_mm = 25.4 if action == 27 else 1.0
+        if f[F_UNIT_MM] != unit_mm or f[F_UNIT_E_MM] != unit_mm:
+            kind = _STATE
+        f[F_UNIT_MM] = f[F_UNIT_E_MM] = unit_mm
     elif action == 28 or action == 29:
         i[I_ABS_XYZ] = 1 if action == 28 else 0
         if i[I_E_RULE] == _MARLIN_E:
@@ -102,7 +105,7 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
     else:
         return ERROR_INCHES
     note_modal(f, i, tables)
-    put_event(i, rows, _MODE)
+    put_event(i, rows, kind)
     return OK
 
 

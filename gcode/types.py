@@ -54,8 +54,9 @@ class EventKind(IntEnum):
     STAMP = 7
     """Our own header or footer line."""
     STATE = 8
-    """Keeps or brings back modes, F and place (SAVE_GCODE_STATE, G60, M120): the motion goes on,
-    but what the printer keeps must be the file's, not a stream's."""
+    """Keeps or brings back modes, F and place (SAVE_GCODE_STATE, G60, M120), or changes the units
+    (G20, M200): the motion goes on, but what the printer keeps must be the file's, not a stream's,
+    and a stream is in millimetres."""
 
 
 @dataclass(frozen=True, slots=True)

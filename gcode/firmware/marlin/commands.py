@@ -159,10 +159,11 @@ def filament_area(state: MachineState, command: Command) -> int:
     state.settle()
     area = math.pi * diameter**2 / 4.0 if on else 1.0
     f = state.f
+    before = f[at.F_UNIT_E_MM]
     f[at.F_UNIT_E_MM] = (f[at.F_UNIT_MM] ** 3 if on else f[at.F_UNIT_MM]) / area
     if on:
         state.warn("E is in cubic millimetres (M200); such moves stay as they are")
-    return state.event(EventKind.MODE)
+    return state.event(EventKind.MODE if f[at.F_UNIT_E_MM] == before else EventKind.STATE)
 
 
 def retract_settings(state: MachineState, command: Command) -> int:
