@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from service.pipeline.layers import ERROR_UM, UNKNOWN, LayerTile
 from service.pipeline.result import LayerView
@@ -28,14 +28,15 @@ class LayerViews:
     def __init__(self, names: Sequence[str]) -> None:
         self._names = list(names)
         self._every = 1
-        self._layers: dict[int, LayerView] = {}
+        self._layers: dict[int, LayerTile] = {}
 
     def add(self, tile: LayerTile) -> None:
         """Take a layer, or more of one."""
         if tile.layer < 0 or tile.layer % self._every:
             return
-        view, known = self._view(tile), self._layers.get(tile.layer)
-        self._layers[tile.layer] = view if known is None else _thinned(_joined(known, view))
+        part = _thinned(replace(tile, error=np.where(tile.error == UNKNOWN, 0, tile.error)))
+        known = self._layers.get(tile.layer)
+        self._layers[tile.layer] = part if known is None else _thinned(_joined(known, part))
         while len(self._layers) > 2 * _LAYERS_SHOWN:
             self._every *= 2
             self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
@@ -46,70 +47,55 @@ class LayerViews:
         if len(numbers) > _LAYERS_SHOWN:
             pick = np.linspace(0, len(numbers) - 1, _LAYERS_SHOWN).round().astype(int)
             numbers = [numbers[i] for i in pick]
-        return [self._layers[k] for k in numbers]
+        return [self._view(self._layers[k]) for k in numbers]
 
     def _view(self, tile: LayerTile) -> LayerView:
-        error = np.where(tile.error == UNKNOWN, 0, tile.error)
-        return _thinned(
-            LayerView(
-                layer=tile.layer,
-                z_mm=tile.z_mm,
-                x_mm=np.round(tile.x_mm.astype(float), 3).tolist(),
-                y_mm=np.round(tile.y_mm.astype(float), 3).tolist(),
-                extruding=(tile.on > 0).tolist(),
-                line=tile.line.tolist(),
-                contour_um={
-                    name: np.round(ERROR_UM * row, 1).tolist()
-                    for name, row in zip(self._names, error, strict=True)
-                },
-            )
+        return LayerView(
+            layer=tile.layer,
+            z_mm=tile.z_mm,
+            x_mm=np.round(tile.x_mm.astype(float), 3).tolist(),
+            y_mm=np.round(tile.y_mm.astype(float), 3).tolist(),
+            extruding=(tile.on > 0).tolist(),
+            line=tile.line.tolist(),
+            contour_um={
+                name: np.round(ERROR_UM * row, 1).tolist()
+                for name, row in zip(self._names, tile.error, strict=True)
+            },
         )
 
 
-def _joined(first: LayerView, second: LayerView) -> LayerView:
+def _joined(first: LayerTile, second: LayerTile) -> LayerTile:
     """Return two parts of a layer as one."""
-    return first.model_copy(
-        update={
-            "x_mm": first.x_mm + second.x_mm,
-            "y_mm": first.y_mm + second.y_mm,
-            "extruding": first.extruding + second.extruding,
-            "line": first.line + second.line,
-            "contour_um": {
-                k: v + second.contour_um.get(k, []) for k, v in first.contour_um.items()
-            },
-        }
+    return replace(
+        first,
+        x_mm=np.append(first.x_mm, second.x_mm),
+        y_mm=np.append(first.y_mm, second.y_mm),
+        line=np.append(first.line, second.line),
+        error=np.append(first.error, second.error, axis=1),
+        feature=np.append(first.feature, second.feature),
+        on=np.append(first.on, second.on),
     )
 
 
-def _thinned(view: LayerView) -> LayerView:
-    """Return a view with a stretch where there were several, and the largest of their errors.
+def _thinned(tile: LayerTile) -> LayerTile:
+    """Return a tile with a stretch where there were several, and the largest of their errors.
 
     A stretch is never longer than what extrudes without a break, or travels.
     """
-    count = len(view.x_mm)
+    count = len(tile)
     if count <= _POINTS_PER_LAYER:
-        return view
-    on = np.array(view.extruding)
+        return tile
     step = -(-count // _POINTS_PER_LAYER)
-    run = np.concatenate([[0], np.flatnonzero(np.diff(on)) + 1, [count]])
+    run = np.concatenate([[0], np.flatnonzero(np.diff(tile.on)) + 1, [count]])
     place = np.arange(count) - np.repeat(run[:-1], np.diff(run))
     first = np.flatnonzero(place % step == 0)
     last = np.append(first[1:], count) - 1
-
-    def kept(values: Sequence[float]) -> list[float]:
-        column: NDArray[np.float64] = np.array(values)
-        found: list[float] = column[last].tolist()
-        return found
-
-    return view.model_copy(
-        update={
-            "x_mm": kept(view.x_mm),
-            "y_mm": kept(view.y_mm),
-            "extruding": on[last].tolist(),
-            "line": np.array(view.line)[last].tolist(),
-            "contour_um": {
-                name: np.maximum.reduceat(np.array(values), first).tolist()
-                for name, values in view.contour_um.items()
-            },
-        }
+    return replace(
+        tile,
+        x_mm=tile.x_mm[last],
+        y_mm=tile.y_mm[last],
+        line=tile.line[last],
+        error=np.maximum.reduceat(tile.error, first, axis=1),
+        feature=tile.feature[last],
+        on=tile.on[last],
     )
