@@ -44,8 +44,8 @@ class ErrorSpectra:
         top_hz = max(_LEAST_HZ, _BEYOND * float(np.max(found, initial=0.0)))
         self._f_hz = f_hz[: int(np.searchsorted(f_hz, top_hz)) + 1]
         self._window = np.hanning(BLOCK + 1)[:-1]
-        self._block = np.zeros((len(self._names), 2, BLOCK))
-        self._power = np.zeros((_KEPT, len(self._names), 2, len(self._f_hz)))
+        # Spectra are taken at the end: of most blocks that are looked at there is no need.
+        self._blocks = np.zeros((_KEPT, len(self._names), 2, BLOCK))
         self._numbers: list[int] = []
         self._every = 1
         self._seen = self._printing = 0
@@ -55,18 +55,19 @@ class ErrorSpectra:
         at, count = 0, len(extruding)
         while at < count:
             number, filled = divmod(self._seen, BLOCK)
-            take = min(BLOCK - filled, count - at)
-            if number % self._every == 0:
+            others = -number % self._every
+            take = min((others or 1) * BLOCK - filled, count - at)
+            if not others:
                 part = slice(at, at + take)
-                into = self._block[:, :, filled : filled + take]
+                into = self._blocks[len(self._numbers), :, :, filled : filled + take]
                 np.subtract(positions_mm[:, :, part], path_mm[:, part], out=into)
                 self._printing += int(np.count_nonzero(extruding[part]))
+                if filled + take == BLOCK:
+                    if self._printing > BLOCK // 2:
+                        self._keep(number)
+                    self._printing = 0
             at += take
             self._seen += take
-            if filled + take == BLOCK:
-                if self._printing > BLOCK // 2:
-                    self._keep(number)
-                self._printing = 0
 
     def jump(self) -> None:
         """Say that what comes does not follow what was."""
@@ -79,7 +80,8 @@ class ErrorSpectra:
             return []
         # One-sided: what lies at negative frequencies counts as well.
         scale = 2e6 * self._dt_s / float(np.sum(self._window**2))
-        density = np.sqrt(scale * np.mean(self._power[: len(self._numbers)], axis=0))
+        powers = [self._power(block) for block in self._blocks[: len(self._numbers)]]
+        density = np.sqrt(scale * np.mean(powers, axis=0))
         return [
             AxisSpectrum(
                 axis=axis,
@@ -94,12 +96,14 @@ class ErrorSpectra:
         ]
 
     def _keep(self, number: int) -> None:
-        block = self._block - self._block.mean(axis=2, keepdims=True)
-        spectrum = np.fft.rfft(block * self._window)[:, :, : len(self._f_hz)]
-        self._power[len(self._numbers)] = spectrum.real**2 + spectrum.imag**2
         self._numbers.append(number)
         while len(self._numbers) == _KEPT:
             self._every *= 2
             kept = [k for k, n in enumerate(self._numbers) if n % self._every == 0]
-            self._power[: len(kept)] = self._power[kept]
+            self._blocks[: len(kept)] = self._blocks[kept]
             self._numbers = [self._numbers[k] for k in kept]
+
+    def _power(self, block: Array) -> Array:
+        even = block - block.mean(axis=2, keepdims=True)
+        spectrum = np.fft.rfft(even * self._window)[:, :, : len(self._f_hz)]
+        return np.asarray(spectrum.real**2 + spectrum.imag**2)
