@@ -18,6 +18,8 @@ BLOCK = 1024
 _ALL_BITS = 6
 """Of a long print, every second block behind the first 64 tells enough, every fourth behind the
 first 128, and so on; each counts for all that it stands for."""
+_TOGETHER = 16
+"""Blocks are transformed so many at a time, as to prepare for it takes longer than a block."""
 NOTABLE_UM = 1.0
 """Less than this beyond the band is not worth a word."""
 
@@ -40,6 +42,9 @@ class BandContent:
         self._window = np.hanning(BLOCK + 1)[:-1]
         self._power = np.zeros((2, BLOCK // 2 + 1))
         self._seen = self._blocks = 0
+        self._accel = np.zeros((_TOGETHER, 2, BLOCK))
+        """Of the blocks still to be transformed, and how many each of them stands for."""
+        self._weights: list[int] = []
         self._limited = any(
             axis.band_hz or (axis.provenance and axis.provenance.trust_below_hz)
             for axis in machine.axes.values()
@@ -62,10 +67,10 @@ class BandContent:
             prints = _span(printed, extruding, first, first + BLOCK)
             if np.count_nonzero(prints) > BLOCK // 2:
                 path = _span(before, path_mm, first, first + BLOCK + 2)
-                accel = np.diff(path, 2) / self._dt_s**2
-                spectrum = np.fft.rfft(accel * self._window)
-                self._power += every * (spectrum.real**2 + spectrum.imag**2)
-                self._blocks += every
+                self._accel[len(self._weights)] = np.diff(path, 2) / self._dt_s**2
+                self._weights.append(every)
+                if len(self._weights) == _TOGETHER:
+                    self._transform()
         self._path = _span(before, path_mm, count * BLOCK, total).copy()
         self._prints = _span(printed, extruding, count * BLOCK, total).copy()
 
@@ -75,12 +80,19 @@ class BandContent:
 
     def beyond_um(self, f_hz: float) -> Array:
         """Return the rms of the planned X and Y above a frequency, shape (2,)."""
+        self._transform()
         f = np.fft.rfftfreq(BLOCK, self._dt_s)
         above = f > f_hz
         scale = 2.0 / (BLOCK * np.sum(self._window**2) * max(self._blocks, 1))
         second = (2.0 * np.sin(np.pi * f[above] * self._dt_s) / self._dt_s) ** 2
         square = self._power[:, above] @ second**-2.0
         return np.asarray(1e3 * np.sqrt(scale * square))
+
+    def _transform(self) -> None:
+        spectrum = np.fft.rfft(self._accel[: len(self._weights)] * self._window)
+        self._power += np.tensordot(self._weights, spectrum.real**2 + spectrum.imag**2, 1)
+        self._blocks += sum(self._weights)
+        self._weights.clear()
 
     def warnings(self) -> list[str]:
         """Return what lies outside the bands of the models, in words."""
