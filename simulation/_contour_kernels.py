@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from models.jit import kernel
 
-__all__ = ["BOX", "contour_distances", "group_sums", "motion_sums", "path_tables"]
+__all__ = [
+    "BOX",
+    "contour_distances",
+    "contour_errors",
+    "group_sums",
+    "motion_sums",
+    "path_tables",
+]
 
 Array = NDArray[np.float64]
 
@@ -130,6 +137,25 @@ def contour_distances(
                 j = k
         out[i] = math.sqrt(best2)
         lag = best_at - centre
+    return looked
+
+
+@kernel(allocates=False)
+def contour_errors(
+    path: Array,
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    boxes: Array,
+    points: Array,
+    centres: NDArray[np.int64],
+    window: int,
+    out: Array,
+) -> int:
+    """`path_tables`, and `contour_distances` of the points (channels, 2, m) of all channels."""
+    path_tables(path, first, last, boxes)
+    looked = 0
+    for c in range(len(points)):
+        looked += contour_distances(path, first, last, boxes, points[c], centres, window, out[c])
     return looked
 
 

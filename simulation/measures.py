@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from simulation._contour_kernels import (
     BOX,
     contour_distances,
+    contour_errors,
     group_sums,
     motion_sums,
     path_tables,
@@ -197,11 +198,14 @@ class ContourMeter:
         if count:
             self._next = first + count * self._stride
             centres = first - self._path_from + self._stride * np.arange(count, dtype=np.int64)
-            tables = _path_tables(self._path)
-            for points, error in zip(self._points, errors, strict=True):
-                self.evaluations += contour_distances(
-                    self._path, *tables, points, centres, self._window, error
-                )
+            self.evaluations += contour_errors(
+                self._path,
+                *_room_for_tables(self._path),
+                self._points,
+                centres,
+                self._window,
+                errors,
+            )
             self._points = self._points[:, :, count:].copy()
             drop = max(0, self._next - self._window - self._path_from)
             drop = min(drop, self._path.shape[1])
@@ -352,7 +356,8 @@ class PathDistances:
 
     def __init__(self, path_mm: Array, dt_s: float = 1e-3, window_s: float = 0.08) -> None:
         self._path = np.ascontiguousarray(path_mm)
-        self._tables = _path_tables(self._path)
+        self._tables = _room_for_tables(self._path)
+        path_tables(self._path, *self._tables)
         self._window = round(window_s / dt_s)
 
     def at(self, points_mm: Array, index: NDArray[np.int64]) -> Array:
@@ -363,9 +368,7 @@ class PathDistances:
         return out
 
 
-def _path_tables(path: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _room_for_tables(path: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     segments = max(path.shape[1] - 1, 0)
     first, last = np.empty((2, segments), np.int64)
-    boxes = np.empty((-(-segments // BOX), 4))
-    path_tables(path, first, last, boxes)
-    return first, last, boxes
+    return first, last, np.empty((-(-segments // BOX), 4))

@@ -135,9 +135,10 @@ class Answers:
         answers = np.empty((len(self._names), 2, ready))
         for name, answer in zip(self._names, answers, strict=True):
             if name == "before" and self._shapes_answer:
-                fresh = sliced[:, self._answer.shape[1] :]
-                found = self._streams[name].push(fresh, fresh)
-                self._answer = np.concatenate([self._answer, found], axis=1)
+                known, self._answer = self._answer, np.empty(sliced.shape)
+                at = known.shape[1]
+                self._answer[:, :at] = known
+                self._streams[name].push(sliced[:, at:], sliced[:, at:], self._answer[:, at:])
                 answer[:] = self._answer[:, span]
             elif name == "shaper" and self._shapes_answer:
                 self._shape(self._answer, span, answer)
