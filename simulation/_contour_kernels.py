@@ -185,7 +185,8 @@ def group_sums(
 
 @kernel(allocates=False)
 def motion_sums(
-    path: Array,
+    x: Array,
+    y: Array,
     points: Array,
     extruding: NDArray[np.bool_],
     still_mm: float,
@@ -198,7 +199,9 @@ def motion_sums(
 
     Parameters
     ----------
-    path, points : ndarray, shapes (2, n) and (channels, 2, n)
+    x, y : ndarray, shape (n,)
+        The path; rows, as part of an array's columns would have to be copied.
+    points : ndarray, shape (channels, 2, n)
     still_mm : float
         Steps of an axis up to this are no motion.
     shortest, window : int
@@ -210,41 +213,42 @@ def motion_sums(
         Carried on, squares: sum and maximum of all, of extruding, of the rest that waits, and of
         rests that count.
     """
-    n = path.shape[1]
+    n = len(x)
     if n > 0 and math.isnan(rest[0]):
-        rest[0], rest[1] = path[0, 0], path[1, 0]
+        rest[0], rest[1] = x[0], y[0]
     k = 0
     while k < n:
         behind = k
-        while behind < n and _moved(path, behind, rest, still_mm):
+        while behind < n and _moved(x, y, behind, rest, still_mm):
             behind += 1
         # Where the path moves on, samples have no part in rests.
         last = behind - 1 if shortest > 0 else k
         if k < last:
-            _add_squares(path[:, k:last], points[:, :, k:last], extruding[k:last], sums)
+            _add_squares(x[k:last], y[k:last], points[:, :, k:last], extruding[k:last], sums)
             k = last
         moved = behind > k
-        _add_sample(path, points, extruding, k, moved, shortest, window, rest, sums)
+        _add_sample(x, y, points, extruding, k, moved, shortest, window, rest, sums)
         k += 1
     if n > 0:
-        rest[0], rest[1] = path[0, n - 1], path[1, n - 1]
+        rest[0], rest[1] = x[n - 1], y[n - 1]
 
 
 @kernel(inline=True, allocates=False)
-def _moved(path: Array, k: int, rest: Array, still_mm: float) -> bool:
-    x = path[0, k - 1] if k > 0 else rest[0]
-    y = path[1, k - 1] if k > 0 else rest[1]
-    moved: bool = abs(path[0, k] - x) > still_mm or abs(path[1, k] - y) > still_mm
+def _moved(x: Array, y: Array, k: int, rest: Array, still_mm: float) -> bool:
+    last_x, last_y = (x[k - 1], y[k - 1]) if k > 0 else (rest[0], rest[1])
+    moved: bool = abs(x[k] - last_x) > still_mm or abs(y[k] - last_y) > still_mm
     return moved
 
 
 @kernel(allocates=False)
-def _add_squares(path: Array, points: Array, extruding: NDArray[np.bool_], sums: Array) -> None:
+def _add_squares(
+    x: Array, y: Array, points: Array, extruding: NDArray[np.bool_], sums: Array
+) -> None:
     """Add samples that belong to no rest."""
     for c in range(len(points)):
         total, most, printed, printed_most = sums[c, 0], sums[c, 1], sums[c, 2], sums[c, 3]
         for k in range(len(extruding)):
-            ex, ey = points[c, 0, k] - path[0, k], points[c, 1, k] - path[1, k]
+            ex, ey = points[c, 0, k] - x[k], points[c, 1, k] - y[k]
             squared = ex * ex + ey * ey
             total += squared
             # Comparisons, as nothing then waits for the largest of the samples before.
@@ -259,7 +263,8 @@ def _add_squares(path: Array, points: Array, extruding: NDArray[np.bool_], sums:
 
 @kernel(force_inline=True, allocates=False)
 def _add_sample(
-    path: Array,
+    x: Array,
+    y: Array,
     points: Array,
     extruding: NDArray[np.bool_],
     k: int,
@@ -284,7 +289,7 @@ def _add_sample(
         rest[3] = 0.0
         rest[5] += 1.0 if rest[2] == shortest else 0.0
     for c in range(len(points)):
-        ex, ey = points[c, 0, k] - path[0, k], points[c, 1, k] - path[1, k]
+        ex, ey = points[c, 0, k] - x[k], points[c, 1, k] - y[k]
         squared = ex * ex + ey * ey
         sums[c, 0] += squared
         sums[c, 1] = max(sums[c, 1], squared)

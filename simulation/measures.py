@@ -271,12 +271,11 @@ class MotionMeter:
 
         Returns the contour errors that the block completed.
         """
-        path, points = np.ascontiguousarray(y_d_mm), np.ascontiguousarray(y_mm)
         due = -self._seen % self._stride
-        errors = self._contour.push(path, points)
+        errors = self._contour.push(y_d_mm, y_mm)
         motion_sums(
-            path,
-            points,
+            *map(np.ascontiguousarray, y_d_mm),
+            np.ascontiguousarray(y_mm),
             np.ascontiguousarray(extruding),
             _STILL_MM,
             self._shortest,
