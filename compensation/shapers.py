@@ -31,7 +31,14 @@ def shaper_pulses(name: str, f_hz: float, zeta: float = 0.1) -> Pulses:
         raise DesignError(str(error)) from None
 
 
-def shape(command_mm: Array, dt_s: float, pulses: Pulses, *, centred: bool = True) -> Array:
+def shape(
+    command_mm: Array,
+    dt_s: float,
+    pulses: Pulses,
+    *,
+    centred: bool = True,
+    out: Array | None = None,
+) -> Array:
     """Apply a shaper to a command that is linear between its samples.
 
     Parameters
@@ -42,6 +49,8 @@ def shape(command_mm: Array, dt_s: float, pulses: Pulses, *, centred: bool = Tru
         As `shaper_pulses` returns them.
     centred : bool
         Start earlier by the mean delay (as Klipper does), so that slow motion is not delayed.
+    out : ndarray, shape (..., n), optional
+        Where the shaped command is written to, if not to a new array; contiguous.
 
     Returns
     -------
@@ -58,7 +67,8 @@ def shape(command_mm: Array, dt_s: float, pulses: Pulses, *, centred: bool = Tru
     gains = (weights[:, None] * np.stack([1.0 - part, part], axis=1)).ravel()
     used = gains != 0.0
     command = np.ascontiguousarray(command_mm, dtype=np.float64)
-    out = np.zeros_like(command)
+    out = np.empty_like(command) if out is None else out
+    out[...] = 0.0
     n = command.shape[-1]
     for row, shaped in zip(command.reshape(-1, n), out.reshape(-1, n), strict=True):
         add_delayed(row, samples[used], gains[used], shaped)

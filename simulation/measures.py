@@ -275,7 +275,7 @@ class MotionMeter:
         errors = self._contour.push(y_d_mm, y_mm)
         motion_sums(
             *map(np.ascontiguousarray, y_d_mm),
-            np.ascontiguousarray(y_mm),
+            y_mm,
             np.ascontiguousarray(extruding),
             _STILL_MM,
             self._shortest,

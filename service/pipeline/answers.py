@@ -34,6 +34,7 @@ class Answered:
     path_mm, executed_mm : ndarray, shape (2, n)
     extruding : ndarray of bool, shape (n,)
     answer_mm : ndarray, shape (channels, 2, n)
+        Part of a larger array.
     """
 
     path_mm: Array
@@ -83,7 +84,7 @@ class Answers:
         """Planned: the path, and below it the file as it came, where that is not the same."""
         self._extruding = np.zeros(0, bool)
         self._answer = np.zeros((2, 0))
-        """To the path, from `reach` samples before what is held, as far as it is known."""
+        """To the path, from `reach` samples before what is held to where it is known."""
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Say where the machine is from now on."""
@@ -128,32 +129,32 @@ class Answers:
             }
 
     def _release(self, ready: int) -> Answered:
-        # What is planned begins `reach` samples before what is held.
+        # What is planned begins `reach` samples before what is held, and ends as many behind it.
         span = slice(self._reach, self._reach + ready)
         sliced = self._planned[-2:]
         path, executed = self._planned[:2, span], self._executed[:, :ready]
-        answers = np.empty((len(self._names), 2, ready))
+        answers = np.empty((len(self._names), *sliced.shape))
         for name, answer in zip(self._names, answers, strict=True):
             if name == "before" and self._shapes_answer:
-                known, self._answer = self._answer, np.empty(sliced.shape)
-                at = known.shape[1]
-                self._answer[:, :at] = known
-                self._streams[name].push(sliced[:, at:], sliced[:, at:], self._answer[:, at:])
-                answer[:] = self._answer[:, span]
+                known = self._answer.shape[1]
+                answer[:, :known] = self._answer
+                self._streams[name].push(sliced[:, known:], sliced[:, known:], answer[:, known:])
+                self._answer = answer
             elif name == "shaper" and self._shapes_answer:
-                self._shape(self._answer, span, answer)
+                self._shape(self._answer, answer)
             elif name == "shaper":
-                command = np.empty((2, ready))
-                self._shape(sliced, span, command)
-                self._streams[name].push(command, path, answer)
+                command = np.empty(sliced.shape)
+                self._shape(sliced, command)
+                self._streams[name].push(command[:, span], path, answer[:, span])
             else:
                 came = name == "before" and self._compensated
-                self._streams[name].push(sliced[:, span] if came else executed, path, answer)
-        out = Answered(path, executed, self._extruding[:ready], answers)
-        self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:]
+                command = sliced[:, span] if came else executed
+                self._streams[name].push(command, path, answer[:, span])
+        out = Answered(path, executed, self._extruding[:ready], answers[:, :, span])
+        self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:].copy()
         self._executed, self._extruding = self._executed[:, ready:], self._extruding[ready:]
         return out
 
-    def _shape(self, motion: Array, span: slice, out: Array) -> None:
+    def _shape(self, motion: Array, out: Array) -> None:
         for row, pulses, shaped in zip(motion, self._pulses, out, strict=True):
-            shaped[:] = shape(row, self._dt_s, pulses)[span]
+            shape(row, self._dt_s, pulses, out=shaped)
