@@ -84,7 +84,7 @@ class GroupTally:
             return
         self._cover(int(groups.min()), int(groups.max()))
         group_sums(
-            values,
+            np.ascontiguousarray(values),
             np.ascontiguousarray(groups, dtype=np.int32),
             np.ascontiguousarray(use),
             self.lowest,

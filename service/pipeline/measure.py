@@ -9,7 +9,6 @@ layers that are given away.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,7 @@ from service.pipeline.answers import Answered, Answers
 from service.pipeline.band import BandContent
 from service.pipeline.layer_views import LayerViews
 from service.pipeline.layers import LayerRecorder, LayerTile
-from service.pipeline.points import MeasuredPoints, MotionSamples, part_of
+from service.pipeline.points import MeasuredPoints, MotionSamples
 from service.pipeline.result import (
     AxisSpectrum,
     Channel,
@@ -110,12 +109,11 @@ class Measurement:
     def add(self, samples: MotionSamples) -> None:
         """Add motion."""
         if len(samples):
-            self._last = part_of(samples, len(samples) - 1, len(samples))
-            points = MeasuredPoints.of(
-                samples, slice(-self._count % self._stride, None, self._stride)
-            )
+            self._last = samples
+            which = slice(-self._count % self._stride, None, self._stride)
+            points = MeasuredPoints.of(samples, which, jumped=self._jumped)
             if len(points):
-                self._waiting.append(replace(points, jumped=self._jumped))
+                self._waiting.append(points)
                 self._jumped = False
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
@@ -126,7 +124,7 @@ class Measurement:
         if self._last is None or samples == 0:
             return None
         last = self._last
-        rows = np.zeros(samples, dtype=np.int64)
+        rows = np.full(samples, len(last) - 1)
         position = last.path_mm[:, rows]
         self.add(
             MotionSamples(
@@ -170,7 +168,7 @@ class Measurement:
         while done < len(errors):
             points = self._waiting[0]
             count = min(len(points), len(errors) - done)
-            found = errors.error_mm[:, done : done + count]
+            found = np.ascontiguousarray(errors.error_mm[:, done : done + count])
             done += count
             if count < len(points):
                 self._waiting[0] = points.part(slice(count, None))

@@ -73,7 +73,7 @@ class MeasuredPoints:
     jumped: bool = False
 
     @classmethod
-    def of(cls, samples: MotionSamples, which: slice) -> MeasuredPoints:
+    def of(cls, samples: MotionSamples, which: slice, *, jumped: bool) -> MeasuredPoints:
         """Return what belongs to some samples."""
         return cls(
             samples.path_mm[:, which].copy(),
@@ -82,6 +82,7 @@ class MeasuredPoints:
             samples.row[which].copy(),
             samples.moves,
             samples.first_move,
+            jumped,
         )
 
     def part(self, which: slice) -> MeasuredPoints:
