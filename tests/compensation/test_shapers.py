@@ -96,6 +96,9 @@ def test_shape_is_linear_interpolation(
         for w, t in zip(weights, times, strict=True)
     )
     np.testing.assert_allclose(shape(command, 1e-3, pulses, centred=centred), expected, atol=1e-12)
+    given = np.full(len(command), np.nan)
+    assert shape(command, 1e-3, pulses, centred=centred, out=given) is given
+    np.testing.assert_allclose(given, expected, atol=1e-12)
 
 
 def test_centred_shaper_does_not_delay_a_ramp() -> None:
