@@ -274,7 +274,8 @@ class MotionMeter:
         due = -self._seen % self._stride
         errors = self._contour.push(y_d_mm, y_mm)
         motion_sums(
-            *map(np.ascontiguousarray, y_d_mm),
+            np.ascontiguousarray(y_d_mm[0]),
+            np.ascontiguousarray(y_d_mm[1]),
             y_mm,
             np.ascontiguousarray(extruding),
             _STILL_MM,
