@@ -97,6 +97,7 @@ def fit_stretch(
     answers: Answers,
     states: NDArray[np.complex128],
     errors: NDArray[np.float64],
+    begun: int,
     out_t: NDArray[np.float64],
     out_position: NDArray[np.float64],
 ) -> int:
@@ -107,14 +108,15 @@ def fit_stretch(
     inside the (slightly looser) funnel, is chosen so that the machine's answer to the error stays
     small. `states` (axes, order) carries that answer and is updated in place. With `level` set z
     is the same at `begin` and at all samples. `errors` (LONGEST,) is scratch.
-    Vertices in X and Y lie on multiples of `grid`. A segment is cut short where the speed of an
-    axis would step too far, as far as one sample allows. Returns their number.
+    Vertices in X and Y lie on multiples of `grid`; they are written from row `begun` on. A segment
+    is cut short where the speed of an axis would step too far, as far as one sample allows.
+    Returns their number.
     """
     x, y, z, e = begin[0], begin[1], begin[2], begin[3]
     origin_s = start_s
     speed_x = speed_y = 0.0
     k = first
-    count = 0
+    count = begun
     while k <= last:
         end, low, high, left, right, z_slope, e_slope = _reach(
             position,
@@ -170,7 +172,7 @@ def fit_stretch(
         out_position[3, count] = e
         count += 1
         k = end + 1
-    return count
+    return count - begun
 
 
 @kernel(force_inline=True, allocates=False)

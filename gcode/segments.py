@@ -178,8 +178,9 @@ def fit_segments(
             error_filter.answers,
             states,
             errors,
-            end_s[count:],
-            end_mm[:, count:],
+            count,
+            end_s,
+            end_mm,
         )
         if group.before_z:
             allowed = tolerance_mm + END_EXCESS_MM
