@@ -272,6 +272,9 @@ class MarlinEncoder:
 
     def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
         """Put the vertices on whole steps, and leave out those that would be swallowed."""
+        if len(segments) == 0:
+            # X and Y of the whole piece move by less than a step.
+            return segments
         scale = self._scale[:3]
         wish = vertices_on_steps(self._lattice, timeline, segments)
         steps = np.round(wish.end_mm[:3].T * scale).astype(np.int64)

@@ -62,7 +62,8 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
     lattice : Lattice
     timeline : Timeline
     segments : Segments
-        Fitted much finer than the steps. Where they have no `error_filter`, all errors count alike.
+        At least one, fitted much finer than the steps. Where they have no `error_filter`, all
+        errors count alike.
 
     Returns
     -------
@@ -83,8 +84,6 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])
         groups.append(np.full(len(at_s) - 1, group, np.int64))
-    if not end_s:
-        return segments
     return replace(
         segments,
         end_s=np.concatenate(end_s),

@@ -64,6 +64,17 @@ def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
     assert result.filament_error_mm < 1e-2
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path) -> None:
+    """Seen by fuzzing: of a wipe that the motors round away nothing is left but its filament."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    lines = ("G28", "G90", "M83", "G1 X78.802 Y50 F6000", "G4 P1", "G1 X78.800 Y50 E-.17", "G4 P1")
+    data = tagged("\n".join([*lines, "G1 X90 E1", ""]).encode())
+    source.write_bytes(data)
+    compensate_file(source, target, machine_with(kind), Options(), cache_dir=cache)
+    assert differences(data, target.read_bytes(), machine_with(kind)) == []
+
+
 def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(body("marlin"))
