@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
 from gcode.firmware.marlin.encoder import STREAM_ACCEL_MM_S2, stream_limits
 from gcode.firmware.marlin.kit import MarlinKit
-from gcode.firmware.marlin.limits import initial_limits
+from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from gcode.firmware.marlin.voice import MarlinVoice
 from gcode.interpreter import Interpreter
 from models.firmware import Marlin
@@ -286,3 +287,14 @@ def in_single_precision(text: bytes) -> tuple[float, float, float]:
                 lost += float(np.float32(at + value)) - float(at) - float(word[1:])
             at = np.float32(at + value)
     return lost, furthest, float(at)
+
+
+@pytest.mark.parametrize("value", [1e-9, 2.5e-5, 0.4, 3000.0])
+def test_limits_are_written_as_marlin_reads_them(value: float) -> None:
+    """Seen by fuzzing: Marlin reads `1e-09` as 1."""
+    own = replace(initial_limits(FIRMWARE), feedrate_x_mm_s=value)
+    reader = Interpreter(with_firmware())
+    (block,) = reader.push(MarlinVoice(FIRMWARE).limits(own) + b"G28\n") + reader.flush()
+    found = block.limits[-1]
+    assert isinstance(found, MarlinLimits)
+    assert found.feedrate_x_mm_s == value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from decimal import Decimal
 from typing import cast
 
 from gcode.firmware.marlin.limits import MarlinLimits, without_advance
@@ -89,22 +90,22 @@ class MarlinVoice:
         own = cast(MarlinLimits, limits)
         if self._classic_jerk:
             corner = (
-                f"X{own.jerk_x_mm_s:.10g} Y{own.jerk_y_mm_s:.10g} "
-                f"Z{own.jerk_z_mm_s:.10g} E{own.jerk_e_mm_s:.10g}"
+                f"X{_number(own.jerk_x_mm_s)} Y{_number(own.jerk_y_mm_s)} "
+                f"Z{_number(own.jerk_z_mm_s)} E{_number(own.jerk_e_mm_s)}"
             )
         else:
-            corner = f"J{own.junction_deviation_mm:.10g}"
+            corner = f"J{_number(own.junction_deviation_mm)}"
         k_s = 0.0 if own.advance_in_filament else own.linear_advance_k_s
-        advance = f"M900 K{k_s:.10g}\n" if self._advances and own.linear_advance_k_s else ""
+        advance = f"M900 K{_number(k_s)}\n" if self._advances and own.linear_advance_k_s else ""
         return (
-            f"M201 X{own.accel_x_mm_s2:.10g} Y{own.accel_y_mm_s2:.10g} "
-            f"Z{own.accel_z_mm_s2:.10g} E{own.accel_e_mm_s2:.10g}\n"
-            f"M203 X{own.feedrate_x_mm_s:.10g} Y{own.feedrate_y_mm_s:.10g} "
-            f"Z{own.feedrate_z_mm_s:.10g} E{own.feedrate_e_mm_s:.10g}\n"
-            f"M204 P{own.print_accel_mm_s2:.10g} R{own.retract_accel_mm_s2:.10g} "
-            f"T{own.travel_accel_mm_s2:.10g}\n"
-            f"M205 B{own.min_segment_time_us:.10g} S{own.min_feedrate_mm_s:.10g} "
-            f"T{own.min_travel_feedrate_mm_s:.10g} {corner}\n{advance}"
+            f"M201 X{_number(own.accel_x_mm_s2)} Y{_number(own.accel_y_mm_s2)} "
+            f"Z{_number(own.accel_z_mm_s2)} E{_number(own.accel_e_mm_s2)}\n"
+            f"M203 X{_number(own.feedrate_x_mm_s)} Y{_number(own.feedrate_y_mm_s)} "
+            f"Z{_number(own.feedrate_z_mm_s)} E{_number(own.feedrate_e_mm_s)}\n"
+            f"M204 P{_number(own.print_accel_mm_s2)} R{_number(own.retract_accel_mm_s2)} "
+            f"T{_number(own.travel_accel_mm_s2)}\n"
+            f"M205 B{_number(own.min_segment_time_us)} S{_number(own.min_feedrate_mm_s)} "
+            f"T{_number(own.min_travel_feedrate_mm_s)} {corner}\n{advance}"
         ).encode()
 
     def acceleration(self, accel_mm_s2: float) -> bytes:
@@ -118,3 +119,8 @@ class MarlinVoice:
         mark.
         """
         return without_advance(cast(MarlinLimits, limits))
+
+
+def _number(value: float) -> str:
+    """Ten digits without an exponent, at which Marlin stops reading."""
+    return f"{Decimal(f'{value:.10g}'):f}"
