@@ -58,6 +58,20 @@ def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path) -> None:
         assert found["after"] <= found["before"] + 0.1
 
 
+def test_a_wipe_on_the_spot_may_wait(tmp_path: Path) -> None:
+    """What is too short for Marlin waits for the next move: the piece is good without it."""
+    wipe = "G1 Z5.2 F600\nG1 E1 F2100\nG1 F8640\n" + "".join(
+        f"G1 X110 Y60.{y} E-.01\n" for y in ("080", "043", "005")
+    )
+    source = tmp_path / "wipe.gcode"
+    source.write_text(f"{LINES}{wipe}G4 P500\nG1 E-.8 F2100\nG1 X60 Y60 F6000\n")
+    machine = machine_with("marlin")
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+    written = tmp_path / "out.gcode"
+    assert "Y60.043" not in written.read_text()
+
+
 def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
     """Marlin passes these corners without slowing down: no command follows all of them at once."""
     document = machine_with("marlin").model_dump(mode="json")
