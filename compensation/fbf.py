@@ -51,8 +51,6 @@ ACCEL_RATIO = 1.4
 together then stay below twice of it."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""
-SET_ALONG = 0.09
-"""Weight of the error along the path, for sets (what others give: docs/benchmarks.md)."""
 _BOUNDED_SHARE = 0.2
 """Solve windows again within bounds if so few leave them; otherwise take a gentler design."""
 _BOUNDED_ROUNDS = 4
@@ -72,9 +70,9 @@ class PreviewFbf:
     robust : str
         One of `ROBUST`.
     along : float, optional
-        Weight of the error along the path against that across it, above 0; 1: they count alike,
-        which is least squares to the path. Default: 1 for one plant, .09 for a set, at some three
-        times the time.
+        Weight of the error along the path against that across it, above 0; 1, the default: they
+        count alike, which is least squares to the path. With .09 a set is followed somewhat better
+        across the path (docs/benchmarks.md), at some ten times the time.
     window_s, update_s : float
         Preview window and how much of it is committed before the next one starts.
 
@@ -122,7 +120,7 @@ class PreviewFbf:
                 "the robust basis compares members of a set, but one plant is designed for (robust "
                 "off): choose robust ensemble or minimax, or the basis ce-opt"
             )
-        along = (1.0 if robust == "off" else SET_ALONG) if along is None else along
+        along = 1.0 if along is None else along
         if not 0.0 < along <= 1.0:
             raise DesignError(f"weight along the path is {along}; above 0 and at most 1 needed")
         window, update = round(window_s / dt_s), round(update_s / dt_s)
@@ -133,7 +131,9 @@ class PreviewFbf:
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
         self._last: list[AxisCommand] = []
         self.rungs: tuple[int, ...] = ()
-        sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
+        # What delays slow motion is no vibration: a command that led it would put it right only if
+        # that delay were true.
+        sets = [plant_set(machine.axes[axis].without_delay(), dt_s) for axis in ("x", "y")]
         chosen = _chosen(sets, robust, dt_s, window, update, basis, along)
         bands_hz = [machine.axes["x"].band_hz, machine.axes["y"].band_hz]
         made = [
@@ -159,6 +159,11 @@ class PreviewFbf:
         """Take the last command as executed."""
         for axis, command in zip(self._axes, self._last, strict=True):
             axis.commit(command)
+
+    def commit_as(self, command_mm: Array) -> None:
+        """Take a command (2, n) as executed that was made of the last one."""
+        for axis, command in zip(self._axes, command_mm, strict=True):
+            axis.commit_as(command)
 
     def operate_at(self, point: OperatingPoint) -> None:
         """Do nothing: the plants of this machine stay."""

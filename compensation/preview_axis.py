@@ -270,6 +270,12 @@ class PreviewAxis:
         self.rung = self.next_rung
         self._made = None
 
+    def commit_as(self, command: Array) -> None:
+        """Take a command as executed that was made of the last one."""
+        self.observe(command)
+        self.rung = self.next_rung
+        self._made = None
+
     def answer(self, member: int, command: Array) -> Array:
         """Return what a member of the set does with the command of a piece."""
         first = sum(p.order for p in self._plants[:member])

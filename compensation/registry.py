@@ -43,9 +43,12 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
             machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
         )
     if name == "fbf":
+        from compensation.cautious import CautiousFbf
         from compensation.fbf import PreviewFbf
 
-        return PreviewFbf(machine, dt_s, **settings)
+        caution = settings.pop("caution", None)
+        exact = PreviewFbf(machine, dt_s, **settings)
+        return exact if caution is None else CautiousFbf(exact, machine, dt_s, caution)
     if name in INVERSIONS:
         from compensation.inverting import InversionCompensator
 

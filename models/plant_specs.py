@@ -1,4 +1,4 @@
-"""Plants as they are written down: five kinds of JSON document and the sets made of them.
+"""Plants as they are written down: six kinds of JSON document and the sets made of them.
 
 Every kind is checked where it is read: finite, proper, stable, free of integrators, and with
 DC gain 1 (an axis without slip reaches every position it is told to).
@@ -6,6 +6,7 @@ DC gain 1 (an axis without slip reaches every position it is told to).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -26,6 +27,8 @@ __all__ = [
     "PlantSetSpec",
     "PlantSpec",
     "PolePair",
+    "RelativeMode",
+    "RelativeModesSpec",
     "TfSpec",
     "WeightedMember",
     "ZeroPair",
@@ -103,26 +106,63 @@ class ModesSpec(_Plant):
         )
 
     def _as_written(self) -> Roots:
-        # In units of the mean frequency the polynomials stay well scaled.
-        unit = 2 * np.pi * float(np.exp(np.mean([np.log(m.f_hz) for m in self.modes])))
-        denominators = [
-            np.array([(unit / w) ** 2, 2 * m.zeta * unit / w, 1.0])
-            for m in self.modes
-            for w in (2 * np.pi * m.f_hz,)
-        ]
-        numerator = np.zeros(2 * len(denominators) - 1)
-        for i, mode in enumerate(self.modes):
-            term = np.array([mode.gain])
-            for j, other in enumerate(denominators):
-                if j != i:
-                    term = np.convolve(term, other)
-            numerator[len(numerator) - len(term) :] += term
-        # A leading coefficient of rounding size would be a zero at infinity in disguise.
-        tiny = 1e-13 * np.abs(numerator).max()
-        numerator = np.trim_zeros(np.where(np.abs(numerator) < tiny, 0.0, numerator), "f")
-        zeros = np.roots(numerator) * unit if len(numerator) else np.zeros(0)
-        poles = np.concatenate([_pair(m.f_hz, m.zeta) for m in self.modes])
-        return Roots(_complex(zeros), _complex(poles), sum(m.gain for m in self.modes), None)
+        return _sum_of_modes([(m.f_hz, m.zeta, m.gain, 0.0) for m in self.modes])
+
+
+class RelativeMode(Document):
+    """share (2 zeta s/w + 1) / (1 + 2 zeta s/w + s^2/w^2), w = 2 pi f_hz.
+
+    Attributes
+    ----------
+    share : float
+        Of a slow motion; those of a plant add up to 1. Negative where the nozzle swings against
+        what drives it.
+    grounded : float
+        Share of the damping that acts against the frame (viscous guides) and not between the
+        parts that move: `2 zeta s/w` of the numerator is multiplied by 1 - grounded.
+    """
+
+    f_hz: Positive
+    zeta: Damping
+    share: Finite
+    grounded: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.0
+
+
+class RelativeModesSpec(_Plant):
+    """Sum of resonances whose damping acts on relative speed, inside belts and joints.
+
+    At rest and at constant speed such an axis stands where it is told: its delay at zero frequency
+    is 0 whatever the parameters are, unless damping is `grounded`.
+    """
+
+    kind: Literal["relative_modes"] = "relative_modes"
+    modes: Annotated[tuple[RelativeMode, ...], Field(min_length=1, max_length=12)]
+
+    @property
+    def delay_s(self) -> float:
+        """Delay of slow motion: sum of share 2 zeta grounded / w."""
+        total = sum(m.share for m in self.modes)
+        return float(
+            sum(m.share * m.zeta * m.grounded / (np.pi * m.f_hz) for m in self.modes) / total
+        )
+
+    def without_delay(self) -> RelativeModesSpec:
+        """Return the plant with all of its damping between the parts that move."""
+        return RelativeModesSpec(
+            modes=tuple(m.model_copy(update={"grounded": 0.0}) for m in self.modes)
+        )
+
+    def scaled(self, frequency: float, damping: float) -> RelativeModesSpec:
+        """See `_Plant.scaled`."""
+        return RelativeModesSpec(
+            modes=tuple(
+                m.model_copy(update={"f_hz": m.f_hz * frequency, "zeta": m.zeta * damping})
+                for m in self.modes
+            )
+        )
+
+    def _as_written(self) -> Roots:
+        return _sum_of_modes([(m.f_hz, m.zeta, m.share, 1.0 - m.grounded) for m in self.modes])
 
 
 class PolePair(Document):
@@ -263,7 +303,8 @@ class FirSpec(_Plant):
 
 
 PlantSpec = Annotated[
-    ModesSpec | PairsSpec | ZpkSpec | TfSpec | FirSpec, Field(discriminator="kind")
+    ModesSpec | RelativeModesSpec | PairsSpec | ZpkSpec | TfSpec | FirSpec,
+    Field(discriminator="kind"),
 ]
 
 
@@ -306,6 +347,14 @@ class PlantSetSpec(Document):
         self.weighted_members()
         return self
 
+    def without_delay(self) -> PlantSetSpec:
+        """Return the set without what delays slow motion, where its plants say what that is."""
+        if isinstance(self.members, ParametricMembers):
+            members: tuple[WeightedMember, ...] | ParametricMembers = self.members
+        else:
+            members = tuple(m.model_copy(update={"plant": _prompt(m.plant)}) for m in self.members)
+        return self.model_copy(update={"nominal": _prompt(self.nominal), "members": members})
+
     def weighted_members(self) -> tuple[WeightedMember, ...]:
         """Return the members written out, the nominal plant alone if there are none."""
         if isinstance(self.members, ParametricMembers):
@@ -315,6 +364,39 @@ class PlantSetSpec(Document):
                 for z in self.members.damping_scale
             )
         return self.members or (WeightedMember(plant=self.nominal),)
+
+
+def _prompt(plant: PlantSpec) -> PlantSpec:
+    return plant.without_delay() if isinstance(plant, RelativeModesSpec) else plant
+
+
+def _sum_of_modes(modes: Sequence[tuple[float, float, float, float]]) -> Roots:
+    """Return the roots of a sum of gain (1 + relative 2 zeta s/w) / (1 + 2 zeta s/w + s^2/w^2).
+
+    Parameters
+    ----------
+    modes : sequence of (f_hz, zeta, gain, relative)
+    """
+    # In units of the mean frequency the polynomials stay well scaled.
+    unit = 2 * np.pi * float(np.exp(np.mean([np.log(f_hz) for f_hz, *_ in modes])))
+    denominators = [
+        np.array([(unit / w) ** 2, 2 * zeta * unit / w, 1.0])
+        for f_hz, zeta, _, _ in modes
+        for w in (2 * np.pi * f_hz,)
+    ]
+    numerator = np.zeros(2 * len(denominators))
+    for i, (_, _, gain, relative) in enumerate(modes):
+        term = gain * np.array([relative * denominators[i][1], 1.0])
+        for j, other in enumerate(denominators):
+            if j != i:
+                term = np.convolve(term, other)
+        numerator[len(numerator) - len(term) :] += term
+    # A leading coefficient of rounding size would be a zero at infinity in disguise.
+    tiny = 1e-13 * np.abs(numerator).max()
+    numerator = np.trim_zeros(np.where(np.abs(numerator) < tiny, 0.0, numerator), "f")
+    zeros = np.roots(numerator) * unit if len(numerator) else np.zeros(0)
+    poles = np.concatenate([_pair(f_hz, zeta) for f_hz, zeta, _, _ in modes])
+    return Roots(_complex(zeros), _complex(poles), sum(gain for _, _, gain, _ in modes), None)
 
 
 def _pair(f_hz: float, zeta: float) -> NDArray[np.complex128]:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.errors import ModelError
-from models.identification.averaging import mean_response, mean_spectrum
+from models.identification.averaging import mean_response
 from models.identification.fitting import fit_response, refit_response
-from models.identification.spectrum_fit import fit_spectrum, refit_spectrum
+from models.identification.spectrum_fit import explain_spectra
 from models.identification.types import (
     AxisIdentification,
     Excitation,
@@ -27,6 +27,7 @@ from models.plants import (
     ParametricMembers,
     PlantSetSpec,
     PlantSpec,
+    RelativeModesSpec,
     WeightedMember,
     frequency_response,
 )
@@ -66,7 +67,8 @@ _FEW_REPEATS = 1.25
 """Two or three repeats show less scatter than there is."""
 _POINTS = 200
 _DELAYS_DIFFER_S = 0.2e-3
-_SPECTRUM_DAMPING = (0.5, 1.5)
+_MOST_GROUNDED = 0.5
+"""Of the damping that may act against the frame, in viscous guides."""
 
 
 def response_set(
@@ -131,8 +133,8 @@ def spectrum_set(
 ) -> AxisIdentification:
     """Identify an axis from one or more spectra of the same test.
 
-    Nominal is the fit to the mean of their logarithms; members are fits of the same structure,
-    and the nominal plant with other damping, which a spectrum shows poorly.
+    Nominal and members explain them all, within their scatter and that of such tables
+    (`spectrum_fit.explain_spectra`).
 
     Parameters
     ----------
@@ -150,21 +152,36 @@ def spectrum_set(
             f"axis {axis}: the spectra come from different tests (accel_per_hz, range or "
             "direction), so they have no mean; identify from those of one test"
         )
-    fit = fit_spectrum(
-        mean_spectrum(spectra), tests[0], column=column, max_order=max_order, progress=progress
+    found = explain_spectra(
+        spectra, tests[0], column=column, max_order=max_order, progress=progress
     )
-    each = [refit_spectrum(s, tests[0], fit, column=column) for s in spectra]
-    fits = each if len(each) > 1 else []
-    kept = _outside_scatter(fits, fit, np.full(_POINTS, _NO_DIFFERENCE))
-    plants = plant_set_from(fit, kept, kind="spectrum", sources=sources, measured_on=measured_on)
+    fit, population = found.fit, found.population
+    low, high = fit.band_hz
+    plants = PlantSetSpec(
+        nominal=fit.spec,
+        members=tuple(
+            WeightedMember(plant=plant, weight=weight)
+            for plant, weight in zip(
+                _with_delays(population.members), population.weights, strict=True
+            )
+        ),
+        band_hz=(low, high),
+        provenance=provenance_of(fit, "spectrum", sources=sources, measured_on=measured_on),
+    )
     return AxisIdentification(
-        axis=axis,
-        plants=plants,
-        fit=fit,
-        measured=tuple(spectra),
-        member_fits=tuple(kept),
-        warnings=(*fit.notes, *_set_notes([s.source for s in spectra], fits, kept, fit)),
+        axis=axis, plants=plants, fit=fit, measured=tuple(spectra), warnings=fit.notes
     )
+
+
+def _with_delays(members: Sequence[RelativeModesSpec]) -> list[PlantSpec]:
+    """Let guides damp every second member: nobody measured what of the damping is theirs."""
+    shares = np.linspace(0.0, _MOST_GROUNDED, max(len(members) // 2, 1))
+    out: list[PlantSpec] = []
+    for k, plant in enumerate(members):
+        grounded = float(shares[k // 2]) if k % 2 else 0.0
+        modes = tuple(m.model_copy(update={"grounded": grounded}) for m in plant.modes)
+        out.append(RelativeModesSpec(modes=modes))
+    return out
 
 
 def plant_set_from(
@@ -182,8 +199,6 @@ def plant_set_from(
     listed: tuple[WeightedMember, ...] | ParametricMembers = parametric_members(kind)
     if members:
         plants: list[PlantSpec] = [fit.spec, *(m.spec for m in members)]
-        if kind == "spectrum":
-            plants += [fit.spec.scaled(1.0, z) for z in _SPECTRUM_DAMPING]
         listed = tuple(WeightedMember(plant=p) for p in plants)
     low, high = fit.band_hz
     return PlantSetSpec(
@@ -281,17 +296,16 @@ def _outside_scatter(fits: list[Fit], nominal: Fit, scatter: Array) -> list[Fit]
     """Keep members that leave the scatter somewhere; the farthest if there are too many."""
     distances = [_distance(fit, nominal) for fit in fits]
     kept = [i for i, d in enumerate(distances) if np.any(d > scatter)]
-    # The nominal plant is a member too; of spectra two more are added.
-    room = _MOST_MEMBERS - 1 - (len(_SPECTRUM_DAMPING) if nominal.magnitude_only else 0)
+    # The nominal plant is a member too.
+    room = _MOST_MEMBERS - 1
     farthest = sorted(kept, key=lambda i: -float(distances[i].max()))[:room]
     return [fits[i] for i in sorted(farthest)]
 
 
 def _set_notes(names: list[str], fits: list[Fit], kept: list[Fit], nominal: Fit) -> tuple[str, ...]:
-    unit, scale = ("dB", 1.0) if nominal.magnitude_only else ("%", 100.0)
     notes = [
-        f"{name or 'a measurement'}: the pairs of the mean leave {scale * fit.residual:.2g} {unit} "
-        f"of it (of the mean {scale * nominal.residual:.2g} {unit}); fit it by itself, another "
+        f"{name or 'a measurement'}: the pairs of the mean leave {100 * fit.residual:.2g} % "
+        f"of it (of the mean {100 * nominal.residual:.2g} %); fit it by itself, another "
         "mode may have moved into the band"
         for name, fit in zip(names, fits, strict=False)
         if fit.residual > _BAD_MEMBER * nominal.residual

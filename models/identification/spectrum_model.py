@@ -13,7 +13,7 @@ from models.identification.excitation import (
     drive_spectrum_regenerated,
     welch_kernel,
 )
-from models.identification.pair_structure import PairStructure
+from models.identification.modal_structure import ModalStructure
 from models.identification.types import Excitation, Spectrum
 
 __all__ = ["SpectrumModel", "cross_axis_share", "driven_column", "spectrum_model"]
@@ -55,30 +55,33 @@ class SpectrumModel:
         """Lowest and highest frequency that is fitted."""
         return float(self.f_hz[0]), float(self.f_hz[-1])
 
-    def log_spectrum(self, structure: PairStructure, vector: Array) -> Array:
-        """Return log S for the parameters [log gain, log noise, pairs ...]."""
-        signal = self.kernel @ np.abs(structure.response(vector[2:], self.fine_hz)) ** 2
-        return np.asarray(np.log(np.exp(2 * vector[0]) * signal + np.exp(vector[1])))
+    def log_spectrum(self, structure: ModalStructure, vector: Array) -> Array:
+        """Return log S for the parameters [log gain, log noise, modes ...]."""
+        return self.log_spectrum_and_gradient(structure, vector)[0]
 
-    def log_gradient(self, structure: PairStructure, vector: Array) -> Array:
-        """Return the derivatives of log S, shape (bins, len(vector))."""
-        power = np.abs(structure.response(vector[2:], self.fine_hz)) ** 2
-        slopes = 2 * structure.log_gradient(vector[2:], self.fine_hz).real
-        columns = self.kernel @ np.column_stack([power, power[:, None] * slopes])
-        columns *= np.exp(2 * vector[0])
-        total = columns[:, 0] + np.exp(vector[1])
-        return np.asarray(
-            np.column_stack(
-                [2 * columns[:, 0], np.full(len(total), np.exp(vector[1])), columns[:, 1:]]
-            )
-            / total[:, None]
+    def log_spectrum_and_gradient(
+        self, structure: ModalStructure, vector: Array
+    ) -> tuple[Array, Array]:
+        """Return log S, shape (bins,), and its derivatives, shape (bins, len(vector))."""
+        response, slopes = structure.response_and_gradient(vector[2:], self.fine_hz)
+        power = np.column_stack(
+            [np.abs(response) ** 2, 2 * (response.conj()[:, None] * slopes).real]
         )
+        signal = np.exp(2 * vector[0]) * (self.kernel @ power)
+        noise = float(np.exp(vector[1]))
+        total = signal[:, 0] + noise
+        rows = np.column_stack([2 * signal[:, 0], np.full(len(total), noise), signal[:, 1:]])
+        return np.log(total), np.asarray(rows / total[:, None])
+
+    @property
+    def log_drive(self) -> Array:
+        """What log S would be if the plant did just what it is told, without noise."""
+        return np.asarray(np.log(self.kernel.sum(axis=1)))
 
     def gain_of_plateau(self) -> float:
         """Return the gain that makes the drive alone explain the spectrum below 15 Hz."""
         low = self.f_hz <= max(_PLATEAU_HZ[1], float(self.f_hz[4]))
-        drive = np.log(self.kernel.sum(axis=1))
-        return float(np.exp(0.5 * np.median((self.log_psd - drive)[low])))
+        return float(np.exp(0.5 * np.median((self.log_psd - self.log_drive)[low])))
 
 
 def spectrum_model(spectrum: Spectrum, column: str, excitation: Excitation) -> SpectrumModel:

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.plants import PairsSpec, PlantSetSpec, PlantSpec
+from models.plants import PlantSetSpec, PlantSpec
 from models.schedule import AxisSchedule
 
 __all__ = [
@@ -190,7 +190,7 @@ class Fit:
         Above, the model may be far off although it fits.
     """
 
-    spec: PairsSpec
+    spec: PlantSpec
     residual: float
     gain: float
     delay_s: float
@@ -203,8 +203,8 @@ class Fit:
 
     @property
     def order(self) -> int:
-        """Number of pole pairs."""
-        return len(self.spec.poles)
+        """Number of resonances."""
+        return len(self.modes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

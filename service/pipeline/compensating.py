@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation.base import Compensator, DesignError
+from compensation.cautious import Caution
 from compensation.registry import compensator
 from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
@@ -25,6 +26,7 @@ from models.operating import OperatingGrid, machine_at
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
 from service.pipeline._peak_kernels import peaks, speed_step
+from service.pipeline.caution import design_mode
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
@@ -84,15 +86,24 @@ class PieceCompensator:
     options : Options
     shaper : BestShaper, optional
         The tuned frequencies, for `shaper:NAME` of the same type.
+    caution : Caution, optional
+        How much of a shaper's smoothing `fbf` takes.
     """
 
     def __init__(
-        self, machine: Machine, options: Options, shaper: BestShaper | None = None
+        self,
+        machine: Machine,
+        options: Options,
+        shaper: BestShaper | None = None,
+        caution: Caution | None = None,
     ) -> None:
         settings: dict[str, object] = {}
         vibration = options.method.removesuffix("+ripple")
         if vibration == "fbf":
-            settings.update(basis=options.basis, robust=options.robust, along=options.along)
+            robust = design_mode(machine, options)
+            settings.update(basis=options.basis, robust=robust, along=options.along)
+            if caution is not None:
+                settings.update(caution=caution)
         elif shaper is not None and vibration == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine

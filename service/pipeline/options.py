@@ -47,7 +47,7 @@ def _known(method: str) -> str:
 
 MethodName = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"pattern": _METHOD})]
 BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
-RobustMode = Literal["off", "ensemble", "minimax"]
+RobustMode = Literal["auto", "off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
 BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
 
@@ -58,8 +58,11 @@ class Options(BaseModel):
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
     with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
     `advise` leaves every move as it is and adds firmware commands (`service.pipeline.advising`).
-    `basis`, `robust` and `along` are settings of `fbf`: `along` is the weight of the error along
-    the path against that across it (None: as suits `robust`). `plate` chooses one of several in a
+    `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
+    the set of plants that explain the measurement, with as much of a shaper's smoothing as no
+    member fares worse for (`auto`; a machine without a measured set: its one plant), the nominal
+    plant (`off`), or the set as given (`ensemble`, `minimax`). `along` is the weight of the error
+    along the path against that across it (None: 1). `plate` chooses one of several in a
     3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
     the file follow the new motion. `dialect` is how the file is read (None: as the machine's
     firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
@@ -71,7 +74,7 @@ class Options(BaseModel):
 
     method: MethodName = "fbf"
     basis: BasisName = "ce-opt"
-    robust: RobustMode = "off"
+    robust: RobustMode = "auto"
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
     plate: Annotated[int, Field(ge=1)] | None = None
     tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM

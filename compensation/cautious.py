@@ -1,0 +1,113 @@
+"""Filtered basis functions with some of a shaper's smoothing: for plants known only so far.
+
+Where the members of a set disagree, inverting the plant that lies in the middle makes the others
+worse; a shaper, which is symmetric and only smooths, does little good and little harm to any. Plant
+and command are linear, so the error of a mixture of both commands is the mixture of their errors,
+member by member: how much to take of each is a question with a number for an answer
+(`service.pipeline.caution`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import DesignError
+from compensation.fbf import PreviewFbf
+from compensation.shapers import ShaperCompensator
+from models.machine import Machine
+from models.schedule import OperatingPoint
+
+__all__ = ["Caution", "CautiousFbf"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Caution:
+    """How much of the command of X and Y is that of filtered basis functions, and the shaper.
+
+    Attributes
+    ----------
+    shares : (float, float)
+        Of X and Y, 0 (the shaper alone) to 1.
+    shaper : str
+    fx_hz, fy_hz : float
+    """
+
+    shares: tuple[float, float]
+    shaper: str
+    fx_hz: float
+    fy_hz: float
+
+
+class CautiousFbf:
+    """share * filtered basis functions + (1 - share) * shaper, axis by axis.
+
+    Parameters
+    ----------
+    inner : PreviewFbf
+    machine : Machine
+    dt_s : float
+    caution : Caution
+
+    Raises
+    ------
+    DesignError
+        For shares outside 0 to 1, or a shaper that there is not.
+    """
+
+    name = "fbf"
+    lead_s = 0.0
+    tail_s = 0.0
+
+    def __init__(self, inner: PreviewFbf, machine: Machine, dt_s: float, caution: Caution) -> None:
+        if not all(0.0 <= share <= 1.0 for share in caution.shares):
+            raise DesignError(f"shares of filtered basis functions are {caution.shares}: 0 to 1")
+        self._inner = inner
+        self._smoothing = ShaperCompensator(
+            machine, dt_s, shaper=caution.shaper, fx_hz=caution.fx_hz, fy_hz=caution.fy_hz
+        )
+        self._shares = np.array(caution.shares)[:, None]
+        self._last = np.zeros((2, 0))
+
+    @property
+    def rungs(self) -> tuple[int, ...]:
+        """See `compensation.fbf.PreviewFbf`."""
+        return self._inner.rungs
+
+    def reset(self, position_mm: Array) -> None:
+        """Take the machine to stand still at `position_mm` (2,)."""
+        self._inner.reset(position_mm)
+
+    def observe(self, command_mm: Array) -> None:
+        """Let the machine follow a command (2, n) that was not ours."""
+        self._inner.observe(command_mm)
+
+    def commit(self) -> None:
+        """Take the last command as executed."""
+        self._inner.commit_as(self._last)
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Do nothing: the plants of this machine stay."""
+
+    def ease(self, accel_share: float) -> bool:
+        """Ask for at most this share of the machine's acceleration from now on."""
+        return self._inner.ease(accel_share)
+
+    def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
+        """Acceleration that the command of a path (2, n) may ask for."""
+        return self._inner.accel_limit_mm_s2(y_d_mm)
+
+    def compensate(
+        self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
+    ) -> Array:
+        """See `compensation.base.Compensator.compensate`; both commands stand in the rests."""
+        exact = self._inner.compensate(y_d_mm, extruding, rests)
+        smooth = self._smoothing.compensate(y_d_mm, extruding, rests)
+        self._last = self._shares * exact + (1.0 - self._shares) * smooth
+        # Both end on the plan; sums of products may not, to the last bit.
+        self._last[:, -1] = y_d_mm[:, -1]
+        return self._last

@@ -1,0 +1,92 @@
+"""Resonances whose damping acts on relative speed, and their derivatives.
+
+G(s) = 1 - s^2 sum_i r_i / (s^2 + 2 z_i w_i s + w_i^2),  sum_i r_i = 1
+
+which is the sum of r_i (2 z_i w_i s + w_i^2) / (s^2 + 2 z_i w_i s + w_i^2). Whatever the parameters
+are, a slow motion comes out as it went in, without delay: what a measurement without phase cannot
+tell is not left to its noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.plants import RelativeMode, RelativeModesSpec
+
+__all__ = ["ModalStructure"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class ModalStructure:
+    """Number of modes, and the order of the parameters.
+
+    The vector is [log f, log zeta, shares of all modes but the last]; frequencies in units of
+    `unit_hz`, so that all parameters are of order 1.
+    """
+
+    modes: int
+    unit_hz: float
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return 3 * self.modes - 1
+
+    def split(self, theta: Array) -> tuple[Array, Array, Array]:
+        """Return frequencies (in units), damping ratios and shares."""
+        n = self.modes
+        shares = theta[2 * n :]
+        return np.exp(theta[:n]), np.exp(theta[n : 2 * n]), np.append(shares, 1.0 - shares.sum())
+
+    def response(self, theta: Array, f_hz: Array) -> ComplexArray:
+        """Return G at the frequencies, shape (len(f_hz),)."""
+        return self.response_and_gradient(theta, f_hz)[0]
+
+    def response_and_gradient(self, theta: Array, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
+        """Return G, shape (len(f_hz),), and its derivatives, shape (len(f_hz), size)."""
+        s = np.asarray(1j * f_hz[:, None] / self.unit_hz, np.complex128)
+        f, zeta, share = self.split(theta)
+        below = s * s + 2 * zeta * f * s + f * f
+        part = s * s / below
+        # The stiffness and the damping of each mode stand in its denominator alone.
+        slope = share * part / below
+        by_zeta = slope * (2 * zeta * f * s)
+        by_f = by_zeta + slope * (2 * f * f)
+        by_share = part[:, -1:] - part[:, :-1]
+        return 1.0 - part @ share, np.concatenate([by_f, by_zeta, by_share], axis=1)
+
+    def parameters(self, f_hz: Array, zeta: Array, share: Array) -> Array:
+        """Return the vector of the modes given; shares are made to add up to 1."""
+        share = share + (1.0 - share.sum()) / len(share)
+        return np.concatenate([np.log(f_hz / self.unit_hz), np.log(zeta), share[:-1]])
+
+    def spec(self, theta: Array) -> RelativeModesSpec:
+        """Return the plant, its modes rising in frequency."""
+        f, zeta, share = self.split(theta)
+        return RelativeModesSpec(
+            modes=tuple(
+                RelativeMode(
+                    f_hz=float(f[i] * self.unit_hz), zeta=float(zeta[i]), share=float(share[i])
+                )
+                for i in np.argsort(f)
+            )
+        )
+
+    def bounds(
+        self, f_hz: tuple[float, float], zeta: tuple[float, float], share: tuple[float, float]
+    ) -> tuple[Array, Array]:
+        """Return lowest and highest parameters; the last mode's share follows from the others."""
+        n = self.modes
+        rows = (
+            (np.log(f_hz[0] / self.unit_hz), np.log(f_hz[1] / self.unit_hz), n),
+            (np.log(zeta[0]), np.log(zeta[1]), n),
+            (share[0], share[1], n - 1),
+        )
+        low, high = (np.concatenate([np.full(row[2], row[i]) for row in rows]) for i in (0, 1))
+        return low, high

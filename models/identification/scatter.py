@@ -1,0 +1,67 @@
+"""By how much a spectrum may be wrong: what a model need not explain.
+
+Two tables of one axis, taken minutes apart, differ by more than counting noise, and differ
+smoothly: the level drifts with friction and temperature, a peak moves by a fraction of a hertz,
+and where little of the motion arrives, something else moves the sensor. A fit that takes every
+such difference for the machine invents modes, and with them phase. Here the errors have a white
+part, bin by bin, and a smooth one that neighbouring frequencies share; how large and how smooth is
+itself not known, so several answers are given and all of them are used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.identification.spectrum_model import SpectrumModel
+
+__all__ = ["SCATTERS", "Scatter"]
+
+Array = NDArray[np.float64]
+
+_DB = 10 / np.log(10)
+
+
+@dataclass(frozen=True, slots=True)
+class Scatter:
+    """Standard deviations of the errors of a spectrum.
+
+    Attributes
+    ----------
+    white_db : float
+        Of every bin by itself.
+    smooth_db, octaves : float
+        Of the part that neighbours share, and over how much of the scale.
+    shift_hz : float
+        Of a peak's place: where the spectrum is steep, bins are off by that times the slope.
+    floor : float
+        |G| below which other motion is seen instead.
+    """
+
+    white_db: float = 0.35
+    smooth_db: float = 0.6
+    octaves: float = 0.7
+    shift_hz: float = 0.4
+    floor: float = 0.03
+
+    def covariance(self, model: SpectrumModel) -> Array:
+        """Return the covariance of the errors of log S, shape (bins, bins)."""
+        size = np.exp(0.5 * (model.log_psd - model.log_drive)) / model.gain_of_plateau()
+        slope = np.abs(np.gradient(model.log_psd, model.f_hz))
+        white = (self.white_db / _DB) ** 2 + (slope * self.shift_hz) ** 2
+        white = white + (2.0 * self.floor / size) ** 2
+        apart = np.subtract.outer(np.log2(model.f_hz), np.log2(model.f_hz)) / self.octaves
+        smooth = (self.smooth_db / _DB) ** 2 * np.exp(-0.5 * apart**2)
+        return np.asarray(np.diag(white) + smooth)
+
+
+SCATTERS = (
+    Scatter(),
+    Scatter(octaves=0.35),
+    Scatter(smooth_db=0.9),
+    Scatter(white_db=0.5, smooth_db=0.9, octaves=0.35, floor=0.01),
+)
+"""Repeats within a session differ by .3 to .5 dB bin by bin, tables of one axis weeks apart by .5
+to 1 dB over an octave (`benchmarks/printers.py` prints the spread of real tables)."""

@@ -1,0 +1,176 @@
+"""How much of a machine's compensation its plant set can bear: the promise of the default.
+
+On every plant that explains the measurement a file shall print no worse than with the shaper that
+the same measurement leads to. Before anything is printed, both commands are tried on the reference
+motion, all members answer, and the mixture is taken that is best without being bad for any.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.cautious import Caution
+from compensation.fbf import PreviewFbf
+from compensation.shapers import ShaperCompensator
+from models.machine import Machine
+from models.plants import PlantSetSpec, plant_set
+from models.reference_motion import reference_motion
+from service.pipeline.files import replacing
+from service.pipeline.options import Options
+from service.pipeline.yardstick import BestShaper
+from simulation.measures import PathDistances
+from simulation.response import response
+
+__all__ = ["Choice", "caution_for", "choose_caution", "design_mode", "measured_set"]
+
+Array = NDArray[np.float64]
+
+_VERSION = 1
+_SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
+_UNSEEN_SHARE = 0.85
+"""Most where the phase was not measured: what a set does not hold, it cannot warn of."""
+_CLEARLY_BELOW = 0.9
+"""Of the shaper's error on every member, while there is a mixture that keeps it."""
+_STRIDE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The mixture chosen for a machine, and what its set says of it on the reference motion.
+
+    Attributes
+    ----------
+    shares : (float, float)
+        Of filtered basis functions in the command of X and Y.
+    worst, mean : float
+        Largest, and geometric mean, over the members, of the contour error against the shaper's.
+    worst_to_none : float
+        Largest against no compensation.
+    """
+
+    shares: tuple[float, float]
+    worst: float
+    mean: float
+    worst_to_none: float
+
+
+def measured_set(axis: PlantSetSpec) -> bool:
+    """Whether an axis has members that a measurement gave, each a plant of its own."""
+    return isinstance(axis.members, tuple) and len(axis.members) > 1
+
+
+def design_mode(machine: Machine, options: Options) -> str:
+    """Return the robust mode of `compensation.fbf.PreviewFbf` that the options ask for."""
+    if options.robust != "auto":
+        return options.robust
+    return "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
+
+
+def caution_for(
+    machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
+) -> Caution | None:
+    """Return what the default takes of the shaper; None where it takes none."""
+    vibration = options.method.removesuffix("+ripple")
+    if vibration != "fbf" or options.robust != "auto" or design_mode(machine, options) == "off":
+        return None
+    return choose_caution(machine, shaper, directory, dt_s, options.basis)[0]
+
+
+def choose_caution(
+    machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = "ce-opt"
+) -> tuple[Caution, Choice]:
+    """Choose how much of the compensation a machine bears; found once per machine revision.
+
+    Parameters
+    ----------
+    shaper : BestShaper
+        What the nominal plants lead to.
+    directory : Path
+        Where the choice is kept.
+    """
+    path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
+    choice: Choice | None = None
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        choice = Choice(**{**found, "shares": tuple(found["shares"])})
+    if choice is None:
+        choice = _tried(machine, shaper, dt_s, basis)
+        directory.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(asdict(choice)), encoding="utf-8")
+    return Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz), choice
+
+
+def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
+    path, extruding = reference_motion(dt_s)
+    no_rests = np.zeros((0, 2), np.int64)
+    exact = PreviewFbf(machine, dt_s, basis=basis, robust="ensemble")
+    exact.reset(path[:, 0])
+    smooth = ShaperCompensator(
+        machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz
+    )
+    commands = [one.compensate(path, extruding, no_rests) for one in (exact, smooth)]
+    at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
+    distances = PathDistances(path, dt_s)
+    answers = [
+        [response(pair, command)[:, at] for command in (*commands, path)]
+        for pair in _pairs(machine, dt_s)
+    ]
+
+    def rms(points: Array) -> float:
+        error = distances.at(points, at)
+        return float(np.sqrt(np.mean(error**2)))
+
+    shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
+    none = np.array([rms(none_mm) for _, _, none_mm in answers])
+
+    def tried(shares: tuple[float, float]) -> Choice:
+        a = np.array(shares)[:, None]
+        ours = np.array(
+            [rms(a * exact_mm + (1 - a) * smooth_mm) for exact_mm, smooth_mm, _ in answers]
+        )
+        ratio = ours / np.maximum(shaped, 1e-12)
+        return Choice(
+            shares,
+            float(ratio.max()),
+            float(np.exp(np.mean(np.log(ratio)))),
+            float(np.max(ours / np.maximum(none, 1e-12))),
+        )
+
+    most = [_most(machine.axes[axis]) for axis in ("x", "y")]
+    both = [tried((min(share, most[0]), min(share, most[1]))) for share in _SHARES]
+    best = min(both, key=_rank)
+    for i in (0, 1):
+        others = [
+            tried((share, best.shares[1]) if i == 0 else (best.shares[0], share))
+            for share in _SHARES
+            if share <= most[i]
+        ]
+        best = min([best, *others], key=_rank)
+    return best
+
+
+def _rank(choice: Choice) -> tuple[float, float]:
+    """Order choices: those clearly below the shaper on every member by what they reach."""
+    if choice.worst <= _CLEARLY_BELOW:
+        return 0.0, choice.mean + choice.worst
+    return choice.worst, choice.mean
+
+
+def _most(axis: PlantSetSpec) -> float:
+    about = axis.provenance
+    return _UNSEEN_SHARE if about is None or about.magnitude_only else 1.0
+
+
+def _pairs(machine: Machine, dt_s: float) -> Sequence[tuple]:  # type: ignore[type-arg]
+    """Return members of X and Y side by side; the shorter list again from its start."""
+    x, y = (plant_set(machine.axes[axis], dt_s).members for axis in ("x", "y"))
+    count = max(len(x), len(y))
+    return [(x[j % len(x)], y[j % len(y)]) for j in range(count)]
