@@ -34,6 +34,7 @@ from models.errors import ModelError
 from models.machine import Machine
 from service.pipeline.budget import SpeedBudget
 from service.pipeline.budget_measure import BudgetMeasurement
+from service.pipeline.caution import caution_for
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import (
     DT_S,
@@ -220,8 +221,11 @@ class _Job:
         self._say("tuning the shaper to compare with", 0.0)
         with self._clock.stage("yardstick"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-        if tuned_first:
-            self._work = PieceCompensator(machine, options, self._shaper)
+            caution = caution_for(
+                machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S
+            )
+        if tuned_first or caution is not None:
+            self._work = PieceCompensator(machine, options, self._shaper, caution)
         dialect = dialect_for(machine, options.dialect)
         self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)

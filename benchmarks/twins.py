@@ -1,0 +1,175 @@
+"""Files for the built-in machines, printed by plants that explain the same measurement.
+
+A resonance table tells no phase. `golden/twins.json` of the shared folder holds, for each of four
+printers, two plants that somebody else made to fit the same measured magnitude; the machines that
+are shipped have not seen them. Each file is compensated for the machine as shipped, the written
+file is planned by the firmware's rules, and the twin answers that motion at 10 kHz. Beside it:
+nothing, and the shaper tuned by brute force on the twin itself, which nobody has.
+
+Goals: every ratio to that shaper <= 1.05 and their geometric mean <= .7; to nothing <= .5.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from quality import FILES, Task, best_shaper
+from readback import (
+    Aligned,
+    Judge,
+    Own,
+    Shaped,
+    find_input,
+    forced_stops,
+    plain_copy,
+    read_motion,
+    shared_folder,
+)
+
+from models.machine import Machine
+from models.plants import PlantSetSpec, RelativeModesSpec
+from models.store import load_machine
+from service.pipeline.files import default_cache_dir
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+
+MACHINES = {
+    "ender3": "ender3",
+    "voron_v0": "voron-v0",
+    "voron_v24_250": "voron-v24-250",
+    "annex_k3": "annex-k3",
+}
+_WORST, _MEAN, _NOTHING = 1.05, 0.7, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Contour rms while extruding, in um."""
+
+    file: str
+    machine: str
+    twin: str
+    shaper: str
+    none_um: float
+    shaper_um: float
+    ours_um: float
+    ours_max_um: float
+
+    @property
+    def to_shaper(self) -> float:
+        """Ours over the shaper's."""
+        return self.ours_um / self.shaper_um
+
+    @property
+    def to_none(self) -> float:
+        """Ours over none."""
+        return self.ours_um / self.none_um
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
+    parser.add_argument("--machines", nargs="+", default=list(MACHINES), choices=list(MACHINES))
+    parser.add_argument("--robust", default="auto")
+    parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
+    parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    given = parser.parse_args()
+    shared = shared_folder(given.shared)
+    if shared is None:
+        sys.exit("the folder of shared data is not there; see --shared")
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    options = Options(robust=given.robust)
+    head = f"{'file':26}{'machine':15}{'twin':5}{'none':>7}{'shaper':>8}{'ours':>7}{'max':>6}"
+    print(f"{head}{'/shaper':>9}{'/none':>7}  tuned shaper of the twin", flush=True)
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix="stillpath-twins-") as folder:
+        files = [plain_copy(find_input(name, shared), Path(folder)) for name in given.files]
+        with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+            waiting = [
+                pool.submit(judged, file, name, shared, options, given.cache)
+                for file in files
+                for name in given.machines
+            ]
+            for done in waiting:
+                rows += done.result()
+                for row in rows[-2:]:
+                    print(
+                        f"{row.file[:25]:26}{row.machine:15}{row.twin:5}{row.none_um:7.2f}"
+                        f"{row.shaper_um:8.2f}{row.ours_um:7.2f}{row.ours_max_um:6.0f}"
+                        f"{row.to_shaper:9.2f}{row.to_none:7.2f}  {row.shaper}",
+                        flush=True,
+                    )
+    worst = max(row.to_shaper for row in rows)
+    mean = math.exp(sum(math.log(row.to_shaper) for row in rows) / len(rows))
+    nothing = max(row.to_none for row in rows)
+    missed = 0
+    for what, value, limit in (
+        ("worst ratio to the shaper", worst, _WORST),
+        ("geometric mean of the ratios", mean, _MEAN),
+        ("worst ratio to nothing", nothing, _NOTHING),
+    ):
+        missed += value > limit
+        print(f"{'PASS' if value <= limit else 'MISS'} {what} {value:.3f} <= {limit:g}")
+    return 1 if missed else 0
+
+
+def twin_of(shipped: Machine, name: str, twin: str, shared: Path) -> Machine:
+    """Return the machine with the plants of a twin."""
+    plants = json.loads((shared / "golden" / "twins.json").read_text())[name][twin]
+    axes = {
+        axis: PlantSetSpec(nominal=RelativeModesSpec.model_validate({"modes": one["modes"]}))
+        for axis, one in plants.items()
+    }
+    return shipped.model_copy(update={"axes": axes, "name": f"{shipped.name}-{twin}"})
+
+
+def judged(file: Path, name: str, shared: Path, options: Options, cache: Path) -> list[Row]:
+    """Compensate a file for a machine as shipped and let both twins print it."""
+    shipped = load_machine(MACHINES[name])
+    own = read_motion(file, shipped)
+    with tempfile.TemporaryDirectory(prefix="stillpath-twins-") as folder:
+        target = Path(folder) / "out.gcode"
+        compensate_file(file, target, shipped, options, cache_dir=cache)
+        written = read_motion(target, shipped)
+    original = read_motion(file, shipped, forced_stops(own, written))
+    rows = []
+    for twin in ("a", "b"):
+        truth = twin_of(shipped, name, twin, shared)
+        best = best_shaper(Task(file, truth.name, (), options, cache), truth, own)
+        none, shaped, ours = (Judge(truth, members=False) for _ in range(3))
+        for section in Own.sections(own):
+            none.add(section)
+        for shaped_section in Shaped.sections(own):
+            assert isinstance(shaped_section, Shaped)
+            shaped_section.shaper = (best.type, best.fx_hz, best.fy_hz, best.zeta)
+            shaped.add(shaped_section)
+        for part in Aligned(original, written).sections(original, written):
+            ours.add(part)
+        rows.append(
+            Row(
+                file.stem,
+                shipped.name,
+                twin,
+                best.label,
+                1e3 * none.contour.rms,
+                1e3 * shaped.contour.rms,
+                1e3 * ours.contour.rms,
+                1e3 * ours.contour.max,
+            )
+        )
+    return rows
+
+
+if __name__ == "__main__":
+    sys.exit(main())
