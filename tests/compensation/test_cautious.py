@@ -1,0 +1,68 @@
+"""Mixtures of filtered basis functions and a shaper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.base import DesignError
+from compensation.cautious import Caution
+from compensation.registry import compensator
+from compensation.shapers import ShaperCompensator
+from models.reference_motion import reference_motion
+from models.store import load_machine
+
+DT_S = 1e-3
+NO_RESTS = np.zeros((0, 2), np.int64)
+MACHINE = load_machine("ender3")
+
+
+def caution(x: float, y: float) -> Caution:
+    return Caution((x, y), "mzv", 45.0, 33.0)
+
+
+def short() -> tuple[np.ndarray, np.ndarray]:
+    path, extruding = reference_motion(DT_S)
+    return path[:, :4000], extruding[:4000]
+
+
+def made(shares: Caution | None, path: np.ndarray, extruding: np.ndarray) -> np.ndarray:
+    one = compensator("fbf", MACHINE, DT_S, robust="ensemble", caution=shares)
+    one.reset(path[:, 0])
+    return one.compensate(path, extruding, NO_RESTS)
+
+
+def test_the_ends_are_those_of_the_two() -> None:
+    path, extruding = short()
+    shaper = ShaperCompensator(MACHINE, DT_S, shaper="mzv", fx_hz=45.0, fy_hz=33.0)
+    smooth = shaper.compensate(path, extruding, NO_RESTS)
+    exact = made(None, path, extruding)
+    np.testing.assert_allclose(made(caution(1.0, 1.0), path, extruding), exact, atol=1e-12)
+    np.testing.assert_allclose(made(caution(0.0, 0.0), path, extruding), smooth, atol=1e-12)
+    half = made(caution(0.5, 1.0), path, extruding)
+    np.testing.assert_allclose(half[0], 0.5 * (exact[0] + smooth[0]), atol=1e-12)
+    np.testing.assert_allclose(half[1], exact[1], atol=1e-12)
+
+
+def test_the_machine_follows_the_mixture() -> None:
+    """What comes after a piece is that of a machine which saw the mixture, not its parts."""
+    path, extruding = short()
+    first, second = path[:, :1500], path[:, 1500:3000]
+    committed = compensator("fbf", MACHINE, DT_S, robust="ensemble", caution=caution(0.6, 0.6))
+    observed = compensator("fbf", MACHINE, DT_S, robust="ensemble", caution=caution(0.6, 0.6))
+    for one in (committed, observed):
+        one.reset(first[:, 0])
+    command = committed.compensate(first, extruding[:1500], NO_RESTS)
+    committed.commit()
+    # The same step of the ladder, but the machine is told what it followed.
+    observed.compensate(first, extruding[:1500], NO_RESTS)
+    observed.commit()
+    observed.reset(first[:, 0])
+    observed.observe(command)
+    rest = [one.compensate(second, extruding[1500:3000], NO_RESTS) for one in (committed, observed)]
+    np.testing.assert_allclose(rest[0], rest[1], atol=1e-9)
+
+
+def test_shares_are_shares() -> None:
+    with pytest.raises(DesignError, match=r"\(1.2, 0.0\): 0 to 1"):
+        compensator("fbf", MACHINE, DT_S, caution=caution(1.2, 0.0))
