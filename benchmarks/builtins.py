@@ -2,8 +2,8 @@
 
     python benchmarks/builtins.py [--write]
 
-Prints, axis by axis, what the fit leaves, its modes and its members, and whether the machine that is
-shipped says the same; exits with 1 if one does not. With `--write` the documents are made anew:
+Prints, axis by axis, what the fit leaves, its modes and its members, and whether the machine that
+is shipped says the same; exits with 1 if one does not. With `--write` the documents are made anew:
 `benchmarks/yardsticks.py --write` goes after it.
 """
 
@@ -26,14 +26,19 @@ TABLES = {
     "ender3": (
         "bassco_ender3/resonances_x_20210821_152037.csv",
         "bassco_ender3/resonances_y_20210630_223910.csv",
+        "bassco_ender3/resonances_y_20210630_230110.csv",
     ),
     "voron-v0": (
         "bassco_v0/resonances_x_20220703_144605.csv",
         "bassco_v0/resonances_y_20220703_143119.csv",
     ),
     "voron-v24-250": (
+        "richardjm_voron24_250/resonances_x_20220430_191517.csv",
+        "richardjm_voron24_250/resonances_x_20220430_192532.csv",
         "richardjm_voron24_250/resonances_x_20220430_193805.csv",
         "richardjm_voron24_250/resonances_y_20220430_191733.csv",
+        "richardjm_voron24_250/resonances_y_20220430_192750.csv",
+        "richardjm_voron24_250/resonances_y_20220430_194022.csv",
     ),
     "annex-k3": (
         "nielsvz_annexK3/resonances_x_20220522_092825.csv",

@@ -50,16 +50,20 @@ _LEVEL, _LEVEL_SPREAD = np.log(0.92), 0.13
 stated (reference notes on identification); sensors read up to 15 % wrong."""
 _MISSTATED = 0.3
 """A plateau this far off (log) means other settings of the test: it is taken as the level."""
-_ZETA, _ZETA_SPREAD = 0.08, 0.7
+_ZETA, _ZETA_SPREAD = 0.08, 0.5
 """Damping where a spectrum does not tell it, and the standard deviation of its logarithm."""
 _SHARE_SPREAD = 0.6
-_ZETA_BAND, _SHARE_BAND = (0.008, 0.7), (-2.0, 2.5)
+_ZETA_BAND, _SHARE_BAND = (0.008, 0.4), (-2.0, 2.5)
 _MODES_BAND = (1.1, 2.4)
 """Modes lie above the lowest bin and below so many times the highest, by these factors."""
 _BEYOND = 0.6
 """Share of the starts with a mode beyond the band."""
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above so many times the highest bin were not seen, and damping that they may have."""
+_FRAME_HZ, _FRAME_BELOW, _FRAME_SHARE = 30.0, 0.7, 0.25
+"""What may be a frame on its feet: no higher, well below the strongest mode, of no more share."""
+_FRAME_SHAKES = 0.5
+"""How likely such a mode is the frame's: a spectrum of one sensor does not tell."""
 _PEAKS = 4
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
@@ -126,11 +130,10 @@ def explain_spectra(
             progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
     least_db = min(c.residual_db for c in accepted)
     good = [c for c in accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
-    population = representatives(
-        [c.structure.spec(c.theta) for c in good],
-        [c.structure.spec(c.theta) for c in (*accepted, *drawn)],
-    )
-    chosen = good[population.middle]
+    centres = [c.structure.spec(c.theta) for c in good]
+    crowd = search.seen_by_reaction([c.structure.spec(c.theta) for c in (*accepted, *drawn)])
+    population = representatives([*centres, *map(without_frame, centres)], crowd)
+    chosen = good[population.middle % len(good)]
     gain = float(np.exp(chosen.vector[0]))
     best = {n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders}
     notes = (
@@ -150,6 +153,25 @@ def explain_spectra(
         notes=notes,
     )
     return Explained(fit, population)
+
+
+def without_frame(plant: RelativeModesSpec) -> RelativeModesSpec:
+    """Return the plant without weak modes far below its strongest one.
+
+    An accelerometer feels its body against the ground. A frame on its feet that shakes by reaction
+    (mass ratio mu, frequency w) multiplies what the nozzle does over the bed by
+    1 - mu s^2/(s^2 + 2 z w s + w^2): a mode of share mu that nothing on the bed shows.
+    """
+    strongest = max(plant.modes, key=lambda m: abs(m.share) / m.zeta)
+    kept = [
+        m
+        for m in plant.modes
+        if abs(m.share) > _FRAME_SHARE or m.f_hz > min(_FRAME_HZ, _FRAME_BELOW * strongest.f_hz)
+    ]
+    total = sum(m.share for m in kept)
+    return RelativeModesSpec(
+        modes=tuple(m.model_copy(update={"share": m.share / total}) for m in kept)
+    )
 
 
 def fit_spectrum(
@@ -196,8 +218,8 @@ def refit_spectrum(
 class _Candidate:
     """Parameters [log gain, log noise, modes ...] of a structure, and what they leave.
 
-    `cost` is twice the negative log of likelihood times prior, and what parameters cost; `covariance` that of the vector
-    where both are taken to be normal around the fit (Laplace).
+    `cost` is twice the negative log of likelihood times prior, and what parameters cost;
+    `covariance` that of the vector where both are taken to be normal around the fit (Laplace).
     """
 
     structure: ModalStructure
@@ -313,12 +335,18 @@ class _Search:
             out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
         return out
 
+    def seen_by_reaction(self, crowd: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
+        """Take the frame out of some plants, as the nozzle over the bed does not feel it."""
+        reacts = self._rng.random(len(crowd)) < _FRAME_SHAKES
+        pairs = zip(crowd, reacts, strict=True)
+        return [without_frame(plant) if shakes else plant for plant, shakes in pairs]
+
     def _rung(self, fit: _Candidate) -> _Candidate:
         """Give modes beyond the band any damping: of them only a flank was seen."""
         n, vector = fit.structure.modes, fit.vector.copy()
         beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]
-        anything = np.log(_UNSEEN_ZETA)
-        vector[2 + n : 2 + 2 * n][beyond] = self._rng.uniform(*anything, np.count_nonzero(beyond))
+        low, high = np.log(_UNSEEN_ZETA)
+        vector[2 + n : 2 + 2 * n][beyond] = self._rng.uniform(low, high, np.count_nonzero(beyond))
         return replace(fit, vector=vector)
 
     def _whitening(self, fits: Sequence[_Candidate], scatter: Scatter) -> Array:

@@ -32,7 +32,7 @@ __all__ = ["Choice", "caution_for", "choose_caution", "design_mode", "measured_s
 
 Array = NDArray[np.float64]
 
-_VERSION = 1
+_VERSION = 2
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
@@ -171,6 +171,8 @@ def _most(axis: PlantSetSpec) -> float:
 
 def _pairs(machine: Machine, dt_s: float) -> Sequence[tuple]:  # type: ignore[type-arg]
     """Return members of X and Y side by side; the shorter list again from its start."""
-    x, y = (plant_set(machine.axes[axis], dt_s).members for axis in ("x", "y"))
+    # A delay that differs between the axes spoils all commands alike: it tells none from another.
+    axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
+    x, y = (plant_set(axis, dt_s).members for axis in axes)
     count = max(len(x), len(y))
     return [(x[j % len(x)], y[j % len(y)]) for j in range(count)]

@@ -1,0 +1,395 @@
+"""The closed chain: draw a printer, measure it, identify it, compensate, print, judge.
+
+The printers are made of bodies, belts and dry friction (`simulation/printers`); what is identified
+has another form, and sees a printer only through an accelerometer that is turned, hisses and reads
+up to 15 % wrong. A file is compensated with default options, the written file is planned by the
+firmware's rules, and the printer executes it at 10 kHz. Beside it: nothing; the shaper that
+Klipper's rules recommend from the same table; and the shaper tuned by brute force on the printer's
+own linear part, which nobody has. Contour error while extruding.
+
+    python benchmarks/closed_chain.py --printers 30 --from spectra
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from readback import (
+    DT_S,
+    WINDOW_S,
+    Aligned,
+    Motion,
+    Own,
+    Shaped,
+    Timed,
+    find_input,
+    forced_stops,
+    plain_copy,
+    read_motion,
+    shared_folder,
+)
+from scipy.signal import ss2zpk
+
+from models.errors import ModelError
+from models.identification.identify import Measured, identify
+from models.identification.readers import ReadSettings, read_content
+from models.identification.shaper_choice import choose_shaper_of
+from models.identification.types import AccelerationLog, Spectrum
+from models.machine import Machine
+from models.plants import PlantSetSpec, ZpkSpec, plant_set
+from models.store import load_machine
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from service.pipeline.yardstick import tune_shaper
+from simulation.measures import distance_to_path
+from simulation.printers.bodies import Bodies
+from simulation.printers.drawing import KINDS, draw
+from simulation.printers.machines import Printer
+from simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
+from simulation.response import response
+
+Array = NDArray[np.float64]
+
+FILES = ("ps_voron_klipper_ringing", "klipper_excludeobj_multi")
+BASES = {"bed slinger": "generic-bedslinger", "corexy": "generic-corexy"}
+_EVERY = 20
+_TUNE_S = 40.0
+_GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0)}
+_NOTHING = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A printer, how it is measured, and what it prints."""
+
+    kind: str
+    seed: int
+    source: str
+    files: tuple[Path, ...]
+    seconds: float
+    oracle: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Contour rms (and largest) while extruding, in um; the predicted range of ours."""
+
+    printer: str
+    file: str
+    none_um: float
+    recommended_um: float
+    oracle_um: float
+    ours_um: float
+    ours_max_um: float
+    recommended_max_um: float
+    predicted_um: tuple[float, float]
+    shaper: str
+    note: str = ""
+
+    @property
+    def to_shaper(self) -> float:
+        """Ours over the recommended shaper's."""
+        return self.ours_um / self.recommended_um
+
+    @property
+    def to_none(self) -> float:
+        """Ours over none."""
+        return self.ours_um / self.none_um
+
+    @property
+    def foreseen(self) -> bool:
+        """Whether ours lies in the predicted range."""
+        low, high = self.predicted_um
+        return low <= self.ours_um <= high
+
+
+@dataclass(slots=True)
+class Errors:
+    """Errors of a motion, in mm."""
+
+    values: list[Array] = field(default_factory=list)
+
+    @property
+    def rms_um(self) -> float:
+        """Root mean square."""
+        every = np.concatenate(self.values)
+        return float(1e3 * np.sqrt(np.mean(every**2)))
+
+    @property
+    def max_um(self) -> float:
+        """Largest."""
+        return float(1e3 * np.concatenate(self.values).max())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
+    parser.add_argument("--printers", type=int, default=30, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first one")
+    parser.add_argument("--from", dest="source", choices=list(_GOALS), default="spectra")
+    parser.add_argument("--seconds", type=float, default=90.0, help="of each print to judge")
+    parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
+    parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    given = parser.parse_args()
+    shared = shared_folder(given.shared)
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    rows: list[Row] = []
+    head = f"{'printer':16}{'file':20}{'none':>7}{'recom.':>8}{'oracle':>8}{'ours':>7}{'max':>6}"
+    print(f"{head}{'/recom.':>8}{'/none':>7}{'predicted':>14}  recommended", flush=True)
+    with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
+        files = tuple(plain_copy(find_input(name, shared), Path(folder)) for name in given.files)
+        tasks = [
+            Task(kind, seed, given.source, files, given.seconds, given.oracle)
+            for seed in range(given.first, given.first + given.printers)
+            for kind in KINDS
+        ]
+        with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+            for done in as_completed([pool.submit(judged, task) for task in tasks]):
+                found = done.result()
+                rows += found
+                for row in found:
+                    print_row(row)
+    return summary(rows, given.source)
+
+
+def print_row(r: Row) -> None:
+    low, high = r.predicted_um
+    print(
+        f"{r.printer:16}{r.file[:19]:20}{r.none_um:7.1f}{r.recommended_um:8.2f}{r.oracle_um:8.2f}"
+        f"{r.ours_um:7.2f}{r.ours_max_um:6.0f}{r.to_shaper:8.2f}{r.to_none:7.2f}"
+        f"{low:7.2f}-{high:<6.2f} {'' if r.foreseen else '!'} {r.shaper} {r.note}",
+        flush=True,
+    )
+
+
+def summary(rows: Sequence[Row], source: str) -> int:
+    """Print the distribution and what was to be reached."""
+    ratio = np.sort([row.to_shaper for row in rows])
+    share = 100.0 * np.array([row.to_shaper > 1.0 for row in rows]).mean()
+    decile = float(np.mean(ratio[-max(1, len(ratio) // 10) :]))
+    quartiles = np.quantile(ratio, [0.1, 0.25, 0.5, 0.75, 0.9])
+    print(f"\nratio to the recommended shaper, deciles and quartiles: {quartiles.round(2)}")
+    print(f"worst decile {decile:.2f} on average; worse than the shaper: {share:.0f} % of prints")
+    mean_goal, worst_goal = _GOALS[source]
+    foreseen = float(np.mean([row.foreseen for row in rows]))
+    missed = 0
+    for what, value, limit in (
+        ("geometric mean to the shaper", math.exp(float(np.mean(np.log(ratio)))), mean_goal),
+        ("worst to the shaper", float(ratio[-1]), worst_goal),
+        ("worst to nothing", max(row.to_none for row in rows), _NOTHING),
+        ("share outside the predicted range", 1.0 - foreseen, 0.1),
+    ):
+        missed += value > limit
+        print(f"{'PASS' if value <= limit else 'MISS'} {what} {value:.3f} <= {limit:g}")
+    return 1 if missed else 0
+
+
+def judged(task: Task) -> list[Row]:
+    """Measure, identify and print on one printer."""
+    printer = draw(task.kind, task.seed)
+    rng = np.random.default_rng([KINDS.index(task.kind), task.seed, 1])
+    base = load_machine(BASES[task.kind])
+    machine, shapers, note = identified(printer, base, task.source, rng)
+    rows = []
+    for file in task.files:
+        own = read_motion(file, base)
+        sections = Own.sections(own)
+        none = errors_of(sections, printer, task.seconds)
+        recommended = errors_of(Both.sections_of(own, shapers), printer, task.seconds)
+        oracle = np.nan
+        if task.oracle:
+            oracle = errors_of(
+                Both.sections_of(own, tuned(printer, base, sections)), printer, task.seconds
+            ).rms_um
+        ours, predicted = recommended, (0.0, np.inf)
+        if machine is not None:
+            ours, predicted = compensated(file, own, machine, printer, task.seconds)
+        rows.append(
+            Row(
+                printer.name,
+                file.stem,
+                none.rms_um,
+                recommended.rms_um,
+                oracle,
+                ours.rms_um,
+                ours.max_um,
+                recommended.max_um,
+                predicted,
+                " / ".join(f"{name} {f_hz:.1f}" for name, f_hz in shapers),
+                note,
+            )
+        )
+    return rows
+
+
+def identified(
+    printer: Printer, base: Machine, source: str, rng: np.random.Generator
+) -> tuple[Machine | None, list[tuple[str, float]], str]:
+    """Return the machine that the measurement leads to, and the shapers of X and Y.
+
+    A machine that is refused prints with the shaper.
+    """
+    sensor = drawn_sensor(rng)
+    test = OLD_TEST if rng.random() < 0.5 else NEW_TEST
+    settings = ReadSettings(
+        accel_per_hz_mm_s=test.accel_per_hz_mm_s,
+        f_start_hz=test.f_start_hz,
+        f_end_hz=test.f_end_hz,
+        hz_per_s=test.hz_per_s,
+        sweeping_accel_mm_s2=test.sweeping_accel_mm_s2,
+    )
+    measured, shapers = [], []
+    for axis in ("x", "y"):
+        for run in range(3 if source == "raw" else 1):
+            record = run_test(printer, axis, sensor, rng, test)
+            name = f"resonances_{axis}_{run}.csv"
+            (table,) = read_content(record.resonances(), name, settings=settings)
+            assert isinstance(table, Spectrum)
+            if run == 0:
+                best = choose_shaper_of(table)[0]
+                shapers.append((best.name, best.f_hz))
+            log = AccelerationLog(record.time_s, record.accel_mm_s2, axis, f"raw_{axis}_{run}.csv")
+            measured.append(Measured(log if source == "raw" else table))
+    try:
+        found = identify(measured, settings)
+    except ModelError as error:
+        return None, shapers, f"refused: {error}"
+    axes = {axis: one.plants for axis, one in found.items()}
+    return base.model_copy(update={"axes": axes, "name": printer.name}), shapers, ""
+
+
+class Both(Own):
+    """A file as it is, through a firmware shaper of its own for each axis."""
+
+    shapers: list[tuple[str, float]]
+
+    @classmethod
+    def sections_of(cls, motion: Motion, shapers: list[tuple[str, float]]) -> list[Both]:
+        """All sections of a file."""
+        sections = cls.sections(motion)
+        for section in sections:
+            assert isinstance(section, Both)
+            section.shapers = shapers
+        return sections  # type: ignore[return-value]
+
+    def command(self, first: int, last: int) -> Array:
+        rows = []
+        for row, (kind, f_hz) in enumerate(self.shapers):
+            one = object.__new__(Shaped)
+            one._phases, one._start_s = self._phases, self._start_s
+            one.shaper = (kind, f_hz, f_hz, 0.1)
+            rows.append(one.command(first, last)[row])
+        return np.stack(rows)
+
+
+def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Errors:
+    """Let the printer execute sections, up to so many seconds in all."""
+    errors, left = Errors(), round(seconds / DT_S)
+    for section in sections:
+        n = min(section.samples, left)
+        left -= n
+        if n < 2 * round(WINDOW_S / DT_S):
+            continue
+        path, extruding = section.path(0, n)
+        at = np.flatnonzero(extruding[::_EVERY]) * _EVERY
+        if len(at) == 0:
+            continue
+        y = printer.prints(section.command(0, n), DT_S)
+        errors.values.append(distance_to_path(path, y[:, at], at, DT_S, WINDOW_S))
+    return errors
+
+
+def compensated(
+    file: Path, own: Motion, machine: Machine, printer: Printer, seconds: float
+) -> tuple[Errors, tuple[float, float]]:
+    """Errors of the written file on the printer, and the range that its members predict."""
+    with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
+        target = Path(folder) / "out.gcode"
+        compensate_file(file, target, machine, Options(), cache_dir=Path(folder))
+        written = read_motion(target, machine)
+    original = read_motion(file, machine, forced_stops(own, written))
+    parts = Aligned(original, written).sections(original, written)
+    return errors_of(parts, printer, seconds), predicted_range(parts, machine, seconds)
+
+
+def predicted_range(
+    parts: Sequence[Timed], machine: Machine, seconds: float
+) -> tuple[float, float]:
+    """Least and largest contour rms over the members, in um."""
+    step = 4
+    x, y = (plant_set(machine.axes[axis], step * DT_S).members for axis in ("x", "y"))
+    found = []
+    for j in range(max(len(x), len(y))):
+        errors, left = Errors(), round(seconds / DT_S)
+        for part in parts:
+            n = min(part.samples, left)
+            left -= n
+            if n < 2 * round(WINDOW_S / DT_S):
+                continue
+            path, extruding = part.path(0, n)
+            path, extruding = path[:, ::step].copy(), extruding[::step]
+            at = np.flatnonzero(extruding[::10]) * 10
+            answer = response([x[j % len(x)], y[j % len(y)]], part.command(0, n)[:, ::step])
+            errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
+        found.append(errors.rms_um)
+    return min(found), max(found)
+
+
+def tuned(printer: Printer, base: Machine, sections: Sequence[Timed]) -> list[tuple[str, float]]:
+    """Return the best shaper on the printer's linear part, axis by axis of one type."""
+    axes = {
+        axis: PlantSetSpec(nominal=linear_part(printer, number))
+        for number, axis in enumerate(("x", "y"))
+    }
+    longest = max(sections, key=lambda s: s.samples)
+    path, extruding = longest.path(0, min(longest.samples, round(_TUNE_S / DT_S)))
+    machine = base.model_copy(update={"axes": axes})
+    best = tune_shaper(machine, path[:, ::10].copy(), 10 * DT_S, extruding[::10].copy())
+    return [(best.type, best.fx_hz), (best.type, best.fy_hz)]
+
+
+def linear_part(printer: Printer, number: int) -> ZpkSpec:
+    """Return nozzle over command of one axis, without friction and without the other axis."""
+    bodies: Bodies = printer.bodies
+    m, d, k, by_command, by_rate = bodies.matrices()
+    n = len(m)
+    inverse = np.linalg.inv(m)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ k, -inverse @ d]])
+    # The rate of the command enters through damping: shift it into the state.
+    b = np.concatenate([inverse @ by_rate, inverse @ (by_command - d @ inverse @ by_rate)])
+    c = np.concatenate([printer.nozzle[number], np.zeros(n)])
+    zeros, poles, _ = ss2zpk(a, b[:, [number]], c[None], np.zeros((1, 1)))
+    kept_z, kept_p = cancelled(zeros, poles)
+    return ZpkSpec(
+        zeros=tuple((float(z.real), float(z.imag)) for z in kept_z),
+        poles=tuple((float(p.real), float(p.imag)) for p in kept_p),
+    )
+
+
+def cancelled(zeros: Array, poles: Array) -> tuple[list[complex], list[complex]]:
+    """Leave out what cancels: modes of the other axis."""
+    left_z, left_p = list(zeros), []
+    for pole in poles:
+        near = min(left_z, key=lambda z: abs(z - pole), default=None)
+        if near is not None and abs(near - pole) < 1e-6 * abs(pole):
+            left_z.remove(near)
+        else:
+            left_p.append(pole)
+    return [z for z in left_z if abs(z) < 1e6], left_p
+
+
+if __name__ == "__main__":
+    sys.exit(main())
