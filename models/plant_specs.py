@@ -187,6 +187,17 @@ class PairsSpec(_Plant):
     zeros: tuple[ZeroPair, ...] = ()
     real_zero_tau_s: Finite = 0.0
 
+    def without_delay(self) -> PairsSpec:
+        """Return the plant whose slow motion is not delayed: `real_zero_tau_s` makes it so.
+
+        A recording does not tell when it began, so a delay of the plant and one of the clock look
+        alike; an axis at constant speed stands where it is told. To first order in frequency this
+        is the plant, advanced by its delay; at a resonance it differs by 2 zeta^2.
+        """
+        poles_s = sum(p.zeta / (np.pi * p.f_hz) for p in self.poles)
+        zeros_s = sum(z.zeta / (np.pi * z.f_hz) for z in self.zeros)
+        return self.model_copy(update={"real_zero_tau_s": float(poles_s - zeros_s)})
+
     def scaled(self, frequency: float, damping: float) -> PairsSpec:
         """See `_Plant.scaled`; `real_zero_tau_s` stays."""
         return PairsSpec(

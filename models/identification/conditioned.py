@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from models.errors import ModelError
 from models.identification.conditions import Condition
-from models.identification.sets import parametric_members
+from models.identification.sets import parametric_members, prompt
 from models.identification.types import AxisIdentification, Fit, ModeEstimate
 from models.plants import ParametricMembers, PlantSetSpec
 from models.provenance import Kind
@@ -165,7 +165,7 @@ def _grid_note(placed: Mapping[Condition, Fit]) -> str:
 
 def _node(condition: Condition, fit: Fit) -> GridNode:
     where = {f"{axis}_mm": value for axis, value in condition.position_mm}
-    return GridNode.model_validate({**where, "plant": fit.spec.model_dump()})
+    return GridNode.model_validate({**where, "plant": prompt(fit).model_dump()})
 
 
 def _followed(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:

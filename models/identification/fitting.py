@@ -61,6 +61,9 @@ _ZEROS_BAND = (0.5, 10.0)
 _ZETA = (3e-3, 3.0)
 _GAIN = (1e-9, 1e9)
 """Of any two units."""
+_TINY = 1e-9
+_FAR_ZERO = 3.0
+"""A real zero above this multiple of the band is hardly anything but a delay."""
 
 
 def fit_response(
@@ -86,8 +89,8 @@ def fit_response(
     Returns
     -------
     Fit
-        Stable, DC gain 1, slow motion without delay; `residual` and `trials` hold NRMSE, the root
-        of sum |model - H|^2 over sum |H|^2.
+        Stable, DC gain 1; `residual` and `trials` hold NRMSE, the root of sum |model - H|^2 over
+        sum |H|^2.
 
     Raises
     ------
@@ -105,7 +108,7 @@ def fit_response(
         if tried[-1].nrmse < _EXPLAINED * data.noise:
             break
     chosen = _without_fillers(data, _by_the_knee(tried, data.noise))
-    chosen = _calm_beyond(data, chosen)
+    chosen = _without_far_zero(data, _calm_beyond(data, chosen))
     trials = tuple(OrderTrial(c.structure.poles, c.nrmse) for c in tried)
     return replace(_as_fit(data, chosen), trials=trials)
 
@@ -122,14 +125,14 @@ def refit_response(
     ModelError
         If too few points are left to fit.
     """
-    data = response_data(measured, band_hz)
     if not isinstance(like.spec, PairsSpec):
         raise ModelError("a plant of pairs is needed to start from; fit a response first")
+    data = response_data(measured, band_hz)
     structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
     theta = structure.parameters(like.spec)
     ratio = data.response / structure.response(theta, data.f_hz)
     start = _candidate(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
-    fitted = _polished(data, start, _sides(start))
+    fitted = _polished(data, start, _sides(start), real_zero=like.spec.real_zero_tau_s != 0.0)
     return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
 
 
@@ -165,7 +168,7 @@ def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -
     starts = _rational_starts(data, order)
     if smaller is None:
         peak = data.f_hz[np.argmax(np.abs(data.response))] / data.unit_hz
-        theta = np.array([np.log(peak), np.log(0.1)])
+        theta = np.array([0.0, np.log(peak), np.log(0.1)])
         starts.append(_candidate(data, PairStructure(1, 0, data.unit_hz), theta, data.delay_s))
     else:
         starts.append(_grown(data, smaller))
@@ -201,13 +204,24 @@ def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
     vector = fit.vector.copy()
     turned = (sides > 0) & (fit.theta < 0)
     vector[2:][turned] *= -1
+    # What a zero no longer delays, the delay takes over: of a pair 4 zeta/w, of a real one 2 tau.
+    vector[1] += 2 * float(np.sum(_zero_delay(fit)[turned]))
     return _polished(data, replace(fit, vector=vector), sides)
+
+
+def _zero_delay(fit: _Candidate) -> Array:
+    """Return what the zero at each parameter that holds its side delays slow motion by, or 0."""
+    tau, _, _, log_fz, zz = fit.structure.split(fit.theta)
+    out = np.zeros(fit.structure.size)
+    out[0] = abs(tau)
+    out[fit.structure.size - fit.structure.zeros :] = 2 * np.abs(zz) / np.exp(log_fz)
+    return out
 
 
 def _sides(fit: _Candidate) -> Array:
     """Return +1 or -1 at the parameters whose sign is a zero's side (-1: right), else 0."""
     sides = np.zeros(fit.structure.size)
-    signed = slice(fit.structure.size - fit.structure.zeros, fit.structure.size)
+    signed = [0, *range(fit.structure.size - fit.structure.zeros, fit.structure.size)]
     sides[signed] = np.where(fit.theta[signed] < 0, -1.0, 1.0)
     return sides
 
@@ -215,8 +229,9 @@ def _sides(fit: _Candidate) -> Array:
 def _zero_hz(fit: _Candidate) -> Array:
     """Return the frequency of the zero at each parameter that holds its side, else 0."""
     structure = fit.structure
-    _, _, _, log_fz, zz = structure.split(fit.theta)
+    tau, _, _, log_fz, zz = structure.split(fit.theta)
     out = np.zeros(structure.size)
+    out[0] = structure.unit_hz / max(abs(tau), 1e-9)
     # Of two real zeros the slower one.
     slower = np.where(np.abs(zz) > 1, np.abs(zz) - np.sqrt(np.maximum(zz**2 - 1, 0)), 1.0)
     out[structure.size - structure.zeros :] = np.exp(log_fz) * structure.unit_hz * slower
@@ -244,6 +259,17 @@ def _without_fillers(data: ResponseData, fit: _Candidate) -> _Candidate:
         if _stands(data, smaller, fit, clearly=False):
             return _without_fillers(data, smaller)
     return fit
+
+
+def _without_far_zero(data: ResponseData, fit: _Candidate) -> _Candidate:
+    """Drop a real zero far above the band, which trades off with the delay that is set aside."""
+    if abs(fit.theta[0]) * data.f_hz[-1] * _FAR_ZERO > data.unit_hz:
+        return fit
+    sides = _sides(fit)
+    sides[0] = 0.0
+    without = _polished(data, fit, sides, real_zero=False)
+    no_worse = without.nrmse < max(_NO_WORSE * fit.nrmse, _EXPLAINED * data.noise)
+    return without if no_worse else fit
 
 
 def _calm_beyond(data: ResponseData, fit: _Candidate) -> _Candidate:
@@ -298,13 +324,14 @@ def _delays(data: ResponseData) -> Array:
 def _pairs_theta(structure: PairStructure, b: Array, a: Array) -> Array | None:
     """Turn polynomials into parameters, unstable poles mirrored; None if pairs are missing."""
     poles, _ = pairs_of(a)
-    zeros, _ = pairs_of(b)
+    zeros, tau = pairs_of(b)
     if len(poles) != structure.poles or len(zeros) < structure.zeros:
         return None
     # Of too many zeros the slowest matter within the band.
     zeros = zeros[: structure.zeros]
     return np.concatenate(
         [
+            tau[:1] if len(tau) else [0.0],
             np.log(poles[:, 0]),
             np.log(np.clip(np.abs(poles[:, 1]), *_ZETA)),
             np.log(zeros[:, 0]),
@@ -344,6 +371,8 @@ def _polished(
     start: _Candidate,
     sides: Array | None = None,
     least_zeta: Array | None = None,
+    *,
+    real_zero: bool = True,
 ) -> _Candidate:
     """Minimise the weighted error, the zeros kept at `sides` (0: free)."""
     structure, f = start.structure, data.f_hz
@@ -352,6 +381,8 @@ def _polished(
     low, high = structure.bounds(poles_hz, (least, _ZETA[1]), zeros_hz=zeros_hz)
     if sides is not None:
         low[sides > 0], high[sides < 0] = 1e-3, -1e-3
+    if not real_zero:
+        low[0], high[0] = -_TINY, _TINY
     turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 1.5 * _EARLIER_S)
     low = np.append([np.log(_GAIN[0]), -turns], low)
     high = np.append([np.log(_GAIN[1]), turns], high)
@@ -369,4 +400,7 @@ def _polished(
     solution = least_squares(
         residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=60
     )
-    return _judged(data, replace(start, vector=np.asarray(solution.x, np.float64)))
+    vector = np.asarray(solution.x, np.float64)
+    if not real_zero:
+        vector[2] = 0.0
+    return _judged(data, replace(start, vector=vector))

@@ -66,6 +66,11 @@ _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
+_LEAST_SHARE, _MOST_UNSURE = 0.1, 0.05
+_MEASURE = (
+    "Measure the whole band: Klipper's TEST_RESONANCES with OUTPUT=raw_data, or a swept sine from 5 "
+    "to 130 Hz, with the sensor on what moves"
+)
 _WARNING = "warning: "
 """How readers mark notes that the user must look at."""
 
@@ -181,6 +186,8 @@ class _AxisWork:
         told, warned = _parted(dict.fromkeys(notes))
         names = list(dict.fromkeys(m.source for m in used))
         fit_warnings = _fit_warnings(found.fit, names) if found.fit else ()
+        if found.fit is not None:
+            _check_told(found.fit, found.measured, names)
         return replace(found, notes=told, warnings=(*fit_warnings, *found.warnings, *warned))
 
     def _from_model(self) -> AxisIdentification:
@@ -248,6 +255,7 @@ class _AxisWork:
             [e for _, e in chosen],
             axis=self._axis,
             column=self._settings.sensor_axis,
+            frame_firm=self._settings.frame_firm,
             max_order=self._max_order,
             sources=self._sources,
             measured_on=self._date,
@@ -368,6 +376,47 @@ def _fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
         text = f"the model misses {missed} of what was measured: look at the curves before it is"
         return (f"{text} used. {remedy}",)
     return ()
+
+
+def _check_told(
+    fit: Fit, measured: Sequence[FrequencyResponse | Spectrum], sources: Sequence[str]
+) -> None:
+    """Refuse a model that the measurement does not tell.
+
+    Raises
+    ------
+    ModelError
+        If hardly any frequency is coherent, or the resonance that rings most lies outside of what
+        was measured or might be anywhere.
+    """
+    names = ", ".join(sources)
+    low, high = fit.band_hz
+    for one in measured:
+        if not isinstance(one, FrequencyResponse) or not np.isfinite(one.coherence).any():
+            continue
+        within = (one.f_hz >= low) & (one.f_hz <= high)
+        coherent = np.count_nonzero(one.coherence[within] >= _LEAST_COHERENCE)
+        if coherent < _LEAST_SHARE * np.count_nonzero(within):
+            raise ModelError(
+                f"{names}: the measurement follows the command at {coherent} of "
+                f"{np.count_nonzero(within)} frequencies between {low:.1f} and {high:.1f} Hz "
+                f"(coherence {_LEAST_COHERENCE:g}; {_LEAST_SHARE:.0%} of them are needed), so no "
+                f"model follows from it. {_MEASURE}"
+            )
+    if not fit.modes:
+        return
+    main = max(fit.modes, key=lambda m: m.peak)
+    if not low <= main.f_hz <= high:
+        raise ModelError(
+            f"{names}: the resonance that rings most would be at {main.f_hz:.1f} Hz, outside the "
+            f"measured {low:.1f} to {high:.1f} Hz: nobody saw it. {_MEASURE}"
+        )
+    if np.isfinite(main.f_sd_hz) and main.f_sd_hz > _MOST_UNSURE * main.f_hz:
+        raise ModelError(
+            f"{names}: the resonance that rings most is at {main.f_hz:.1f} Hz, give or take "
+            f"{2 * main.f_sd_hz:.1f} Hz; within {2 * _MOST_UNSURE:.0%} it must be known to "
+            f"compensate it. {_MEASURE}"
+        )
 
 
 def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:

@@ -60,7 +60,7 @@ def mode_estimates(
     n = structure.poles
     _, log_f, log_z, _, _ = structure.split(theta)
     f, zeta = np.exp(log_f) * structure.unit_hz, np.exp(log_z)
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))[: 2 * n]
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))[1 : 1 + 2 * n]
     peak = np.abs(structure.response(theta, f))
     return tuple(
         ModeEstimate(

@@ -2,11 +2,8 @@
 
 G(s) = (1 + tau s) prod_i (1 + 2 zz_i s/wz_i + s^2/wz_i^2) / prod_i (1 + 2 z_i s/w_i + s^2/w_i^2)
 
-with tau = sum_i 2 z_i/w_i - sum_i 2 zz_i/wz_i: DC gain 1 and no delay of slow motion, whatever the
-parameters are. An axis at constant speed stands where it is told; a delay of the recording is the
-clock's, and is set aside where the fit is made. Stable because frequency and damping of the poles
-are fitted as logarithms. Frequencies are in units of `unit_hz`, so that all parameters are of
-order 1.
+DC gain 1 whatever the parameters are, stable because frequency and damping of the poles are
+fitted as logarithms. Frequencies are in units of `unit_hz`, so that all parameters are of order 1.
 """
 
 from __future__ import annotations
@@ -26,14 +23,15 @@ ComplexArray = NDArray[np.complex128]
 # A zero exactly on the imaginary axis would make log G infinite at its frequency.
 _SMALL = 1e-9
 _UNSEEN_ZETA = 0.03
+_NO_TAU = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class PairStructure:
     """Numbers of pairs, and the order of the parameters.
 
-    The vector is [log f of the poles, log zeta of the poles, log f of the zeros, zeta of the
-    zeros]; tau follows from them, in units of 1/(2 pi unit_hz).
+    The vector is [tau, log f of the poles, log zeta of the poles, log f of the zeros, zeta of the
+    zeros]; tau in units of 1/(2 pi unit_hz).
     """
 
     poles: int
@@ -43,14 +41,14 @@ class PairStructure:
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return 2 * self.poles + 2 * self.zeros
+        return 1 + 2 * self.poles + 2 * self.zeros
 
     def split(self, theta: Array) -> tuple[float, Array, Array, Array, Array]:
         """Return tau, log f and log zeta of the poles, log f and zeta of the zeros."""
         n, m = self.poles, self.zeros
-        log_f, log_z, log_fz, zz = np.split(np.asarray(theta, float), np.cumsum([n, n, m]))
-        tau = np.sum(2 * np.exp(log_z - log_f)) - np.sum(2 * zz * np.exp(-log_fz))
-        return float(tau), log_f, log_z, log_fz, zz
+        cuts = np.cumsum([1, n, n, m])
+        tau, *rest = np.split(np.asarray(theta, float), cuts)
+        return float(tau[0]), rest[0], rest[1], rest[2], rest[3]
 
     def response(self, theta: Array, f_hz: Array) -> ComplexArray:
         """Return G at the frequencies, shape (len(f_hz),)."""
@@ -68,40 +66,40 @@ class PairStructure:
         poles = _factors(x, log_f, zeta)
         zeros = _factors(x, log_fz, zz) + _SMALL
         over_pole, over_zero = x[:, None] / np.exp(log_f), x[:, None] / np.exp(log_fz)
-        by_tau = (x / (1 + tau * x))[:, None]
-        pole_tau, zero_tau = 2 * zeta / np.exp(log_f), 2 / np.exp(log_fz)
         return np.concatenate(
             [
-                2 * over_pole * (zeta + over_pole) / poles - by_tau * pole_tau,
-                -2 * zeta * over_pole / poles + by_tau * pole_tau,
-                -2 * over_zero * (zz + over_zero) / zeros + by_tau * zz * zero_tau,
-                2 * over_zero / zeros - by_tau * zero_tau,
+                (x / (1 + tau * x))[:, None],
+                2 * over_pole * (zeta + over_pole) / poles,
+                -2 * zeta * over_pole / poles,
+                -2 * over_zero * (zz + over_zero) / zeros,
+                2 * over_zero / zeros,
             ],
             axis=1,
         )
 
     def extended(self, theta: Array, f_hz: float, zeta: float = 0.1) -> tuple[PairStructure, Array]:
         """Return a structure with one more pole pair at `f_hz`, a zero pair near it, and start."""
-        _, log_f, log_z, log_fz, zz = self.split(theta)
+        tau, log_f, log_z, log_fz, zz = self.split(theta)
         log_new = np.log(f_hz / self.unit_hz)
         poles = [np.append(log_f, log_new), np.append(log_z, np.log(zeta))]
         zeros = [np.append(log_fz, log_new + 0.03), np.append(zz, zeta)]
         larger = PairStructure(self.poles + 1, self.zeros + 1, self.unit_hz)
-        return larger, np.concatenate([*poles, *zeros])
+        return larger, np.concatenate([[tau], *poles, *zeros])
 
     def without(self, theta: Array, pole: int) -> tuple[PairStructure, Array]:
         """Return the structure and vector without a pole pair and the zero pair nearest to it."""
-        _, log_f, log_z, log_fz, zz = self.split(theta)
+        tau, log_f, log_z, log_fz, zz = self.split(theta)
         zero = int(np.argmin(np.abs(log_fz - log_f[pole]))) if self.zeros else 0
         kept = [np.delete(v, pole) for v in (log_f, log_z)]
         kept += [np.delete(v, zero) if self.zeros else v for v in (log_fz, zz)]
         smaller = PairStructure(self.poles - 1, max(self.zeros - 1, 0), self.unit_hz)
-        return smaller, np.concatenate(kept)
+        return smaller, np.concatenate([[tau], *kept])
 
     def parameters(self, spec: PairsSpec) -> Array:
-        """Return the vector of a plant that has this many pairs; its real zero is left out."""
+        """Return the vector of a plant that has this many pairs."""
         return np.concatenate(
             [
+                [spec.real_zero_tau_s * 2 * np.pi * self.unit_hz],
                 np.log([p.f_hz / self.unit_hz for p in spec.poles]),
                 np.log([p.zeta for p in spec.poles]),
                 np.log([z.f_hz / self.unit_hz for z in spec.zeros]),
@@ -117,7 +115,7 @@ class PairStructure:
         return PairsSpec(
             poles=tuple(PolePair(f_hz=float(f), zeta=float(z)) for f, z in poles),
             zeros=tuple(ZeroPair(f_hz=float(f), zeta=float(z)) for f, z in zeros),
-            real_zero_tau_s=tau / (2 * np.pi * self.unit_hz),
+            real_zero_tau_s=0.0 if abs(tau) < _NO_TAU else tau / (2 * np.pi * self.unit_hz),
         )
 
     def bounds(
@@ -126,6 +124,7 @@ class PairStructure:
         zeta: tuple[Array, float],
         *,
         zeros_hz: tuple[float, float] | None = None,
+        minimum_phase: bool = False,
     ) -> tuple[Array, Array]:
         """Return lowest and highest parameters for pairs within `f_hz` and damping `zeta`.
 
@@ -135,10 +134,14 @@ class PairStructure:
         n, m = self.poles, self.zeros
         log_f = np.log(np.array(f_hz) / self.unit_hz)
         log_fz = np.log(np.array(zeros_hz or f_hz) / self.unit_hz)
-        zz = 1.5
-        low = [np.full(n, log_f[0]), np.log(zeta[0]), np.full(m, log_fz[0])]
-        high = [np.full(n, log_f[1]), np.full(n, np.log(zeta[1])), np.full(m, log_fz[1])]
-        return np.concatenate([*low, np.full(m, -zz)]), np.concatenate([*high, np.full(m, zz)])
+        # Slower real zeros than the lowest frequency would make a differentiator of the plant.
+        tau, zz = self.unit_hz / f_hz[0], 1.5
+        low = [[-tau], np.full(n, log_f[0]), np.log(zeta[0]), np.full(m, log_fz[0])]
+        high = [[tau], np.full(n, log_f[1]), np.full(n, np.log(zeta[1])), np.full(m, log_fz[1])]
+        if minimum_phase:
+            low[0] = [0.0]
+        least = 1e-3 if minimum_phase else -zz
+        return np.concatenate([*low, np.full(m, least)]), np.concatenate([*high, np.full(m, zz)])
 
     def least_damping(self, theta: Array, least: float, top_hz: float) -> Array:
         """Return the least damping of every pole pair: `least`, but 0.03 above `top_hz`.

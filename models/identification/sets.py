@@ -24,6 +24,7 @@ from models.identification.types import (
     Spectrum,
 )
 from models.plants import (
+    PairsSpec,
     ParametricMembers,
     PlantSetSpec,
     PlantSpec,
@@ -38,6 +39,7 @@ __all__ = [
     "delay_warning",
     "parametric_members",
     "plant_set_from",
+    "prompt",
     "provenance_of",
     "response_set",
     "spectrum_set",
@@ -126,6 +128,7 @@ def spectrum_set(
     *,
     axis: str,
     column: str | None = None,
+    frame_firm: bool = False,
     max_order: int = 4,
     sources: Sequence[SourceFile] = (),
     measured_on: date | None = None,
@@ -140,6 +143,8 @@ def spectrum_set(
     ----------
     excitation : Excitation, or one per spectrum
         The mean of spectra of different tests cannot be taken.
+    frame_firm : bool
+        What the sensor feels is what prints (`ReadSettings.frame_firm`).
 
     Raises
     ------
@@ -153,7 +158,12 @@ def spectrum_set(
             "direction), so they have no mean; identify from those of one test"
         )
     found = explain_spectra(
-        spectra, tests[0], column=column, max_order=max_order, progress=progress
+        spectra,
+        tests[0],
+        column=column,
+        frame_firm=frame_firm,
+        max_order=max_order,
+        progress=progress,
     )
     fit, population = found.fit, found.population
     low, high = fit.band_hz
@@ -198,15 +208,20 @@ def plant_set_from(
     """
     listed: tuple[WeightedMember, ...] | ParametricMembers = parametric_members(kind)
     if members:
-        plants: list[PlantSpec] = [fit.spec, *(m.spec for m in members)]
+        plants = [prompt(fit), *map(prompt, members)]
         listed = tuple(WeightedMember(plant=p) for p in plants)
     low, high = fit.band_hz
     return PlantSetSpec(
-        nominal=fit.spec,
+        nominal=prompt(fit),
         members=listed,
         band_hz=(low, high),
         provenance=provenance_of(fit, kind, sources=sources, measured_on=measured_on),
     )
+
+
+def prompt(fit: Fit) -> PlantSpec:
+    """Return the plant of a fit, its slow motion without delay: a recording has no common clock."""
+    return fit.spec.without_delay() if isinstance(fit.spec, PairsSpec) else fit.spec
 
 
 def typed_in_set(spec: PlantSpec, *, kind: Kind = "typed in") -> PlantSetSpec:

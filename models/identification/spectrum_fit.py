@@ -95,6 +95,7 @@ def explain_spectra(
     excitation: Excitation,
     *,
     column: str | None = None,
+    frame_firm: bool = False,
     max_order: int = 4,
     progress: Callable[[float], None] | None = None,
 ) -> Explained:
@@ -106,6 +107,9 @@ def explain_spectra(
         The test that made them.
     column : str, optional
         Default: the one that follows the drive from 8 to 15 Hz.
+    frame_firm : bool
+        Whether the frame is known to stand firm; else half of the plants are without what may be
+        its mode.
     max_order : int
         Most modes to try.
     progress : callable, optional
@@ -131,8 +135,11 @@ def explain_spectra(
     least_db = min(c.residual_db for c in accepted)
     good = [c for c in accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
     centres = [c.structure.spec(c.theta) for c in good]
-    crowd = search.seen_by_reaction([c.structure.spec(c.theta) for c in (*accepted, *drawn)])
-    population = representatives([*centres, *map(without_frame, centres)], crowd)
+    crowd = [c.structure.spec(c.theta) for c in (*accepted, *drawn)]
+    if not frame_firm:
+        crowd = search.seen_by_reaction(crowd)
+        centres += [without_frame(plant) for plant in centres]
+    population = representatives(centres, crowd)
     chosen = good[population.middle % len(good)]
     gain = float(np.exp(chosen.vector[0]))
     best = {n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders}

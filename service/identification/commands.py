@@ -72,6 +72,13 @@ Columns = Annotated[
 Repair = Annotated[
     bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
 ]
+Firm = Annotated[
+    bool,
+    typer.Option(
+        "--frame-firm",
+        help="The frame stands firm (bolted down, heavy): what the sensor feels is what prints.",
+    ),
+]
 DcGain = Annotated[
     float | None, typer.Option(help="DC gain that a model may have: steps per mm are off by it.")
 ]
@@ -116,6 +123,7 @@ def run(
     firmware_date: Firmware = None,
     sensor_axis: Sensor = None,
     sensor_turned: Turned = False,
+    frame_firm: Firm = False,
     columns: Columns = None,
     repair_rounding: Repair = False,
     dc_gain: DcGain = None,
@@ -142,6 +150,7 @@ def run(
         firmware_date=firmware_date,
         sensor_axis=sensor_axis,
         sensor_turned=sensor_turned,
+        frame_firm=frame_firm,
         repair_rounding=repair_rounding,
         dc_gain=dc_gain,
         sampling_s=sampling_s,

@@ -1,8 +1,9 @@
 """How much of a machine's compensation its plant set can bear: the promise of the default.
 
-On every plant that explains the measurement a file shall print no worse than with the shaper that
-the same measurement leads to. Before anything is printed, both commands are tried on the reference
-motion, all members answer, and the mixture is taken that is best without being bad for any.
+On the plants that explain the measurement a file shall print no worse than with the shaper that the
+same measurement leads to. Before anything is printed, both commands are tried on the reference
+motion, all members answer, and the mixture is taken that is best for the likely ones without being
+bad for any; what the worst of them pays is kept with the choice.
 """
 
 from __future__ import annotations
@@ -32,12 +33,13 @@ __all__ = ["Choice", "caution_for", "choose_caution", "design_mode", "measured_s
 
 Array = NDArray[np.float64]
 
-_VERSION = 2
+_VERSION = 3
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
-_CLEARLY_BELOW = 0.9
-"""Of the shaper's error on every member, while there is a mixture that keeps it."""
+_PRICE = 0.5
+"""Of a member that fares worse than with the shaper, by how much it does: members contradict each
+other, and to please the least likely one would mean to leave the others alone."""
 _STRIDE = 5
 
 
@@ -50,7 +52,8 @@ class Choice:
     shares : (float, float)
         Of filtered basis functions in the command of X and Y.
     worst, mean : float
-        Largest, and geometric mean, over the members, of the contour error against the shaper's.
+        Largest over the members, and their geometric mean with their weights, of the contour error
+        against the shaper's.
     worst_to_none : float
         Largest against no compensation.
     """
@@ -128,6 +131,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
         error = distances.at(points, at)
         return float(np.sqrt(np.mean(error**2)))
 
+    weights = _weights(machine, len(answers))
     shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
     none = np.array([rms(none_mm) for _, _, none_mm in answers])
 
@@ -140,7 +144,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
         return Choice(
             shares,
             float(ratio.max()),
-            float(np.exp(np.mean(np.log(ratio)))),
+            float(np.exp(weights @ np.log(ratio))),
             float(np.max(ours / np.maximum(none, 1e-12))),
         )
 
@@ -157,16 +161,23 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
     return best
 
 
-def _rank(choice: Choice) -> tuple[float, float]:
-    """Order choices: those clearly below the shaper on every member by what they reach."""
-    if choice.worst <= _CLEARLY_BELOW:
-        return 0.0, choice.mean + choice.worst
-    return choice.worst, choice.mean
+def _rank(choice: Choice) -> float:
+    """Order choices: what they reach on the likely members, and what the worst one pays for it."""
+    return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 
 
 def _most(axis: PlantSetSpec) -> float:
     about = axis.provenance
     return _UNSEEN_SHARE if about is None or about.magnitude_only else 1.0
+
+
+def _weights(machine: Machine, count: int) -> Array:
+    """Return how likely each pair of members is."""
+    x, y = (
+        np.array([m.weight for m in machine.axes[axis].weighted_members()]) for axis in ("x", "y")
+    )
+    both = np.array([x[j % len(x)] * y[j % len(y)] for j in range(count)])
+    return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
 
 
 def _pairs(machine: Machine, dt_s: float) -> Sequence[tuple]:  # type: ignore[type-arg]

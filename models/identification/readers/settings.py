@@ -58,6 +58,10 @@ class ReadSettings(Document):
         Axis of the sensor that lies along the tested axis, if it is mounted turned.
     sensor_turned : bool
         The sensor was mounted differently for X and for Y.
+    frame_firm : bool
+        The frame stands firm (bolted down, heavy): what the sensor feels is what prints. Otherwise
+        a weak mode far below the strongest may be the frame on its feet, which an accelerometer
+        feels and the nozzle over the bed does not.
     time_column, command_column, measured_column, axis_column : str or int, optional
         Columns of a recorded drive, by name or counted from 0.
     acceleration_unit, magnitude_unit : str, optional
@@ -81,6 +85,7 @@ class ReadSettings(Document):
     firmware_date: date | None = None
     sensor_axis: Literal["x", "y", "z"] | None = None
     sensor_turned: bool = False
+    frame_firm: bool = False
     time_column: Column | None = None
     command_column: Column | None = None
     measured_column: Column | None = None
