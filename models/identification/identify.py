@@ -405,7 +405,9 @@ def _check_told(
             )
     if not fit.modes:
         return
-    main = max(fit.modes, key=lambda m: m.peak)
+    # Of a spectrum, what lies beyond the band only shapes its flank.
+    seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
+    main = max(seen or fit.modes, key=lambda m: m.peak)
     if not low <= main.f_hz <= high:
         raise ModelError(
             f"{names}: the resonance that rings most would be at {main.f_hz:.1f} Hz, outside the "
