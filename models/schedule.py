@@ -14,7 +14,7 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ from models.plant_specs import (
     PlantSetSpec,
     PlantSpec,
     PolePair,
+    RelativeMode,
+    RelativeModesSpec,
     WeightedMember,
     ZeroPair,
     ZpkSpec,
@@ -51,6 +53,8 @@ __all__ = [
 ]
 
 Coordinate = Literal["x", "y", "z"]
+Followed: TypeAlias = ModesSpec | RelativeModesSpec | PairsSpec
+"""Plants whose numbers can run from one place to the next."""
 COORDINATES: tuple[Coordinate, ...] = ("x", "y", "z")
 
 
@@ -126,7 +130,7 @@ class GridNode(Document):
     x_mm: Finite | None = None
     y_mm: Finite | None = None
     z_mm: Finite | None = None
-    plant: Annotated[ModesSpec | PairsSpec, Field(discriminator="kind")]
+    plant: Annotated[Followed, Field(discriminator="kind")]
 
 
 class GridSchedule(Document):
@@ -156,7 +160,7 @@ class GridSchedule(Document):
     def _axes(self) -> list[Coordinate]:
         return [axis for axis in COORDINATES if self.coordinates_mm(axis)]
 
-    def _table(self) -> dict[tuple[float, ...], ModesSpec | PairsSpec]:
+    def _table(self) -> dict[tuple[float, ...], Followed]:
         axes = self._axes()
         return {tuple(getattr(n, f"{a}_mm") for a in axes): n.plant for n in self.nodes}
 
@@ -288,7 +292,7 @@ def moving_mass_from_two_runs(
 
 def resonances_hz(plant: PlantSpec) -> NDArray[np.float64]:
     """Return the frequencies of the resonances, rising (none for kind fir)."""
-    if isinstance(plant, ModesSpec):
+    if isinstance(plant, (ModesSpec, RelativeModesSpec)):
         return np.sort([m.f_hz for m in plant.modes])
     if isinstance(plant, PairsSpec):
         return np.sort([p.f_hz for p in plant.poles])
@@ -305,6 +309,14 @@ def _scaled(plant: PlantSpec, factor: float, chosen: Collection[int]) -> PlantSp
         return ModesSpec(
             modes=tuple(
                 Mode(f_hz=m.f_hz * g, zeta=m.zeta * g, gain=m.gain)
+                for m, g in zip(plant.modes, by, strict=True)
+            )
+        )
+    if isinstance(plant, RelativeModesSpec):
+        by = _factors([m.f_hz for m in plant.modes], factor, chosen)
+        return RelativeModesSpec(
+            modes=tuple(
+                m.model_copy(update={"f_hz": m.f_hz * g, "zeta": m.zeta * g})
                 for m, g in zip(plant.modes, by, strict=True)
             )
         )
@@ -367,9 +379,9 @@ def _listed(roots: NDArray[np.complex128]) -> tuple[tuple[float, float], ...]:
     return tuple((float(r.real), float(r.imag)) for r in roots)
 
 
-def _structure(plant: ModesSpec | PairsSpec) -> str:
-    if isinstance(plant, ModesSpec):
-        return f"{len(plant.modes)} modes"
+def _structure(plant: Followed) -> str:
+    if isinstance(plant, (ModesSpec, RelativeModesSpec)):
+        return f"{len(plant.modes)} {plant.kind.replace('_', ' ')}"
     real = " and a real zero" if plant.real_zero_tau_s else ""
     return f"{len(plant.poles)} pole pairs, {len(plant.zeros)} zero pairs{real}"
 
@@ -384,7 +396,7 @@ def _neighbours(values: Sequence[float], wanted: float) -> list[tuple[float, flo
     return [(low, 1.0 - share), (high, share)]
 
 
-def _between(corners: Sequence[tuple[float, ModesSpec | PairsSpec]]) -> PlantSpec:
+def _between(corners: Sequence[tuple[float, Followed]]) -> PlantSpec:
     """Mean of plants of one structure: of logarithms for what is positive."""
     shares = [share for share, _ in corners]
 
@@ -405,6 +417,19 @@ def _between(corners: Sequence[tuple[float, ModesSpec | PairsSpec]]) -> PlantSpe
                     gain=mean(m.gain for m in same),
                 )
                 for same in zip(*(p.modes for p in modal), strict=True)
+            )
+        )
+    relative = [p for p in plants if isinstance(p, RelativeModesSpec)]
+    if relative:
+        return RelativeModesSpec(
+            modes=tuple(
+                RelativeMode(
+                    f_hz=log_mean(m.f_hz for m in same),
+                    zeta=log_mean(m.zeta for m in same),
+                    share=mean(m.share for m in same),
+                    grounded=mean(m.grounded for m in same),
+                )
+                for same in zip(*(p.modes for p in relative), strict=True)
             )
         )
     pairs = [p for p in plants if isinstance(p, PairsSpec)]

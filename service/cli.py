@@ -126,9 +126,10 @@ def compensate(
     robust: Annotated[
         str,
         typer.Option(
-            help="What fbf looks at: off (the nominal plant), ensemble or minimax (its set)."
+            help="What fbf looks at: auto (all that explains the measurement, no more than that "
+            "bears), off (the nominal plant), ensemble or minimax (its set)."
         ),
-    ] = "off",
+    ] = "auto",
     along: Annotated[
         float | None,
         typer.Option(

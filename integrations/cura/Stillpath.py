@@ -98,10 +98,16 @@ _SETTINGS: dict[str, dict[str, Any]] = {
     },
     "robust": {
         "label": "Robust",
-        "description": "What fbf is designed for: the nominal plant, or the set of plants.",
+        "description": "What fbf is designed for: all plants that explain the measurement, "
+        "the nominal plant, or the set as given.",
         "type": "enum",
-        "options": {"off": "nominal", "ensemble": "set", "minimax": "worst of the set"},
-        "default_value": "off",
+        "options": {
+            "auto": "automatic",
+            "off": "nominal",
+            "ensemble": "set",
+            "minimax": "worst of the set",
+        },
+        "default_value": "auto",
         "enabled": "method == 'fbf'",
     },
     "tolerance_um": {
@@ -247,7 +253,7 @@ class Stillpath(Script):
         options = {name: self._value(name) for name in names}
         if self._value("budget_um"):
             options["budget_um"] = self._value("budget_um")
-        return options if options["method"] == "fbf" else {**options, "robust": "off"}
+        return options if options["method"] == "fbf" else {**options, "robust": "auto"}
 
     def _value(self, key: str) -> Any:
         """Return a setting; what Cura read back from its own files is text."""

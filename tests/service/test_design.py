@@ -96,14 +96,13 @@ def impulse(machine: Machine, axis: str) -> np.ndarray:
 
 def test_axis_and_set(machine: Machine, off: DesignReport) -> None:
     spec = machine.axes["x"].nominal
-    assert [m.f_hz for m in off.plant.modes] == pytest.approx(sorted(p.f_hz for p in spec.poles))
+    assert [m.f_hz for m in off.plant.modes] == pytest.approx(sorted(m.f_hz for m in spec.modes))
     (zero,) = off.plant.zeros_outside
-    assert zero.real == pytest.approx(-3.669, abs=1e-3)
     assert zero.radius == pytest.approx(abs(zero.real))
     assert zero.f_hz == pytest.approx(500)
     assert sum(m.weight for m in off.plant.members) == pytest.approx(1)
     assert sum(m.minimax_weight for m in off.plant.members) == pytest.approx(1)
-    assert len(off.plant.members) == 10
+    assert len(off.plant.members) == 16
     taz = report_of(load_machine("taz6-x"), errors_percent=())
     (pair,) = taz.plant.zeros_outside
     assert pair.radius > 1
@@ -124,7 +123,7 @@ def test_singular_values_are_those_of_the_dense_matrices(
         expected = np.linalg.svd(matrix, compute_uv=False)
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected[0])
     # A set: the weighted stack of its members.
-    plants = plant_set(machine.axes["y"], DT)
+    plants = plant_set(machine.axes["y"].without_delay(), DT)
     gram = np.zeros((300, 300))
     for plant, weight in zip(plants.members, plants.weights, strict=True):
         g = toeplitz(plant.impulse_response(300), np.zeros(300))
@@ -245,7 +244,8 @@ def test_curves_equal_direct_simulations(machine: Machine, off: DesignReport) ->
         y = np.stack([answer(member, command[0]), still])
         assert curves[name].members_um[0] == pytest.approx(contour_rms_um(path, y, use), rel=1e-6)
         assert curves[name].members_worst_um == max(curves[name].members_um)
-        mean = np.mean(curves[name].members_um)  # the members' weights are equal
+        weights = plant_set(machine.axes["x"], DT).weights
+        mean = np.average(curves[name].members_um, weights=weights)
         assert curves[name].members_mean_um == pytest.approx(mean)
 
 

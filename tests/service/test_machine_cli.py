@@ -331,7 +331,9 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     config.write_text(CONFIG)  # what is included was not looked at: said, but no difference
     assert machines("check", "mine", "--printer-cfg", config) == 0
     assert "note: [include mainsail.cfg]" in capsys.readouterr().out
-    assert machines("check", "ender3") == 0
+    assert machines("check", "generic-corexy") == 0
+    # Somebody else's printer, and years ago.
+    assert machines("check", "ender3") == 2
 
 
 def test_the_age_of_a_measurement():

@@ -42,6 +42,7 @@ METHODS = (
     ("shaper:3hump_ei", "shaper: 3hump_ei"),
 )
 ROBUST = (
+    ("auto", "automatic: what the measurement bears"),
     ("off", "the nominal plant"),
     ("ensemble", "the set of plants"),
     ("minimax", "the worst of the set"),
@@ -54,7 +55,7 @@ DEFAULTS: dict[str, Any] = {
     "machines": [],
     "machine": "",
     "method": "fbf",
-    "robust": "off",
+    "robust": "auto",
     "tolerance_um": 2.0,
     "budget_um": "",
     "times": "new",

@@ -107,7 +107,7 @@ function complaint(file) {
 /** What few need, folded away. */
 function moreOptions() {
   const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
-  const robust = select("robust", [["", [["off", "The nominal plant (fastest)"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
+  const robust = select("robust", [["", [["auto", "Automatic: what the measurement bears"], ["off", "The nominal plant"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
   const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
   const budget = h("input", { type: "number", id: "budget", min: "0.5", max: "1000", step: "0.5", placeholder: "keep all speeds" });
   const plate = h("input", { type: "number", id: "plate", min: "1", step: "1", placeholder: "the only one" });

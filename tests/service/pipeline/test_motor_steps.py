@@ -79,7 +79,8 @@ def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
     document["firmware"]["planner"]["max_accel_mm_s2"] |= {"x": 20000.0, "y": 20000.0}
     for axis, f_hz, zeta in (("x", 83.01, 0.021), ("y", 91.26, 0.102)):
         pole = {"f_hz": f_hz, "zeta": zeta}
-        document["axes"][axis]["nominal"] = {"kind": "pairs", "poles": [pole], "zeros": []}
+        plant = {"kind": "pairs", "poles": [pole], "zeros": []}
+        document["axes"][axis] = {"nominal": plant, "band_hz": (8.0, 130.0)}
     lines = ["G28", "G90", "M83", "M204 P12000 T12000"]
     for layer in range(3):
         lines += [f"G1 Z{0.2 * (layer + 1):.1f} F600", "G1 E-.8 F2400", "G1 X79.293 Y60 F9000"]
