@@ -12,10 +12,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from models.confirmation import Confirmation
 from models.document import Document, Finite, NonNegative, Positive
 from models.errors import ModelError
 from models.firmware import Firmware, Klipper
 from models.plants import PlantSetSpec
+from models.provenance import ADDED
 from models.ripple import AxisRipple, MachineRipple, RippleAxis
 from models.schedule import AxisSchedule
 
@@ -62,6 +64,8 @@ class Machine(Document):
         schedule, or where none is looked at, the plants are those of `axes`.
     ripple : dict
         `x`, `y` and the motors of CoreXY, `a` and `b`, to errors that repeat with position.
+    confirmations : dict
+        `x` and `y` to what a ring test on the machine said of the plants.
     """
 
     schema_version: Literal[1] = 1
@@ -77,6 +81,7 @@ class Machine(Document):
     mesh_slope: NonNegative = 0.0
     schedules: dict[Literal["x", "y"], AxisSchedule] = Field(default_factory=dict)
     ripple: dict[RippleAxis, AxisRipple] = Field(default_factory=dict)
+    confirmations: dict[Literal["x", "y"], Confirmation] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _complete(self) -> Machine:
@@ -94,10 +99,15 @@ class Machine(Document):
     def revision(self) -> str:
         """First 12 hex digits of the SHA-256 of the canonical JSON document."""
         content = self.model_dump(mode="json")
-        for added in ("schedules", "ripple"):
+        for added in ("schedules", "ripple", "confirmations"):
             if not content[added]:
                 # Machines from before there were such fields keep their revision.
                 del content[added]
+        for axis in content["axes"].values():
+            about = axis["provenance"] or {}
+            for added in ADDED:
+                if about.get(added, ...) is None:
+                    del about[added]
         if not content["firmware"].get("ft_motion", True):
             del content["firmware"]["ft_motion"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))

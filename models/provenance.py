@@ -9,12 +9,19 @@ from pydantic import Field
 
 from models.document import Document, Finite, NonNegative, Positive
 
-__all__ = ["Kind", "MeasuredMode", "Provenance", "SourceFile"]
+__all__ = ["ADDED", "Kind", "MeasuredMode", "Phase", "Provenance", "SourceFile"]
 
 Kind: TypeAlias = Literal[
     "raw log", "spectrum", "frequency response", "recorded drive", "model file", "typed in"
 ]
 """What a model was made of."""
+
+Phase: TypeAlias = Literal["not measured", "aligned at low frequency"]
+"""How the phase was obtained. No recording of a printer shares its clock with the command, so what
+is measured is phase relative to slow motion, which is taken to be on time."""
+
+ADDED = ("phase", "slow_delay_s", "coherent_share", "coherent_band_hz")
+"""Fields that older documents lack: where they are None, a document is as it was before them."""
 
 
 class SourceFile(Document):
@@ -39,15 +46,24 @@ class Provenance(Document):
     Attributes
     ----------
     kind : str
-        What was read. The phase is unknown for `spectrum`: the model is minimum phase by
-        convention.
+        What was read.
     residual : float, optional
         Of the fit: NRMSE (0.01 is 1 %), or rms in dB for a spectrum.
     delay_s, gain : float, optional
-        What the fit set aside: a delay that cannot be told from the start of the recording, and
-        the sensor's gain.
+        What the fit set aside: a delay of the recording against the command, and the level of what
+        was measured against what was commanded.
     trust_below_hz : float, optional
         Above, the model may be far off although it fits (phase unknown, or not measured).
+    phase : str, optional
+        How it was obtained.
+    slow_delay_s : (float, float), optional
+        Least and largest delay of slow motion of the plants that explain the measurement. Of a
+        spectrum the members have it; those of a response are advanced by it, as nobody knows what
+        of it is the recording's.
+    coherent_share : float, optional
+        Of the measured frequencies, those at which the motion follows the command.
+    coherent_band_hz : (float, float), optional
+        Lowest and highest of these.
     """
 
     kind: Kind
@@ -58,6 +74,10 @@ class Provenance(Document):
     gain: Positive | None = None
     modes: tuple[MeasuredMode, ...] = ()
     trust_below_hz: Positive | None = None
+    phase: Phase | None = None
+    slow_delay_s: tuple[Finite, Finite] | None = None
+    coherent_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    coherent_band_hz: tuple[Positive, Positive] | None = None
 
     @property
     def magnitude_only(self) -> bool:

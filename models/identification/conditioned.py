@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from models.errors import ModelError
 from models.identification.conditions import Condition
-from models.identification.sets import parametric_members, prompt
+from models.identification.prompt import prompt
+from models.identification.sets import parametric_members
 from models.identification.types import AxisIdentification, Fit, ModeEstimate
 from models.plants import ParametricMembers, PlantSetSpec
 from models.provenance import Kind
@@ -24,7 +25,7 @@ from models.schedule import (
 )
 from models.store import explain
 
-__all__ = ["scheduled", "special", "usual"]
+__all__ = ["followed", "scheduled", "special", "usual"]
 
 _REPEATABLE = 0.0035
 """Relative standard deviation of a frequency from run to run: +-0.7 % within a session."""
@@ -86,10 +87,10 @@ def scheduled(
         grid = _grid(placed) if placed else None
     except ModelError as error:
         raise ModelError(f"axis {found.axis}: {error}") from None
-    plants = found.plants
+    plants, varied = followed(found.plants, kind)
     if grid is not None:
-        plants, varied = _followed(plants, kind)
-        notes = (*notes, _grid_note(placed), *varied)
+        notes = (*notes, _grid_note(placed))
+    notes = (*notes, *varied)
     schedule = AxisSchedule(mass=mass, grid=grid)
     schedule.check(plants)
     return replace(found, plants=plants, schedule=schedule, notes=(*found.notes, *notes))
@@ -168,9 +169,12 @@ def _node(condition: Condition, fit: Fit) -> GridNode:
     return GridNode.model_validate({**where, "plant": prompt(fit).model_dump()})
 
 
-def _followed(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:
-    """Return members that can follow a grid: those that scale, not those that are listed."""
+def followed(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:
+    """Return members that can follow a schedule: those that scale, not those that are listed."""
     if not plants.members or isinstance(plants.members, ParametricMembers):
         return plants, ()
-    note = "members are spread about the plant of each place; repeats at one place make none"
+    note = (
+        "members are spread about the plant of each place and mass: which resonance of each listed "
+        "one the schedule moves, nobody knows"
+    )
     return plants.model_copy(update={"members": parametric_members(kind)}), (note,)

@@ -8,11 +8,11 @@ explained by the noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from models.errors import ModelError
 from models.identification.averaging import low_frequency_delay, mean_response
@@ -23,6 +23,13 @@ from models.identification.mode_estimates import (
     robust_covariance,
 )
 from models.identification.pair_structure import PairStructure
+from models.identification.response_candidate import (
+    Candidate,
+    delay_span,
+    judged,
+    least_error,
+    with_gain,
+)
 from models.identification.response_data import ResponseData, response_data
 from models.identification.sanathanan_koerner import (
     pairs_of,
@@ -59,8 +66,6 @@ _POLES_BAND = (0.5, 1.6)
 _ZEROS_BAND = (0.5, 10.0)
 """Zeros so far above that there are as good as none."""
 _ZETA = (3e-3, 3.0)
-_GAIN = (1e-9, 1e9)
-"""Of any two units."""
 _TINY = 1e-9
 _FAR_ZERO = 3.0
 """A real zero above this multiple of the band is hardly anything but a delay."""
@@ -131,37 +136,12 @@ def refit_response(
     structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
     theta = structure.parameters(like.spec)
     ratio = data.response / structure.response(theta, data.f_hz)
-    start = _candidate(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
+    start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
     fitted = _polished(data, start, _sides(start), real_zero=like.spec.real_zero_tau_s != 0.0)
     return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.poles, fitted.nrmse),))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """Parameters [log gain, delay (unit 1/(2 pi unit_hz)), pairs ...] of a structure."""
-
-    structure: PairStructure
-    vector: Array
-    nrmse: float = np.inf
-    cost: float = np.inf
-
-    @property
-    def theta(self) -> Array:
-        return self.vector[2:]
-
-    @property
-    def delay_s(self) -> float:
-        return float(self.vector[1] / (2 * np.pi * self.structure.unit_hz))
-
-    def model(self, f_hz: Array) -> ComplexArray:
-        nuisance = np.exp(self.vector[0] - 1j * f_hz / self.structure.unit_hz * self.vector[1])
-        return np.asarray(nuisance * self.structure.response(self.theta, f_hz))
-
-    def gradient(self, f_hz: Array) -> ComplexArray:
-        """Return the derivatives of the model, shape (len(f_hz), len(vector))."""
-        delay = -1j * f_hz / self.structure.unit_hz
-        logs = [np.ones(len(f_hz)), delay, self.structure.log_gradient(self.theta, f_hz)]
-        return np.asarray(self.model(f_hz)[:, None] * np.column_stack(logs))
+_Candidate: TypeAlias = Candidate[PairStructure]
 
 
 def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -> _Candidate:
@@ -169,7 +149,7 @@ def _best_of_order(data: ResponseData, order: int, smaller: _Candidate | None) -
     if smaller is None:
         peak = data.f_hz[np.argmax(np.abs(data.response))] / data.unit_hz
         theta = np.array([0.0, np.log(peak), np.log(0.1)])
-        starts.append(_candidate(data, PairStructure(1, 0, data.unit_hz), theta, data.delay_s))
+        starts.append(with_gain(data, PairStructure(1, 0, data.unit_hz), theta, data.delay_s))
     else:
         starts.append(_grown(data, smaller))
     best = min((_polished(data, s) for s in starts), key=lambda c: c.cost)
@@ -254,7 +234,7 @@ def _without_fillers(data: ResponseData, fit: _Candidate) -> _Candidate:
     for pole in filler_poles(fit.structure, fit.theta) if fit.structure.poles > 1 else ():
         structure, theta = fit.structure.without(fit.theta, pole)
         smaller = _with_zeros_in_band(
-            data, _polished(data, _candidate(data, structure, theta, fit.delay_s))
+            data, _polished(data, with_gain(data, structure, theta, fit.delay_s))
         )
         if _stands(data, smaller, fit, clearly=False):
             return _without_fillers(data, smaller)
@@ -308,7 +288,7 @@ def _rational_starts(data: ResponseData, order: int) -> list[_Candidate]:
         b, a, _ = sanathanan_koerner(basis, h, some.weight, 2 * order - 1, 2 * order)
         theta = _pairs_theta(structure, b, a)
         if theta is not None:
-            found.append(_judged(some, _candidate(some, structure, theta, float(delay))))
+            found.append(judged(some, with_gain(some, structure, theta, float(delay))))
     found.sort(key=lambda c: c.cost)
     apart = [c for c in found if abs(c.delay_s - found[0].delay_s) > _APART_S]
     return [*found[:1], *apart[:1]]
@@ -345,25 +325,7 @@ def _grown(data: ResponseData, smaller: _Candidate) -> _Candidate:
     error = np.abs(data.weight * (smaller.model(data.f_hz) - data.response))
     at = data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))]
     structure, theta = smaller.structure.extended(smaller.theta, float(at))
-    return _Candidate(structure, np.concatenate([smaller.vector[:2], theta]))
-
-
-def _candidate(
-    data: ResponseData, structure: PairStructure, theta: Array, delay_s: float
-) -> _Candidate:
-    """Put gain (by least squares) and delay in front of the parameters of the pairs."""
-    raw = _Candidate(structure, np.concatenate([[0.0, delay_s * 2 * np.pi * data.unit_hz], theta]))
-    shape = data.weight * raw.model(data.f_hz)
-    gain = float(np.vdot(shape, data.weight * data.response).real / np.vdot(shape, shape).real)
-    raw.vector[0] = np.log(max(gain, _GAIN[0]))
-    return raw
-
-
-def _judged(data: ResponseData, candidate: _Candidate) -> _Candidate:
-    error = candidate.model(data.f_hz) - data.response
-    soft = np.sqrt(1 + np.abs(data.weight * error) ** 2) - 1
-    nrmse = float(np.linalg.norm(error) / np.linalg.norm(data.response))
-    return replace(candidate, nrmse=nrmse, cost=float(soft.sum()))
+    return Candidate(structure, np.concatenate([smaller.vector[:2], theta]))
 
 
 def _polished(
@@ -383,24 +345,8 @@ def _polished(
         low[sides > 0], high[sides < 0] = 1e-3, -1e-3
     if not real_zero:
         low[0], high[0] = -_TINY, _TINY
-    turns = 2 * np.pi * data.unit_hz * (abs(data.delay_s) + 1.5 * _EARLIER_S)
-    low = np.append([np.log(_GAIN[0]), -turns], low)
-    high = np.append([np.log(_GAIN[1]), turns], high)
-
-    def residual(vector: Array) -> Array:
-        error = data.weight * (replace(start, vector=vector).model(f) - data.response)
-        return np.concatenate([error.real, error.imag])
-
-    def jacobian(vector: Array) -> Array:
-        slope = data.weight[:, None] * replace(start, vector=vector).gradient(f)
-        return np.concatenate([slope.real, slope.imag])
-
-    margin = np.minimum(1e-6, 0.25 * (high - low))
-    inside = np.clip(start.vector, low + margin, high - margin)
-    solution = least_squares(
-        residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=60
-    )
-    vector = np.asarray(solution.x, np.float64)
+    found = least_error(data, start, low, high, delay_span(data, _EARLIER_S))
     if not real_zero:
-        vector[2] = 0.0
-    return _judged(data, replace(start, vector=vector))
+        found.vector[2] = 0.0
+        found = judged(data, found)
+    return found

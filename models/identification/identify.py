@@ -18,7 +18,7 @@ from models.identification.averaging import mean_response, mean_spectrum
 from models.identification.conditioned import scheduled, special, usual
 from models.identification.conditions import Condition
 from models.identification.estimation import estimate_driven, estimate_response, plateau_gain
-from models.identification.fitting import refit_response
+from models.identification.modal_fit import refit
 from models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -28,6 +28,7 @@ from models.identification.readers import (
 )
 from models.identification.sets import delay_warning, response_set, spectrum_set, typed_in_set
 from models.identification.spectrum_fit import refit_spectrum
+from models.identification.trust import check_axes, check_told, keeps_time
 from models.identification.types import (
     AccelerationLog,
     AxisIdentification,
@@ -66,11 +67,6 @@ _USELESS, _USELESS_DB = 0.5, 6.0
 """Residuals beyond which a fit is no model of what was measured."""
 _AHEAD_S = 1e-3
 _LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
-_LEAST_SHARE, _MOST_UNSURE = 0.1, 0.05
-_MEASURE = (
-    "Measure the whole band: Klipper's TEST_RESONANCES with OUTPUT=raw_data, or a swept sine from 5 "
-    "to 130 Hz, with the sensor on what moves"
-)
 _WARNING = "warning: "
 """How readers mark notes that the user must look at."""
 
@@ -121,6 +117,7 @@ def identify(
     }
     if not settings.sensor_turned:
         _check_directions(found)
+    check_axes(list(found.values()))
     steps.say("done", 1.0)
     return _delays_compared(found)
 
@@ -186,9 +183,10 @@ class _AxisWork:
         told, warned = _parted(dict.fromkeys(notes))
         names = list(dict.fromkeys(m.source for m in used))
         fit_warnings = _fit_warnings(found.fit, names) if found.fit else ()
+        warnings = (*fit_warnings, *found.warnings, *warned)
         if found.fit is not None:
-            _check_told(found.fit, found.measured, names)
-        return replace(found, notes=told, warnings=(*fit_warnings, *found.warnings, *warned))
+            check_told(found.fit, found.measured, names, warnings)
+        return replace(found, notes=told, warnings=warnings)
 
     def _from_model(self) -> AxisIdentification:
         if len(self._used) > 1:
@@ -218,9 +216,7 @@ class _AxisWork:
         nominal = found.fit
         assert nominal is not None
         fits = {
-            condition: refit_response(
-                mean_response([r for r, c in responses if c == condition]), nominal
-            )
+            condition: refit(mean_response([r for r, c in responses if c == condition]), nominal)
             for condition in special([c for _, c in responses])
         }
         others = tuple(r for r, c in responses if c not in common)
@@ -378,51 +374,6 @@ def _fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
     return ()
 
 
-def _check_told(
-    fit: Fit, measured: Sequence[FrequencyResponse | Spectrum], sources: Sequence[str]
-) -> None:
-    """Refuse a model that the measurement does not tell.
-
-    Raises
-    ------
-    ModelError
-        If hardly any frequency is coherent, or the resonance that rings most lies outside of what
-        was measured or might be anywhere.
-    """
-    names = ", ".join(sources)
-    low, high = fit.band_hz
-    for one in measured:
-        if not isinstance(one, FrequencyResponse) or not np.isfinite(one.coherence).any():
-            continue
-        within = (one.f_hz >= low) & (one.f_hz <= high)
-        coherent = np.count_nonzero(one.coherence[within] >= _LEAST_COHERENCE)
-        if coherent < _LEAST_SHARE * np.count_nonzero(within):
-            raise ModelError(
-                f"{names}: the measurement follows the command at {coherent} of "
-                f"{np.count_nonzero(within)} frequencies between {low:.1f} and {high:.1f} Hz "
-                f"(coherence {_LEAST_COHERENCE:g}; {_LEAST_SHARE:.0%} of them are needed), so no "
-                f"model follows from it. {_MEASURE}"
-            )
-    if not fit.modes:
-        return
-    # Of a spectrum, what lies beyond the band only shapes its flank.
-    seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
-    main = max(seen or fit.modes, key=lambda m: m.peak)
-    if not low <= main.f_hz <= high:
-        raise ModelError(
-            f"{names}: the resonance that rings most would be at {main.f_hz:.1f} Hz, outside the "
-            f"measured {low:.1f} to {high:.1f} Hz: nobody saw it. {_MEASURE}"
-        )
-    # Modes of a spectrum trade places with each other; its set knows how far it can be trusted.
-    unsure = np.isfinite(main.f_sd_hz) and main.f_sd_hz > _MOST_UNSURE * main.f_hz
-    if unsure and not fit.magnitude_only:
-        raise ModelError(
-            f"{names}: the resonance that rings most is at {main.f_hz:.1f} Hz, give or take "
-            f"{2 * main.f_sd_hz:.1f} Hz; within {2 * _MOST_UNSURE:.0%} it must be known to "
-            f"compensate it. {_MEASURE}"
-        )
-
-
 def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
     """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
     names = ", ".join(r.source for r in responses if plateau_gain(r) is None)
@@ -492,13 +443,8 @@ def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:
 
 def _delays_compared(found: dict[Axis, AxisIdentification]) -> dict[Axis, AxisIdentification]:
     """Warn about delays that differ, where they are known: a log does not say when it began."""
-    fits = [one.fit for _, one in sorted(found.items()) if _keeps_time(one) and one.fit]
+    fits = [one.fit for _, one in sorted(found.items()) if keeps_time(one) and one.fit]
     warning = delay_warning(fits[0], fits[1]) if len(fits) == 2 else None
     if warning is None:
         return found
     return {a: replace(one, warnings=(*one.warnings, warning)) for a, one in found.items()}
-
-
-def _keeps_time(found: AxisIdentification) -> bool:
-    about = found.plants.provenance
-    return about is not None and about.kind in ("frequency response", "recorded drive")

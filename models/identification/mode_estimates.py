@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from models.identification.pair_structure import PairStructure
 from models.identification.types import ModeEstimate
 
-__all__ = ["band_warnings", "filler_poles", "mode_estimates", "robust_covariance"]
+__all__ = [
+    "band_warnings",
+    "correlation_factor",
+    "filler_poles",
+    "mode_estimates",
+    "robust_covariance",
+    "with_floor",
+]
 
 Array = NDArray[np.float64]
 
@@ -43,7 +52,7 @@ def robust_covariance(gradient: NDArray[np.inexact], residual: NDArray[np.inexac
     unit = gradient / length
     bread = np.linalg.pinv(np.real(unit.conj().T @ unit), rcond=1e-12, hermitian=True)
     scores = np.real(unit.conj() * residual[:, None])
-    meat = scores.T @ scores * (numbers / max(numbers - p, 1)) * _correlation_factor(residual)
+    meat = scores.T @ scores * (numbers / max(numbers - p, 1)) * correlation_factor(residual)
     return np.asarray(bread @ meat @ bread / np.outer(length, length), np.float64)
 
 
@@ -63,14 +72,31 @@ def mode_estimates(
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))[1 : 1 + 2 * n]
     peak = np.abs(structure.response(theta, f))
     return tuple(
-        ModeEstimate(
-            f_hz=float(f[i]),
-            zeta=float(zeta[i]),
-            f_sd_hz=float(f[i] * np.hypot(sd[i], _SYSTEMATIC[0])),
-            zeta_sd=float(zeta[i] * np.hypot(sd[n + i], _SYSTEMATIC[1])),
-            peak=float(peak[i]),
+        with_floor(
+            ModeEstimate(
+                f_hz=float(f[i]),
+                zeta=float(zeta[i]),
+                f_sd_hz=float(f[i] * sd[i]),
+                zeta_sd=float(zeta[i] * sd[n + i]),
+                peak=float(peak[i]),
+            )
         )
         for i in np.argsort(f)
+    )
+
+
+def with_floor(mode: ModeEstimate, floor: tuple[float, float] = _SYSTEMATIC) -> ModeEstimate:
+    """Return the mode with relative deviations of frequency and damping not below a floor.
+
+    Parameters
+    ----------
+    floor : (float, float), optional
+        What estimated responses leave, if not given.
+    """
+    return replace(
+        mode,
+        f_sd_hz=float(np.hypot(mode.f_sd_hz, mode.f_hz * floor[0])),
+        zeta_sd=float(np.hypot(mode.zeta_sd, mode.zeta * floor[1])),
     )
 
 
@@ -111,7 +137,7 @@ def band_warnings(modes: tuple[ModeEstimate, ...], band_hz: tuple[float, float])
     return tuple(out)
 
 
-def _correlation_factor(residual: NDArray[np.inexact]) -> float:
+def correlation_factor(residual: NDArray[np.inexact]) -> float:
     """Return 1 + 2 sum rho_k over the first lags whose correlation is clear."""
     m = len(residual)
     power = float(np.real(np.vdot(residual, residual)))

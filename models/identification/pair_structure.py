@@ -124,7 +124,6 @@ class PairStructure:
         zeta: tuple[Array, float],
         *,
         zeros_hz: tuple[float, float] | None = None,
-        minimum_phase: bool = False,
     ) -> tuple[Array, Array]:
         """Return lowest and highest parameters for pairs within `f_hz` and damping `zeta`.
 
@@ -138,10 +137,7 @@ class PairStructure:
         tau, zz = self.unit_hz / f_hz[0], 1.5
         low = [[-tau], np.full(n, log_f[0]), np.log(zeta[0]), np.full(m, log_fz[0])]
         high = [[tau], np.full(n, log_f[1]), np.full(n, np.log(zeta[1])), np.full(m, log_fz[1])]
-        if minimum_phase:
-            low[0] = [0.0]
-        least = 1e-3 if minimum_phase else -zz
-        return np.concatenate([*low, np.full(m, least)]), np.concatenate([*high, np.full(m, zz)])
+        return np.concatenate([*low, np.full(m, -zz)]), np.concatenate([*high, np.full(m, zz)])
 
     def least_damping(self, theta: Array, least: float, top_hz: float) -> Array:
         """Return the least damping of every pole pair: `least`, but 0.03 above `top_hz`.

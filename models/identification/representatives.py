@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.identification.types import ModeEstimate
-from models.plants import RelativeModesSpec, frequency_response
+from models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["Population", "representatives"]
+__all__ = ["Population", "mode_spread", "representatives"]
 
 Array = NDArray[np.float64]
-Plants: TypeAlias = Sequence[RelativeModesSpec]
+P = TypeVar("P", bound=PlantSpec)
 
 MEMBERS = 16
 _F_HZ: Array = np.linspace(1.0, 150.0, 300)
@@ -29,49 +29,25 @@ _DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Population:
+@dataclass(frozen=True, slots=True)
+class Population(Generic[P]):
     """Members that stand for a crowd of plants.
 
     Attributes
     ----------
-    members : tuple of RelativeModesSpec
+    members : tuple of PlantSpec
         The one in the middle first.
     weights : tuple of float
         Share of the crowd that each stands for; they add up to 1.
     middle : int
         Number of the first member among the candidates for it.
-    crowd : tuple of RelativeModesSpec
+    crowd : tuple of PlantSpec
     """
 
-    members: tuple[RelativeModesSpec, ...]
+    members: tuple[P, ...]
     weights: tuple[float, ...]
     middle: int
-    crowd: tuple[RelativeModesSpec, ...]
-
-    def mode_estimates(self) -> tuple[ModeEstimate, ...]:
-        """Return the modes of the first member, with their scatter over the crowd.
-
-        The counterpart of a mode is the nearest in frequency that moves about as much.
-        """
-        first = self.members[0]
-        out = []
-        for mode in first.modes:
-            near = [
-                min(other.modes, key=lambda m: abs(np.log(m.f_hz / mode.f_hz)))
-                for other in self.crowd
-            ]
-            f, zeta = (np.array([getattr(m, name) for m in near]) for name in ("f_hz", "zeta"))
-            out.append(
-                ModeEstimate(
-                    f_hz=mode.f_hz,
-                    zeta=mode.zeta,
-                    f_sd_hz=_DEVIATION * float(np.median(np.abs(f - mode.f_hz))),
-                    zeta_sd=_DEVIATION * float(np.median(np.abs(zeta - mode.zeta))),
-                    peak=float(abs(frequency_response(first, mode.f_hz)[0])),
-                )
-            )
-        return tuple(out)
+    crowd: tuple[P, ...]
 
     def agree_below_hz(self) -> float:
         """Return the frequency above which members do not agree on what arrives."""
@@ -80,16 +56,42 @@ class Population:
         return float(_F_HZ[np.argmax(apart)]) if apart.any() else float(_F_HZ[-1])
 
 
-def representatives(centres: Plants, crowd: Plants, count: int = MEMBERS) -> Population:
+def mode_spread(population: Population[RelativeModesSpec]) -> tuple[ModeEstimate, ...]:
+    """Return the modes of the first member, with their scatter over the crowd.
+
+    The counterpart of a mode is the nearest in frequency.
+    """
+    first, out = population.members[0], []
+    for mode in first.modes:
+        near = [
+            min(other.modes, key=lambda m: abs(np.log(m.f_hz / mode.f_hz)))
+            for other in population.crowd
+        ]
+        f, zeta = (np.array([getattr(m, name) for m in near]) for name in ("f_hz", "zeta"))
+        out.append(
+            ModeEstimate(
+                f_hz=mode.f_hz,
+                zeta=mode.zeta,
+                f_sd_hz=_DEVIATION * float(np.median(np.abs(f - mode.f_hz))),
+                zeta_sd=_DEVIATION * float(np.median(np.abs(zeta - mode.zeta))),
+                peak=float(abs(frequency_response(first, mode.f_hz)[0])),
+            )
+        )
+    return tuple(out)
+
+
+def representatives(
+    centres: Sequence[P], crowd: Sequence[P], count: int = MEMBERS
+) -> Population[P]:
     """Choose members: one in the middle, then, again and again, the one least like those chosen.
 
     Plants differ by the rms of what they make of a path with corners.
 
     Parameters
     ----------
-    centres : sequence of RelativeModesSpec
+    centres : sequence of PlantSpec
         Candidates for the middle: the one nearest to all of the crowd is taken.
-    crowd : sequence of RelativeModesSpec
+    crowd : sequence of PlantSpec
     count : int
         Most members.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,12 +12,12 @@ from models.errors import ModelError
 from models.identification.averaging import low_frequency_delay
 from models.identification.types import FrequencyResponse
 
-__all__ = ["ResponseData", "response_data"]
+__all__ = ["LEAST_COHERENCE", "ResponseData", "coherent", "coherent_part", "response_data"]
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_LEAST_COHERENCE = 0.95
+LEAST_COHERENCE = 0.95
 _RELATIVE_FLOOR = 0.02
 """Nonlinearity of a real axis: no point counts as better known than this share of the response
 or, where it has fallen below that, of its value at low frequency."""
@@ -81,20 +82,20 @@ def response_data(
     f, h = measured.f_hz, measured.response
     low, high = band_hz or (0.0, np.inf)
     inside = (f > 0) & (f >= low) & (f <= high) & np.isfinite(h) & (np.abs(h) > 0)
-    unclear = inside & ~_coherent(measured.coherence)
+    unclear = inside & ~coherent(measured.coherence)
     use = np.flatnonzero(inside & ~unclear)
     if len(use) < _LEAST_POINTS:
         raise ModelError(
             f"{measured.source or measured.label or 'response'}: {len(use)} of {len(f)} "
             f"frequencies can be fitted, at least {_LEAST_POINTS} are needed "
-            f"({int(unclear.sum())} have a coherence below {_LEAST_COHERENCE}); check that the "
+            f"({int(unclear.sum())} have a coherence below {LEAST_COHERENCE}); check that the "
             "command belongs to this recording, or measure with more acceleration"
         )
     notes = []
     if unclear.any():
         notes.append(
             f"{int(unclear.sum())} of {int(inside.sum())} frequencies left out (coherence below "
-            f"{_LEAST_COHERENCE}), {f[unclear].min():.1f} to {f[unclear].max():.1f} Hz"
+            f"{LEAST_COHERENCE}), {f[unclear].min():.1f} to {f[unclear].max():.1f} Hz"
         )
     use = use[np.argsort(f[use])]
     f, h, sd = f[use], h[use], measured.sd[use]
@@ -111,14 +112,31 @@ def response_data(
     return ResponseData(f, h, np.asarray(weight, np.float64), share, delay, tuple(notes))
 
 
-def _coherent(coherence: Array) -> NDArray[np.bool_]:
+def coherent(coherence: Array) -> NDArray[np.bool_]:
     """Return which points are coherent, or not known not to be; short runs of them are not."""
-    coherent = ~(coherence < _LEAST_COHERENCE)
+    coherent = ~(coherence < LEAST_COHERENCE)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], coherent, [False]]).astype(int)))
     for first, end in ends.reshape(-1, 2):
         if end - first < _LEAST_RUN * len(coherence):
             coherent[first:end] = False
     return np.asarray(coherent, np.bool_)
+
+
+def coherent_part(
+    measured: Sequence[FrequencyResponse],
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Return the share of frequencies that are coherent, and from where to where they are.
+
+    The least share of those whose coherence is known, and the band that all of them have.
+    """
+    known = [one for one in measured if np.isfinite(one.coherence).any()]
+    if not known:
+        return None, None
+    clear = [coherent(one.coherence) for one in known]
+    share = min(float(np.mean(one)) for one in clear)
+    ends = [one.f_hz[c] for one, c in zip(known, clear, strict=True) if c.any()]
+    low, high = (max((e.min() for e in ends), default=0), min((e.max() for e in ends), default=0))
+    return share, (float(low), float(high)) if high > low else None
 
 
 def _roughness(h: ComplexArray) -> float:

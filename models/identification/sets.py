@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 from models.errors import ModelError
 from models.identification.averaging import mean_response
-from models.identification.fitting import fit_response, refit_response
+from models.identification.modal_fit import fit_modes, refit
+from models.identification.prompt import delay_of, prompt
+from models.identification.response_bootstrap import explain_response
+from models.identification.response_data import coherent_part
 from models.identification.spectrum_fit import explain_spectra
 from models.identification.types import (
     AxisIdentification,
@@ -24,7 +27,6 @@ from models.identification.types import (
     Spectrum,
 )
 from models.plants import (
-    PairsSpec,
     ParametricMembers,
     PlantSetSpec,
     PlantSpec,
@@ -39,7 +41,6 @@ __all__ = [
     "delay_warning",
     "parametric_members",
     "plant_set_from",
-    "prompt",
     "provenance_of",
     "response_set",
     "spectrum_set",
@@ -86,9 +87,10 @@ def response_set(
 ) -> AxisIdentification:
     """Identify an axis from one or more responses: repeats, amplitudes, positions, heights.
 
-    Nominal is the fit to their mean (weighted by 1/sd^2, delays aligned); members are fits of
-    the same structure. Responses with the same label are repeats: they count as one member and
-    show the scatter inside which others are dropped.
+    Nominal is the fit to their mean (weighted by 1/sd^2, delays aligned). Members are fits of the
+    same structure, one for each label that differs from the others: responses with the same label
+    are repeats, which show the scatter inside which others are dropped. Where nothing differs
+    beyond it, members are what else explains the responses (`response_bootstrap`).
 
     Raises
     ------
@@ -101,17 +103,30 @@ def response_set(
     means = [mean_response(group) for group in groups]
     if len(means) > 1:
         # The mean of shifted peaks has humps that no machine has: they must not add modes.
-        max_order = fit_response(means[0], max_order=max_order, band_hz=band_hz).order
-    fit = fit_response(measured, max_order=max_order, band_hz=band_hz, progress=progress)
-    fits = [refit_response(m, fit, band_hz=band_hz) for m in means] if len(means) > 1 else []
+        max_order = fit_modes(means[0], max_order=max_order, band_hz=band_hz).order
+    fitted, drawn = _parts(progress)
+    fit = fit_modes(measured, max_order=max_order, band_hz=band_hz, progress=fitted)
+    fits = [refit(m, fit, band_hz=band_hz) for m in means] if len(means) > 1 else []
     scatter = _noise_scatter(measured, fit)
     for group, of_mean in zip(groups, fits, strict=False):
         # Judged about their own mean, whose peaks are as rounded as the nominal plant's.
         for repeat in group if len(group) > 1 else ():
-            around = _distance(refit_response(repeat, fit, band_hz=band_hz), of_mean)
+            around = _distance(refit(repeat, fit, band_hz=band_hz), of_mean)
             scatter = np.maximum(scatter, _FEW_REPEATS * around)
     kept = _outside_scatter(fits, fit, scatter)
-    plants = plant_set_from(fit, kept, kind=kind, sources=sources, measured_on=measured_on)
+    if kept:
+        plants = plant_set_from(fit, kept, kind=kind, sources=sources, measured_on=measured_on)
+    else:
+        population, delays_s = explain_response(measured, fit, progress=drawn)
+        about = provenance_of(
+            fit, kind, measured, delays_s=delays_s, sources=sources, measured_on=measured_on
+        )
+        plants = PlantSetSpec(
+            nominal=prompt(fit),
+            members=_weighted(population.members, population.weights),
+            band_hz=fit.band_hz,
+            provenance=about,
+        )
     return AxisIdentification(
         axis=axis,
         plants=plants,
@@ -166,27 +181,28 @@ def spectrum_set(
         progress=progress,
     )
     fit, population = found.fit, found.population
-    low, high = fit.band_hz
+    members = _with_delays(population.members)
     plants = PlantSetSpec(
         nominal=fit.spec,
-        members=tuple(
-            WeightedMember(plant=plant, weight=weight)
-            for plant, weight in zip(
-                _with_delays(population.members), population.weights, strict=True
-            )
+        members=_weighted(members, population.weights),
+        band_hz=fit.band_hz,
+        provenance=provenance_of(
+            fit,
+            "spectrum",
+            delays_s=_span([plant.delay_s for plant in members]),
+            sources=sources,
+            measured_on=measured_on,
         ),
-        band_hz=(low, high),
-        provenance=provenance_of(fit, "spectrum", sources=sources, measured_on=measured_on),
     )
     return AxisIdentification(
         axis=axis, plants=plants, fit=fit, measured=tuple(spectra), warnings=fit.notes
     )
 
 
-def _with_delays(members: Sequence[RelativeModesSpec]) -> list[PlantSpec]:
+def _with_delays(members: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
     """Let guides damp every second member: nobody measured what of the damping is theirs."""
     shares = np.linspace(0.0, _MOST_GROUNDED, max(len(members) // 2, 1))
-    out: list[PlantSpec] = []
+    out: list[RelativeModesSpec] = []
     for k, plant in enumerate(members):
         grounded = float(shares[k // 2]) if k % 2 else 0.0
         modes = tuple(m.model_copy(update={"grounded": grounded}) for m in plant.modes)
@@ -210,18 +226,15 @@ def plant_set_from(
     if members:
         plants = [prompt(fit), *map(prompt, members)]
         listed = tuple(WeightedMember(plant=p) for p in plants)
-    low, high = fit.band_hz
+    delays_s = _span([delay_of(one.spec) for one in (fit, *members)])
     return PlantSetSpec(
         nominal=prompt(fit),
         members=listed,
-        band_hz=(low, high),
-        provenance=provenance_of(fit, kind, sources=sources, measured_on=measured_on),
+        band_hz=fit.band_hz,
+        provenance=provenance_of(
+            fit, kind, delays_s=delays_s, sources=sources, measured_on=measured_on
+        ),
     )
-
-
-def prompt(fit: Fit) -> PlantSpec:
-    """Return the plant of a fit, its slow motion without delay: a recording has no common clock."""
-    return fit.spec.without_delay() if isinstance(fit.spec, PairsSpec) else fit.spec
 
 
 def typed_in_set(spec: PlantSpec, *, kind: Kind = "typed in") -> PlantSetSpec:
@@ -240,11 +253,22 @@ def parametric_members(kind: Kind) -> ParametricMembers:
 def provenance_of(
     fit: Fit,
     kind: Kind,
+    measured: Sequence[FrequencyResponse] = (),
     *,
+    delays_s: tuple[float, float] | None = None,
     sources: Sequence[SourceFile] = (),
     measured_on: date | None = None,
 ) -> Provenance:
-    """Return what a store keeps of how a plant was found."""
+    """Return what a store keeps of how a plant was found.
+
+    Parameters
+    ----------
+    measured : sequence of FrequencyResponse
+        Whose coherence is told, if it is known.
+    delays_s : (float, float), optional
+        What the plants that explain the measurement delay slow motion by.
+    """
+    share, band_hz = coherent_part(measured)
     return Provenance(
         kind=kind,
         measured_on=measured_on,
@@ -262,6 +286,10 @@ def provenance_of(
             for m in fit.modes
         ),
         trust_below_hz=fit.trust_below_hz,
+        phase="not measured" if fit.magnitude_only else "aligned at low frequency",
+        slow_delay_s=delays_s,
+        coherent_share=share,
+        coherent_band_hz=band_hz,
     )
 
 
@@ -287,6 +315,24 @@ def _by_label(measured: Sequence[FrequencyResponse]) -> list[list[FrequencyRespo
     return list(groups.values())
 
 
+def _parts(
+    progress: Callable[[float], None] | None,
+) -> tuple[Callable[[float], None] | None, Callable[[float], None] | None]:
+    """Part progress between a fit and the draws behind it."""
+    if progress is None:
+        return None, None
+    return lambda part: progress(0.5 * part), lambda part: progress(0.5 + 0.5 * part)
+
+
+def _weighted(plants: Sequence[PlantSpec], weights: Sequence[float]) -> tuple[WeightedMember, ...]:
+    pairs = zip(plants, weights, strict=True)
+    return tuple(WeightedMember(plant=plant, weight=weight) for plant, weight in pairs)
+
+
+def _span(values: Sequence[float]) -> tuple[float, float]:
+    return float(min(values)), float(max(values))
+
+
 def _grid(fit: Fit) -> Array:
     return np.linspace(*fit.band_hz, _POINTS)
 
@@ -294,7 +340,7 @@ def _grid(fit: Fit) -> Array:
 def _distance(member: Fit, nominal: Fit) -> Array:
     """Return |G_j/G_0 - 1| over the band, shape (points,)."""
     f = _grid(nominal)
-    ratio = frequency_response(member.spec, f) / frequency_response(nominal.spec, f)
+    ratio = frequency_response(prompt(member), f) / frequency_response(prompt(nominal), f)
     return np.asarray(np.abs(ratio - 1), np.float64)
 
 

@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 from models.errors import ModelError
 from models.identification.averaging import mean_spectrum
 from models.identification.modal_structure import ModalStructure
-from models.identification.representatives import Population, representatives
+from models.identification.representatives import Population, mode_spread, representatives
 from models.identification.scatter import SCATTERS, Scatter
 from models.identification.spectrum_model import (
     cross_axis_share,
@@ -87,7 +87,7 @@ class Explained:
     """
 
     fit: Fit
-    population: Population
+    population: Population[RelativeModesSpec]
 
 
 def explain_spectra(
@@ -153,7 +153,7 @@ def explain_spectra(
         gain=gain,
         delay_s=0.0,
         band_hz=search.model.band_hz,
-        modes=population.mode_estimates(),
+        modes=mode_spread(population),
         trials=tuple(OrderTrial(n, db) for n, db in best.items()),
         magnitude_only=True,
         trust_below_hz=min(population.agree_below_hz(), search.model.band_hz[1]),

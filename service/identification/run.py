@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from models.errors import ModelError
+from models.identification.conditioned import followed
 from models.identification.conditions import Condition
 from models.identification.identify import Measured, Progress, identify
 from models.identification.readers import ReadSettings, read_content
@@ -150,6 +151,10 @@ def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) ->
             "are left out: they belong to the former measurement; measure there again (FILE@z=150)"
         )
     schedule = AxisSchedule(mass=mass, grid=grid) if mass or grid else None
+    about = found.plants.provenance
+    if schedule is not None and about is not None:
+        plants, varied = followed(found.plants, about.kind)
+        found, notes = replace(found, plants=plants), [*notes, *varied]
     return replace(found, schedule=schedule, notes=tuple(notes), warnings=tuple(warnings))
 
 

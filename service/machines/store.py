@@ -22,6 +22,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import from_json
 
+from models.confirmation import Confirmation
 from models.errors import ModelError
 from models.machine import Machine
 from models.plants import PlantSetSpec
@@ -181,17 +182,25 @@ class MachineStore:
 
         Also if somebody else changes the machine meanwhile: the plants go on top of that change.
         """
-        self._existing(name)
         fields = {"author": author, "message": message, "sources": tuple(sources)}
+        return self._update(name, "axes", axes, fields, when)
 
-        def changed(current: Revision | None) -> tuple[Machine, dict[str, Any]]:
-            if current is None:
-                raise _no_machine(name)
-            document = current.machine.model_dump()
-            document["axes"] |= {axis: plants.model_dump() for axis, plants in axes.items()}
-            return Machine.model_validate(document), fields
+    def confirm(
+        self,
+        name: str,
+        confirmations: Mapping[Literal["x", "y"], Confirmation],
+        *,
+        author: str,
+        message: str = "",
+        sources: Sequence[SourceFile] = (),
+        when: datetime | None = None,
+    ) -> Revision:
+        """Remember what a ring test said of axes, on top of whatever else has changed.
 
-        return self._add(name, changed, when=when)
+        If that is a change of the plants, the confirmation names those it was of, and is stale.
+        """
+        fields = {"author": author, "message": message, "sources": tuple(sources)}
+        return self._update(name, "confirmations", confirmations, fields, when)
 
     def roll_back(
         self,
@@ -284,6 +293,26 @@ class MachineStore:
         return self.current(name)
 
     # Private
+
+    def _update(
+        self,
+        name: str,
+        field: str,
+        by_axis: Mapping[Literal["x", "y"], BaseModel],
+        fields: dict[str, Any],
+        when: datetime | None,
+    ) -> Revision:
+        """Replace entries of a field that goes by axis, in the machine as it is."""
+        self._existing(name)
+
+        def changed(current: Revision | None) -> tuple[Machine, dict[str, Any]]:
+            if current is None:
+                raise _no_machine(name)
+            document = current.machine.model_dump()
+            document[field] |= {axis: entry.model_dump() for axis, entry in by_axis.items()}
+            return Machine.model_validate(document), fields
+
+        return self._add(name, changed, when=when)
 
     def _add(
         self,

@@ -29,7 +29,14 @@ from service.pipeline.yardstick import BestShaper
 from simulation.measures import PathDistances
 from simulation.response import response
 
-__all__ = ["Choice", "caution_for", "choose_caution", "design_mode", "measured_set"]
+__all__ = [
+    "Choice",
+    "caution_for",
+    "choose_caution",
+    "design_mode",
+    "measured_set",
+    "prediction_note",
+]
 
 Array = NDArray[np.float64]
 
@@ -78,12 +85,28 @@ def design_mode(machine: Machine, options: Options) -> str:
 
 def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
-) -> Caution | None:
-    """Return what the default takes of the shaper; None where it takes none."""
+) -> tuple[Caution, Choice] | None:
+    """Return what the default takes of the shaper, and why; None where it takes none."""
     vibration = options.method.removesuffix("+ripple")
     if vibration != "fbf" or options.robust != "auto" or design_mode(machine, options) == "off":
         return None
-    return choose_caution(machine, shaper, directory, dt_s, options.basis)[0]
+    return choose_caution(machine, shaper, directory, dt_s, options.basis)
+
+
+def prediction_note(machine: Machine, choice: Choice) -> str:
+    """Say what the figures of a report are, and how far apart the plants behind them lie."""
+    measured = []
+    for axis, plants in sorted(machine.axes.items()):
+        about = plants.provenance
+        day = f" of {about.measured_on}" if about and about.measured_on else ""
+        what = about.kind if about else "plants"
+        measured.append(f"{len(plants.weighted_members())} ({axis.upper()}: {what}{day})")
+    return (
+        f"Figures are predictions of the plants in the middle of {' and '.join(measured)} that "
+        "explain the measurement. On a test motion the contour error of all of them is at most "
+        f"{choice.worst_to_none:.2f} of what it is without compensation, and {choice.mean:.2f} of "
+        f"the shaper's ({choice.worst:.2f} on the worst of them)."
+    )
 
 
 def choose_caution(

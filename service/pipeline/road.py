@@ -30,11 +30,12 @@ from gcode.sampler import sample_phases, sample_until
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import Retiming
 from gcode.types import EventKind, Events, Moves, Phases
+from models.confirmation import confirmation_text
 from models.errors import ModelError
 from models.machine import Machine
 from service.pipeline.budget import SpeedBudget
 from service.pipeline.budget_measure import BudgetMeasurement
-from service.pipeline.caution import caution_for
+from service.pipeline.caution import caution_for, prediction_note
 from service.pipeline.clock import StageClock
 from service.pipeline.compensating import (
     DT_S,
@@ -221,9 +222,13 @@ class _Job:
         self._say("tuning the shaper to compare with", 0.0)
         with self._clock.stage("yardstick"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-            caution = caution_for(
+            chosen = caution_for(
                 machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S
             )
+        caution = chosen[0] if chosen else None
+        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
+        if self._changes:
+            self._standing.append(f"The machine's model: {confirmation_text(machine)}.")
         if tuned_first or caution is not None:
             self._work = PieceCompensator(machine, options, self._shaper, caution)
         dialect = dialect_for(machine, options.dialect)
@@ -590,7 +595,7 @@ class _Job:
         if self._changes:
             warnings += total.left_alone()
             warnings += self._outdone({c.name: c.extruding.contour_rms_um for c in channels})
-        shaper, notes, budget = self._shaper, self._operation.notes(), None
+        shaper, notes, budget = self._shaper, [*self._standing, *self._operation.notes()], None
         if self._budget is not None and self._pairs is not None:
             names, sums = self._reader.feature_names, self._pairs.sums()
             budget = self._budget.figures(sums, names, total.original_s, total.time_s)

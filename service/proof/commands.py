@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from service.commands.arguments import MachineOption, check_output
-from service.machines.commands import open_machines
+from service.commands.arguments import MachineOption, check_folder, check_output
+from service.machines.commands import By, Message, open_machines, who
 
 if TYPE_CHECKING:
+    from service.machines.resolve import Resolver
     from service.proof.program import PrintSettings
+    from service.proof.ring_figures import RingReport
 
 __all__ = ["register"]
 
@@ -39,8 +41,8 @@ EndGcode = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add coupon, tower and verify to a command line."""
-    for command in (coupon, tower, verify):
+    """Add coupon, tower, ring-test and verify to a command line."""
+    for command in (coupon, tower, ring_test, verify):
         app.command()(command)
 
 
@@ -97,34 +99,115 @@ def tower(
     print_tower(made)
 
 
+def ring_test(
+    machine: MachineOption,
+    output: Output,
+    chip: Annotated[
+        str | None,
+        typer.Option(help="Sensor: CHIP of ACCELEROMETER_MEASURE, P of M956. [default: its own]"),
+    ] = None,
+    chip_y: Annotated[
+        str | None, typer.Option("--chip-y", help="The one that moves with Y, if it is another.")
+    ] = None,
+    start_gcode: StartGcode = None,
+) -> None:
+    """Write stops for an accelerometer, half as planned, half compensated. Nothing is printed."""
+    found = open_machines().for_job(machine, files=True)
+
+    from service.console import progress_shown
+    from service.proof.recorders import RingSettings
+    from service.proof.ring_test import write_ring_test
+    from service.proof.tables import print_proof
+
+    settings = RingSettings(chip, chip_y, _text(start_gcode))
+    with progress_shown("stillpath") as progress:
+        made = write_ring_test(found.machine, check_output(output), settings, progress=progress)
+    print_proof(made, found.warnings)
+
+
 def verify(
     printed: Annotated[
         Path,
         typer.Argument(metavar="PRINTED", exists=True, dir_okay=False, help="What was printed."),
     ],
-    log: Annotated[
-        Path,
-        typer.Argument(metavar="LOG", exists=True, dir_okay=False, help="Raw accelerations."),
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...",
+            exists=True,
+            dir_okay=False,
+            help="Raw accelerations; several of a ring test, one of a print.",
+        ),
     ],
     machine: MachineOption,
     report: Annotated[
         Path | None,
-        typer.Option("--report", metavar="DIR", file_okay=False, help="For readback.html, .json."),
+        typer.Option(
+            "--report",
+            metavar="DIR",
+            file_okay=False,
+            help="For readback.html, .json; of a ring test for ring-test.json.",
+        ),
     ] = None,
+    remember: Annotated[
+        bool, typer.Option(help="Let your machine remember what a ring test says of its plants.")
+    ] = True,
+    by: By = None,
+    message: Message = "",
 ) -> None:
-    """Compare a log of a print with what the model says of it."""
-    found = open_machines().to_look_at(machine, files=True).machine
+    """Compare a log of a print, or those of a ring test, with what the model says of it."""
+    check_folder(report)
+    machines = open_machines()
+    found = machines.to_look_at(machine, files=True).machine
+
+    from service.proof.ring_motion import is_ring_test
+
+    if is_ring_test(printed):
+        from service.proof.confirming import verify_ring
+        from service.proof.tables import print_ring
+        from service.reports.pages import write_texts
+
+        told = verify_ring(printed, logs, found)
+        if report is not None:
+            write_texts(report, {"ring-test.json": told.model_dump_json(indent=1)})
+        print_ring(told)
+        if remember:
+            _remember(machines, machine, told, who(by), message)
+        return
 
     from service.console import progress_shown
     from service.proof.page import write_readback
     from service.proof.readback import verify_log
     from service.proof.tables import print_readback
 
+    if len(logs) > 1:
+        raise typer.BadParameter("of a print, one log is compared at a time")
     with progress_shown("stillpath") as progress:
-        made = verify_log(printed, log, found, progress=progress)
+        made = verify_log(printed, logs[0], found, progress=progress)
     if report is not None:
         write_readback(made, report)
     print_readback(made)
+
+
+def _remember(machines: Resolver, name: str, report: RingReport, author: str, message: str) -> None:
+    """Put what was said of the axes into the machine's document."""
+    said = {a.axis: a.confirmation for a in report.axes if a.confirmation is not None}
+    if not said:
+        return
+    if name not in machines.store:
+        typer.echo(
+            "note: not remembered: only a machine of your own is (`stillpath machines import FILE "
+            "--as NAME`)"
+        )
+        return
+    made = machines.store.confirm(
+        name,
+        said,
+        author=author,
+        message=message or f"ring test: {', '.join(f'{a} {c.verdict}' for a, c in said.items())}",
+        sources=tuple(dict.fromkeys(s for c in said.values() for s in c.sources)),
+    )
+    typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
 
 
 def _settings(

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from gcode.firmware.registry import kit
 from models.machine import Machine
@@ -145,8 +146,15 @@ class ProofPrint:
     warnings: list[str]
 
 
+class Written(Protocol):
+    """Whatever has lines."""
+
+    def text(self) -> str:
+        """Return all lines."""
+
+
 def write_proof(
-    program: Program,
+    program: Written,
     machine: Machine,
     target: Path,
     legend: Callable[[dict[str, Ringing], Result], list[str]],

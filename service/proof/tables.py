@@ -9,9 +9,10 @@ from rich.table import Table
 
 from service.proof.figures import ReadbackReport
 from service.proof.halves import ProofPrint
+from service.proof.ring_figures import Half, RingReport
 from service.proof.tower import Tower
 
-__all__ = ["print_proof", "print_readback", "print_tower"]
+__all__ = ["print_proof", "print_readback", "print_ring", "print_tower"]
 
 
 def print_proof(
@@ -93,3 +94,46 @@ def print_readback(report: ReadbackReport, console: Console | None = None) -> No
         )
     for note in report.notes:
         console.print(f"note: {note}", markup=False)
+
+
+def print_ring(report: RingReport, console: Console | None = None) -> None:
+    """Print verdicts and figures of a ring test."""
+    console = console or Console(highlight=False, soft_wrap=True)
+    for axis in report.axes:
+        console.print(axis.text, markup=False)
+    table = Table(
+        "",
+        "stops",
+        "measured, µm",
+        "predicted, µm",
+        "measured, mm/s²",
+        "predicted, mm/s²",
+        box=None,
+        pad_edge=False,
+    )
+    for axis in report.axes:
+        for label, half in (("as planned", axis.as_planned), ("compensated", axis.compensated)):
+            if half is not None:
+                table.add_row(f"{axis.axis.upper()} {label}", *_half(half))
+    if table.row_count:
+        console.print(table)
+    for axis in report.axes:
+        if axis.gain is not None:
+            low, high = axis.band_hz
+            console.print(
+                f"{axis.axis.upper()}: {', '.join(axis.logs)}, {low:.0f} to {high:.0f} Hz, noise "
+                f"{axis.floor_um:.2g} µm taken off, gain of the sensor {axis.gain:.2f}, "
+                f"{100 * (axis.misses or 0.0):.0f} % of the motion in no plant of the set"
+            )
+    for note in report.notes:
+        console.print(f"note: {note}", markup=False)
+
+
+def _half(half: Half) -> tuple[str, ...]:
+    return (
+        str(half.stops),
+        f"{half.measured_um:.2g} ± {half.scatter_um:.1g}",
+        "{:.2g} - {:.2g}".format(*half.predicted_um),
+        f"{half.measured_mm_s2:.0f}",
+        "{:.0f} - {:.0f}".format(*half.predicted_mm_s2),
+    )

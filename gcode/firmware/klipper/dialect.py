@@ -78,7 +78,7 @@ NATIVE: dict[str, Word] = {
         EventKind.HARMLESS,
     ),
     # Come to rest, wait, go on from the same place.
-    **words("M400 M109 M190 M191 TEMPERATURE_WAIT", EventKind.STOP),
+    **words("M400 M109 M190 M191 TEMPERATURE_WAIT ACCELEROMETER_MEASURE", EventKind.STOP),
     # Homing, probing, motors off, transforms, other tools: the place or the state is lost.
     **words(
         "M18 M84 M112 PROBE PROBE_CALIBRATE PROBE_ACCURACY Z_TILT_ADJUST QUAD_GANTRY_LEVEL "

@@ -1,0 +1,255 @@
+"""Modes, whose delay is what guides can make it, from a measured frequency response.
+
+Pairs of poles and zeros (`fitting`) explain any response, but what they delay slow motion by trades
+off with the start of the recording, and nothing keeps it small. Where modes on relative speed
+(`modal_structure`) explain as much, they are taken: of their damping some may act against the
+frame, so that slow motion is late by d/k at most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.errors import ModelError
+from models.identification.averaging import low_frequency_delay, mean_response
+from models.identification.fitting import fit_response, refit_response
+from models.identification.modal_structure import ModalStructure
+from models.identification.mode_estimates import band_warnings, robust_covariance, with_floor
+from models.identification.response_candidate import (
+    Candidate,
+    delay_span,
+    judged,
+    least_error,
+    with_gain,
+)
+from models.identification.response_data import ResponseData, response_data
+from models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
+from models.plants import PairsSpec, RelativeModesSpec, frequency_response
+
+__all__ = ["alternatives", "fit_modes", "refit"]
+
+Array = NDArray[np.float64]
+Modal: TypeAlias = Candidate[ModalStructure]
+
+_AS_GOOD, _EXPLAINED, _IRRELEVANT = 1.05, 1.3, 0.005
+"""A fit is as good as another within 5 % of its residual, within 1.3 times the noise, or within
+half a percent: no axis is more linear than that."""
+_CLEARLY = 0.7
+_ASSUMED = (1e-3, 0.01)
+"""Relative deviation of frequency and damping by what damping is assumed to act on."""
+_POLES_BAND, _ZETA, _SHARE = (1.1, 1.6), (3e-3, 1.0), (-2.0, 2.5)
+_UNSEEN_ZETA = 0.03
+_EARLIER_S, _DELAY_STEP_S = 10e-3, 0.25e-3
+_START_ZETA, _BEYOND = 0.08, 1.3
+_START_POINTS = 160
+
+
+def fit_modes(
+    measured: FrequencyResponse | Sequence[FrequencyResponse],
+    *,
+    max_order: int = 4,
+    band_hz: tuple[float, float] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Fit:
+    """Fit modes to a frequency response, or pairs where modes do not explain it as well.
+
+    Parameters and errors as of `fitting.fit_response`.
+    """
+    single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
+    pairs = fit_response(single, max_order=max_order, band_hz=band_hz, progress=progress)
+    data = response_data(single, band_hz)
+    found = _orders(data, pairs, max_order)
+    if not found:
+        return pairs
+    chosen = found[0]
+    for larger in found[1:]:
+        clearly = larger.nrmse < _CLEARLY * chosen.nrmse
+        if chosen.nrmse > _enough(data, pairs.residual) and clearly:
+            chosen = larger
+    if chosen.nrmse > _enough(data, pairs.residual):
+        return pairs
+    trials = tuple(OrderTrial(c.structure.modes, c.nrmse) for c in found)
+    return replace(_as_fit(data, chosen), trials=trials)
+
+
+def refit(
+    measured: FrequencyResponse, like: Fit, *, band_hz: tuple[float, float] | None = None
+) -> Fit:
+    """Fit a plant of the structure of `like`, starting from it: modes, or pairs.
+
+    Raises
+    ------
+    ModelError
+        If too few points are left to fit.
+    """
+    if isinstance(like.spec, PairsSpec):
+        return refit_response(measured, like, band_hz=band_hz)
+    if not isinstance(like.spec, RelativeModesSpec):
+        raise ModelError("a plant of modes or pairs is needed to start from; fit a response first")
+    data = response_data(measured, band_hz)
+    structure = ModalStructure(len(like.spec.modes), data.unit_hz, grounded=True)
+    theta = structure.parameters_of(like.spec)
+    ratio = data.response / structure.response(theta, data.f_hz)
+    start = with_gain(data, structure, theta, low_frequency_delay(data.f_hz, ratio))
+    fitted = _polished(data, start, _least_damping(data, start))
+    return replace(_as_fit(data, fitted), trials=(OrderTrial(structure.modes, fitted.nrmse),))
+
+
+def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
+    """Return fits with a mode more and a mode less than `fit`, where they explain as much."""
+    if not isinstance(fit.spec, RelativeModesSpec):
+        return ()
+    data = response_data(measured, fit.band_hz)
+    enough = _enough(data, fit.residual)
+    modes = fit.spec.modes
+    starts = [_grown(data, fit.spec, fit.delay_s)]
+    if len(modes) > 1:
+        weakest = min(modes, key=lambda m: abs(m.share) / m.zeta)
+        kept = [m for m in modes if m is not weakest]
+        starts.append(_of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
+    tried = [_calm(data, _polished(data, s)) for s in starts if s is not None]
+    return tuple(_as_fit(data, one) for one in tried if one.nrmse <= enough)
+
+
+def _enough(data: ResponseData, residual: float) -> float:
+    """Return the residual with which a fit explains as much as one with `residual`."""
+    return max(_AS_GOOD * residual, _EXPLAINED * data.noise, _IRRELEVANT)
+
+
+def _orders(data: ResponseData, pairs: Fit, max_order: int) -> list[Modal]:
+    """Return the best fit of each number of modes, until one explains enough."""
+    some = data.thinned(_START_POINTS)
+    found: list[Modal] = []
+    for order in range(1, max(1, min(max_order, len(data.f_hz) // 6)) + 1):
+        starts = [s for s in _starts(some, pairs, order, found) if s is not None]
+        tried = [_polished(some, start) for start in starts]
+        if not tried:
+            continue
+        best = _polished(data, min(tried, key=lambda c: c.cost))
+        found.append(_calm(data, best))
+        if found[-1].nrmse < _EXPLAINED * data.noise:
+            break
+    return found
+
+
+def _starts(
+    data: ResponseData, pairs: Fit, order: int, found: Sequence[Modal]
+) -> Iterator[Modal | None]:
+    """Yield starts: the modes of the pairs, and those of one order less with one more."""
+    highest = sorted(pairs.modes, key=lambda m: -m.peak)[:order]
+    if len(highest) == order:
+        yield _of_poles(data, [(m.f_hz, m.zeta) for m in highest])
+    if order == 1:
+        peak = float(data.f_hz[np.argmax(np.abs(data.response))])
+        yield _of_poles(data, [(peak, _START_ZETA)])
+    elif found:
+        smaller = found[-1]
+        plant = smaller.structure.spec(smaller.theta)
+        yield _grown(data, plant, smaller.delay_s)
+        poles = [(m.f_hz, m.zeta) for m in plant.modes]
+        yield _of_poles(data, [*poles, (_BEYOND * float(data.f_hz[-1]), _START_ZETA)])
+
+
+def _grown(data: ResponseData, plant: RelativeModesSpec, delay_s: float) -> Modal | None:
+    """Return a start with one more mode, where the plant misses most."""
+    seen = frequency_response(plant, data.f_hz) * np.exp(-2j * np.pi * data.f_hz * delay_s)
+    gain = np.vdot(seen, data.response).real / np.vdot(seen, seen).real
+    error = np.abs(data.weight * (gain * seen - data.response))
+    at = float(data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))])
+    return _of_poles(data, [*((m.f_hz, m.zeta) for m in plant.modes), (at, _START_ZETA)])
+
+
+def _of_poles(data: ResponseData, poles: Sequence[tuple[float, float]]) -> Modal | None:
+    """Return the best shares, gain and delay for given modes; they are linear but for the delay."""
+    structure = ModalStructure(len(poles), data.unit_hz, grounded=True)
+    f_hz, zeta = np.array(poles).T
+    zeta = np.clip(zeta, *_ZETA)
+    s = 1j * data.f_hz[:, None] / f_hz
+    best: tuple[float, Array, float, float] | None = None
+    span_s = abs(data.delay_s) + _EARLIER_S
+    for grounded in (0.0, 1.0):
+        modes = (1 + 2 * zeta * (1 - grounded) * s) / (1 + 2 * zeta * s + s * s)
+        for delay_s in np.arange(-span_s, span_s, _DELAY_STEP_S):
+            turned = np.exp(-2j * np.pi * data.f_hz * delay_s)
+            columns = (data.weight * turned)[:, None] * modes
+            target = data.weight * data.response
+            normal = (columns.conj().T @ columns).real + 1e-9 * np.eye(len(poles))
+            share = np.linalg.solve(normal, (columns.conj().T @ target).real)
+            error = float(np.linalg.norm(columns @ share - target))
+            if share.sum() > 0 and (best is None or error < best[0]):
+                best = error, share / share.sum(), grounded, float(delay_s)
+    if best is None:
+        return None
+    _, share, grounded, delay_s = best
+    share = np.clip(share, *_SHARE)
+    # Inside its bounds, so that it can move.
+    theta = structure.parameters(f_hz, zeta, share, 0.05 + 0.9 * grounded)
+    return with_gain(data, structure, theta, delay_s)
+
+
+def _polished(data: ResponseData, start: Modal, least_zeta: Array | None = None) -> Modal:
+    """Minimise the weighted error."""
+    n = start.structure.modes
+    band_hz = (_POLES_BAND[0] * float(data.f_hz[0]), _POLES_BAND[1] * float(data.f_hz[-1]))
+    low, high = start.structure.bounds(band_hz, _ZETA, _SHARE)
+    if least_zeta is not None:
+        low[n : 2 * n] = np.log(least_zeta)
+    return least_error(data, start, low, high, delay_span(data, _EARLIER_S))
+
+
+def _least_damping(data: ResponseData, fit: Modal) -> Array:
+    """Return the least damping of every mode, as it is where that is less and was chosen."""
+    zeta = fit.structure.split(fit.theta)[1]
+    return np.asarray(np.minimum(_calm_damping(data, fit), zeta), np.float64)
+
+
+def _calm_damping(data: ResponseData, fit: Modal) -> Array:
+    """Of a mode that was not swept over only the flank shows: it must not ring by chance."""
+    beyond = fit.structure.split(fit.theta)[0] * data.unit_hz > data.f_hz[-1]
+    return np.where(beyond, _UNSEEN_ZETA, _ZETA[0])
+
+
+def _calm(data: ResponseData, fit: Modal) -> Modal:
+    """Refit if a mode above the band rings, unless its flank shows clearly that it does."""
+    least = _calm_damping(data, fit)
+    if np.all(fit.structure.split(fit.theta)[1] >= least):
+        return fit
+    calm = _polished(data, fit, least)
+    return fit if calm.nrmse > _EXPLAINED * max(fit.nrmse, data.noise) else calm
+
+
+def _as_fit(data: ResponseData, found: Modal) -> Fit:
+    found = judged(data, found)
+    gradient = data.weight[:, None] * found.gradient(data.f_hz)
+    residual = data.weight * (found.model(data.f_hz) - data.response)
+    n, theta = found.structure.modes, found.theta
+    sd = np.sqrt(np.maximum(np.diag(robust_covariance(gradient, residual)), 0.0))[2 : 2 + 2 * n]
+    f, zeta, _ = found.structure.split(theta)
+    peak = np.abs(found.structure.response(theta, f * data.unit_hz))
+    modes = tuple(
+        with_floor(
+            ModeEstimate(
+                f_hz=float(f[i] * data.unit_hz),
+                zeta=float(zeta[i]),
+                f_sd_hz=float(f[i] * data.unit_hz * sd[i]),
+                zeta_sd=float(zeta[i] * sd[n + i]),
+                peak=float(peak[i]),
+            ),
+            _ASSUMED,
+        )
+        for i in np.argsort(f)
+    )
+    return Fit(
+        spec=found.structure.spec(theta),
+        residual=found.nrmse,
+        gain=float(np.exp(found.vector[0])),
+        delay_s=found.delay_s,
+        band_hz=data.band_hz,
+        modes=modes,
+        notes=(*data.notes, *band_warnings(modes, data.band_hz)),
+    )

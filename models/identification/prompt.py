@@ -1,0 +1,60 @@
+"""Plants whose slow motion is not late: what a recording without a common clock can say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.identification.sanathanan_koerner import pairs_of
+from models.identification.types import Fit
+from models.plants import PairsSpec, PlantSpec, PolePair, RelativeModesSpec, ZeroPair
+
+__all__ = ["advanced", "delay_of", "prompt"]
+
+_MOST_ZETA = 10.0
+"""Of a pair of real zeros: beyond, one of them lies decades away."""
+
+
+def prompt(fit: Fit) -> PlantSpec:
+    """Return the plant of a fit, advanced by what it delays slow motion by.
+
+    A recording does not tell when it began: of the delay at low frequency, what is the plant's and
+    what the clock's is only a guess of the fit. Phases of resonances relative to slow motion are
+    what was measured, and stay. Where the phase was not measured, as it is.
+    """
+    return fit.spec if fit.magnitude_only else advanced(fit.spec)
+
+
+def advanced(plant: PlantSpec) -> PlantSpec:
+    """Return the plant with slow motion on time, its resonances as late against it as before."""
+    if isinstance(plant, RelativeModesSpec) and plant.delay_s != 0.0:
+        plant = _as_pairs(plant) or plant.without_delay()
+    return plant.without_delay() if isinstance(plant, PairsSpec) else plant
+
+
+def delay_of(plant: PlantSpec) -> float:
+    """Return what slow motion is late by [s]: sum of 1/zero minus sum of 1/pole.
+
+    Of a discrete plant 0: it is not known what of it the sampling is.
+    """
+    roots = plant.roots()
+    if roots.dt_s is not None:
+        return 0.0
+    return float(np.real(np.sum(1 / roots.zeros) - np.sum(1 / roots.poles)))
+
+
+def _as_pairs(plant: RelativeModesSpec) -> PairsSpec | None:
+    """Return the same plant by pairs; None if its real zeros are no pair, or one of two scales."""
+    zeros = plant.roots().zeros
+    if np.any(zeros == 0):
+        return None
+    size = float(np.exp(np.mean(np.log(np.abs(zeros))))) if len(zeros) else 1.0
+    pairs, left = pairs_of(np.atleast_1d(np.real(np.poly(zeros / size)))[::-1])
+    if len(left) > 1 or np.any(np.abs(pairs[:, 1]) > _MOST_ZETA):
+        return None
+    return PairsSpec(
+        poles=tuple(PolePair(f_hz=m.f_hz, zeta=m.zeta) for m in plant.modes),
+        zeros=tuple(
+            ZeroPair(f_hz=float(w * size / (2 * np.pi)), zeta=float(zeta)) for w, zeta in pairs
+        ),
+        real_zero_tau_s=float(left[0] / size) if len(left) else 0.0,
+    )

@@ -1,0 +1,126 @@
+"""What a measurement does not tell: models that are refused, and what to measure instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from models.errors import ModelError
+from models.identification.response_data import LEAST_COHERENCE, coherent
+from models.identification.types import AxisIdentification, Fit, FrequencyResponse, Spectrum
+
+__all__ = ["check_axes", "check_told", "keeps_time"]
+
+_LEAST_SHARE, _LEAST_COUNT = 0.1, 30
+_PRINTERS_HZ = 150.0
+"""Where modes of printers are: further up nothing need follow."""
+_MOST_UNSURE = 0.05
+"""Relative standard deviation of the frequency of the mode that rings most."""
+_MOST_LEVEL = 2.0
+_MOST_APART_S = 2e-3
+"""Between the delays of two axes: no drive, belt or sensor makes more than one of them late by so
+much, a wrong clock or noise does."""
+_MEASURE = (
+    "Measure the whole band: Klipper's TEST_RESONANCES with OUTPUT=raw_data, or a swept sine from "
+    "5 to 130 Hz, with the sensor on what moves (the head; the bed of a bed slinger)"
+)
+
+
+def check_told(
+    fit: Fit,
+    measured: Sequence[FrequencyResponse | Spectrum],
+    sources: Sequence[str],
+    warnings: Sequence[str] = (),
+) -> None:
+    """Refuse a model that the measurement does not tell.
+
+    Parameters
+    ----------
+    warnings : sequence of str
+        What else was seen: often the reason.
+
+    Raises
+    ------
+    ModelError
+        If hardly any frequency is coherent, or the mode that rings most lies outside of what was
+        measured or might be anywhere.
+    """
+    names = ", ".join(sources)
+    for one in measured:
+        _check_coherent(one, names)
+    low, high = fit.band_hz
+    # Of a spectrum, what lies beyond the band only shapes its flank.
+    seen = [m for m in fit.modes if low <= m.f_hz <= high] if fit.magnitude_only else []
+    main = max(seen or fit.modes, key=lambda m: m.peak, default=None)
+    if main is None:
+        return
+    if not low <= main.f_hz <= high:
+        raise ModelError(
+            f"{names}: the mode that rings most would be at {main.f_hz:.1f} Hz, outside the "
+            f"measured {low:.1f} to {high:.1f} Hz: nobody saw it. "
+            + "".join(f"And: {warning}. " for warning in warnings)
+            + _MEASURE
+        )
+    # Modes of a spectrum trade places with each other; its set knows how far it can be trusted.
+    unsure = np.isfinite(main.f_sd_hz) and main.f_sd_hz > _MOST_UNSURE * main.f_hz
+    if unsure and not fit.magnitude_only:
+        raise ModelError(
+            f"{names}: the mode that rings most is at {main.f_hz:.1f} Hz, give or take "
+            f"{2 * main.f_sd_hz:.1f} Hz; it must be known within {2 * _MOST_UNSURE:.0%} to be "
+            f"compensated. {_MEASURE}"
+        )
+
+
+def check_axes(found: Sequence[AxisIdentification]) -> None:
+    """Refuse two axes that differ in ways that only noise or a mistake explains.
+
+    Raises
+    ------
+    ModelError
+        If one level is more than twice the other, or delays that are known are 2 ms apart.
+    """
+    fits = [(one.axis.upper(), one.fit) for one in found if one.fit is not None]
+    if len(fits) != 2:
+        return
+    (x, of_x), (y, of_y) = fits
+    both = f"axes {x} and {y}"
+    alike = len({one.plants.provenance.kind for one in found if one.plants.provenance})
+    ratio = max(of_x.gain, of_y.gain) / min(of_x.gain, of_y.gain)
+    if alike == 1 and ratio > _MOST_LEVEL:
+        raise ModelError(
+            f"{both}: slow motion was measured at {of_x.gain:.3g} and {of_y.gain:.3g} times what "
+            f"was commanded, {ratio:.1f} times apart, at most {_MOST_LEVEL:g} is to be expected: "
+            "another axis, a loose sensor, or two units. Measure both again in one session, with "
+            "the sensor on what each of them moves, and give both in one unit"
+        )
+    apart_s = abs(of_x.delay_s - of_y.delay_s)
+    if all(map(keeps_time, found)) and apart_s > _MOST_APART_S:
+        raise ModelError(
+            f"{both}: the delays differ by {apart_s * 1e3:.1f} ms ({of_x.delay_s * 1e3:.2f} and "
+            f"{of_y.delay_s * 1e3:.2f} ms), at most {_MOST_APART_S * 1e3:g} ms is to be expected "
+            "of one machine: clocks that differ, or noise. Measure both axes again in one session"
+        )
+
+
+def keeps_time(found: AxisIdentification) -> bool:
+    """Return whether the measurement of an axis shared a clock with its command."""
+    about = found.plants.provenance
+    return about is not None and about.kind in ("frequency response", "recorded drive")
+
+
+def _check_coherent(one: FrequencyResponse | Spectrum, names: str) -> None:
+    if not isinstance(one, FrequencyResponse) or not np.isfinite(one.coherence).any():
+        return
+    follows = coherent(one.coherence)
+    count = int(np.count_nonzero(follows))
+    top_hz = max(_PRINTERS_HZ, float(one.f_hz[follows].max(initial=0.0)))
+    of = int(np.count_nonzero(one.f_hz <= top_hz))
+    if count >= min(_LEAST_COUNT, of) and count >= _LEAST_SHARE * of:
+        return
+    raise ModelError(
+        f"{names}: the motion follows the command at {count} of {of} frequencies between "
+        f"{one.f_hz.min():.1f} and {min(top_hz, one.f_hz.max()):.1f} Hz (coherence "
+        f"{LEAST_COHERENCE:g} or more, side by side); {_LEAST_COUNT} and {_LEAST_SHARE:.0%} of "
+        f"them are needed, so no model follows from it. {_MEASURE}"
+    )
