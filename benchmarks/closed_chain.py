@@ -315,37 +315,36 @@ def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Er
 def compensated(
     file: Path, own: Motion, machine: Machine, printer: Printer, seconds: float
 ) -> tuple[Errors, tuple[float, float]]:
-    """Errors of the written file on the printer, and the range that its members predict."""
+    """Errors of the written file on the printer, and the range that its report predicts."""
     with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
         target = Path(folder) / "out.gcode"
-        compensate_file(file, target, machine, Options(), cache_dir=Path(folder))
+        result = compensate_file(file, target, machine, Options(), cache_dir=Path(folder))
         written = read_motion(target, machine)
     original = read_motion(file, machine, forced_stops(own, written))
     parts = Aligned(original, written).sections(original, written)
-    return errors_of(parts, printer, seconds), predicted_range(parts, machine, seconds)
+    (after,) = (channel for channel in result.channels if channel.name == "after")
+    low_um, high_um = after.contour_range_um or 2 * (after.extruding.contour_rms_um,)
+    # The report is about the whole file, the printer prints its beginning.
+    part = nominal_um(parts, machine, seconds) / after.extruding.contour_rms_um
+    return errors_of(parts, printer, seconds), (part * low_um, part * high_um)
 
 
-def predicted_range(
-    parts: Sequence[Timed], machine: Machine, seconds: float
-) -> tuple[float, float]:
-    """Least and largest contour rms over the members, in um."""
+def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> float:
+    """Contour rms of the plants in the middle, over as much as the printer prints."""
     step = 4
-    x, y = (plant_set(machine.axes[axis], step * DT_S).members for axis in ("x", "y"))
-    found = []
-    for j in range(max(len(x), len(y))):
-        errors, left = Errors(), round(seconds / DT_S)
-        for part in parts:
-            n = min(part.samples, left)
-            left -= n
-            if n < 2 * round(WINDOW_S / DT_S):
-                continue
-            path, extruding = part.path(0, n)
-            path, extruding = path[:, ::step].copy(), extruding[::step]
-            at = np.flatnonzero(extruding[::10]) * 10
-            answer = response([x[j % len(x)], y[j % len(y)]], part.command(0, n)[:, ::step])
-            errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
-        found.append(errors.rms_um)
-    return min(found), max(found)
+    pair = [plant_set(machine.axes[axis], step * DT_S).nominal for axis in ("x", "y")]
+    errors, left = Errors(), round(seconds / DT_S)
+    for part in parts:
+        n = min(part.samples, left)
+        left -= n
+        if n < 2 * round(WINDOW_S / DT_S):
+            continue
+        path, extruding = part.path(0, n)
+        path, extruding = path[:, ::step].copy(), extruding[::step]
+        at = np.flatnonzero(extruding[::10]) * 10
+        answer = response(pair, part.command(0, n)[:, ::step])
+        errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
+    return errors.rms_um
 
 
 def tuned(printer: Printer, base: Machine, sections: Sequence[Timed]) -> list[tuple[str, float]]:

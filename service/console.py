@@ -55,6 +55,11 @@ def print_result(result: Result, console: Console | None = None) -> None:
                     for channel in result.channels
                 ]
                 table.add_row(f"{kind} {measure}, {part}", *cells)
+    if any(c.contour_range_um for c in result.channels):
+        table.add_row(
+            "contour rms, of all plants",
+            *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
+        )
     table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
     console.print(table)
     console.print(f"best shaper for this machine: {result.best_shaper}")

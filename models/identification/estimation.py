@@ -45,7 +45,8 @@ _HALF_BAND_HZ = 1.0
 _STEP_HZ = 0.25
 _TAPER = 0.01
 _PLATEAU_HZ = (8.0, 15.0)
-_PLATEAU_TOLERANCE = 0.15
+_PLATEAU_TOLERANCE = 0.22
+"""Sensors read up to 15 % wrong, and a frame on its feet makes some per cent more of it."""
 _NOT_MOVING = 0.3
 _LEAST_COHERENCE = 0.95
 _LEAST_FOLLOWED = 0.15
@@ -139,7 +140,7 @@ def plateau_gain(response: FrequencyResponse) -> float | None:
 
 
 def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
-    """Raise ModelError if the gain towards 0 Hz is more than 15 % off 1.
+    """Raise ModelError if the gain towards 0 Hz is more than 22 % off 1.
 
     An axis without slip follows slow motion exactly, so any other level means that the command
     was another one than `excitation` says, that the sensor's scale is off, or (below 0.3) that

@@ -208,6 +208,8 @@ class _AxisWork:
             chosen,
             axis=self._axis,
             kind=self._kind,
+            # A schedule counts the modes of the plant as it was fitted.
+            frame_firm=self._settings.frame_firm or bool(special([c for _, c in responses])),
             max_order=self._max_order,
             sources=self._sources,
             measured_on=self._date,

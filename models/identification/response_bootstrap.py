@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.identification.averaging import aligned_to, mean_response, on_grid
+from models.identification.frame import shaken, without_frame
 from models.identification.modal_fit import alternatives, refit
 from models.identification.mode_estimates import correlation_factor
 from models.identification.prompt import advanced, delay_of, prompt
@@ -40,6 +41,7 @@ def explain_response(
     measured: Sequence[FrequencyResponse],
     fit: Fit,
     *,
+    frame_firm: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[Population[PlantSpec], tuple[float, float]]:
     """Return plants that stand for all that explain repeats of one response.
@@ -49,7 +51,10 @@ def explain_response(
     measured : sequence of FrequencyResponse
         Repeats, their delays free.
     fit : Fit
-        To their mean; its plant is the one in the middle.
+        To their mean.
+    frame_firm : bool
+        Whether the frame is known to stand firm; else half of the plants are without what may be
+        its mode.
     progress : callable, optional
         Told the share done, 0 to 1.
 
@@ -75,7 +80,11 @@ def explain_response(
         delays_s.append(delay_of(drawn.spec))
         if progress:
             progress((k + 1) / _DRAWS)
-    population = representatives([prompt(fit)], crowd)
+    centres = [prompt(fit)]
+    if not frame_firm:
+        crowd = shaken(crowd, rng)
+        centres.append(without_frame(centres[0]))
+    population = representatives(centres, crowd)
     return population, (float(min(delays_s)), float(max(delays_s)))
 
 

@@ -79,6 +79,7 @@ def response_set(
     *,
     axis: str,
     kind: Kind = "raw log",
+    frame_firm: bool = False,
     max_order: int = 4,
     band_hz: tuple[float, float] | None = None,
     sources: Sequence[SourceFile] = (),
@@ -91,6 +92,11 @@ def response_set(
     same structure, one for each label that differs from the others: responses with the same label
     are repeats, which show the scatter inside which others are dropped. Where nothing differs
     beyond it, members are what else explains the responses (`response_bootstrap`).
+
+    Parameters
+    ----------
+    frame_firm : bool
+        What the sensor feels is what prints (`ReadSettings.frame_firm`).
 
     Raises
     ------
@@ -117,12 +123,14 @@ def response_set(
     if kept:
         plants = plant_set_from(fit, kept, kind=kind, sources=sources, measured_on=measured_on)
     else:
-        population, delays_s = explain_response(measured, fit, progress=drawn)
+        population, delays_s = explain_response(
+            measured, fit, frame_firm=frame_firm, progress=drawn
+        )
         about = provenance_of(
             fit, kind, measured, delays_s=delays_s, sources=sources, measured_on=measured_on
         )
         plants = PlantSetSpec(
-            nominal=prompt(fit),
+            nominal=population.members[0],
             members=_weighted(population.members, population.weights),
             band_hz=fit.band_hz,
             provenance=about,

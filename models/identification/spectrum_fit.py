@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 
 from models.errors import ModelError
 from models.identification.averaging import mean_spectrum
+from models.identification.frame import shaken, without_frame
 from models.identification.modal_structure import ModalStructure
 from models.identification.representatives import Population, mode_spread, representatives
 from models.identification.scatter import SCATTERS, Scatter
@@ -60,10 +61,6 @@ _BEYOND = 0.6
 """Share of the starts with a mode beyond the band."""
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above so many times the highest bin were not seen, and damping that they may have."""
-_FRAME_HZ, _FRAME_BELOW, _FRAME_SHARE = 30.0, 0.7, 0.25
-"""What may be a frame on its feet: no higher, well below the strongest mode, of no more share."""
-_FRAME_SHAKES = 0.5
-"""How likely such a mode is the frame's: a spectrum of one sensor does not tell."""
 _PEAKS = 4
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
@@ -137,7 +134,7 @@ def explain_spectra(
     centres = [c.structure.spec(c.theta) for c in good]
     crowd = [c.structure.spec(c.theta) for c in (*accepted, *drawn)]
     if not frame_firm:
-        crowd = search.seen_by_reaction(crowd)
+        crowd = search.shaken(crowd)
         centres += [without_frame(plant) for plant in centres]
     population = representatives(centres, crowd)
     chosen = good[population.middle % len(good)]
@@ -160,25 +157,6 @@ def explain_spectra(
         notes=notes,
     )
     return Explained(fit, population)
-
-
-def without_frame(plant: RelativeModesSpec) -> RelativeModesSpec:
-    """Return the plant without weak modes far below its strongest one.
-
-    An accelerometer feels its body against the ground. A frame on its feet that shakes by reaction
-    (mass ratio mu, frequency w) multiplies what the nozzle does over the bed by
-    1 - mu s^2/(s^2 + 2 z w s + w^2): a mode of share mu that nothing on the bed shows.
-    """
-    strongest = max(plant.modes, key=lambda m: abs(m.share) / m.zeta)
-    kept = [
-        m
-        for m in plant.modes
-        if abs(m.share) > _FRAME_SHARE or m.f_hz > min(_FRAME_HZ, _FRAME_BELOW * strongest.f_hz)
-    ]
-    total = sum(m.share for m in kept)
-    return RelativeModesSpec(
-        modes=tuple(m.model_copy(update={"share": m.share / total}) for m in kept)
-    )
 
 
 def fit_spectrum(
@@ -342,11 +320,9 @@ class _Search:
             out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
         return out
 
-    def seen_by_reaction(self, crowd: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
-        """Take the frame out of some plants, as the nozzle over the bed does not feel it."""
-        reacts = self._rng.random(len(crowd)) < _FRAME_SHAKES
-        pairs = zip(crowd, reacts, strict=True)
-        return [without_frame(plant) if shakes else plant for plant, shakes in pairs]
+    def shaken(self, crowd: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
+        """Take the frame out of some plants."""
+        return shaken(crowd, self._rng)
 
     def _rung(self, fit: _Candidate) -> _Candidate:
         """Give modes beyond the band any damping: of them only a flank was seen."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.cautious import Caution
 from gcode.pieces import Piece
 from gcode.quickening import AS_SLICED, TRAVEL, FirstLayer, move_classes, quickened, top_limits
 from gcode.types import Moves
@@ -84,9 +85,19 @@ class SpeedBudget:
 
     @classmethod
     def chosen(
-        cls, found: FileSamples, machine: Machine, options: Options, shaper: BestShaper
+        cls,
+        found: FileSamples,
+        machine: Machine,
+        options: Options,
+        shaper: BestShaper,
+        caution: Caution | None = None,
     ) -> SpeedBudget:
         """Choose the paces of a file.
+
+        Parameters
+        ----------
+        caution : Caution, optional
+            What the command takes of the shaper.
 
         Raises
         ------
@@ -95,7 +106,7 @@ class SpeedBudget:
         """
         assert options.budget_um is not None
         tops = _tops(found.samples, machine)
-        ours = PaceTrials(found.samples, machine, compensated(machine, options, shaper))
+        ours = PaceTrials(found.samples, machine, compensated(machine, options, shaper, caution))
         theirs = PaceTrials(found.samples, machine, shaped(shaper))
         return cls(
             machine,

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,11 @@ from compensation.cautious import Caution
 from compensation.fbf import PreviewFbf
 from compensation.shapers import ShaperCompensator
 from models.machine import Machine
-from models.plants import PlantSetSpec, plant_set
+from models.plants import DiscretePlant, PlantSetSpec, plant_set
 from models.reference_motion import reference_motion
 from service.pipeline.files import replacing
 from service.pipeline.options import Options
+from service.pipeline.result import Channel
 from service.pipeline.yardstick import BestShaper
 from simulation.measures import PathDistances
 from simulation.response import response
@@ -39,8 +41,9 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 3
+_VERSION = 4
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
@@ -63,12 +66,23 @@ class Choice:
         against the shaper's.
     worst_to_none : float
         Largest against no compensation.
+    ranges : dict
+        By channel of a report, least and largest contour error of the members (delays and all)
+        against the nominal plants' with the same command.
     """
 
     shares: tuple[float, float]
     worst: float
     mean: float
     worst_to_none: float
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def ranged(self, channel: Channel) -> Channel:
+        """Return a channel of a report with the range over the members."""
+        if channel.name not in self.ranges:
+            return channel
+        low, high = (channel.extruding.contour_rms_um * s for s in self.ranges[channel.name])
+        return channel.model_copy(update={"contour_range_um": (low, high)})
 
 
 def measured_set(axis: PlantSetSpec) -> bool:
@@ -103,7 +117,8 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
         measured.append(f"{len(plants.weighted_members())} ({axis.upper()}: {what}{day})")
     return (
         f"Figures are predictions of the plants in the middle of {' and '.join(measured)} that "
-        "explain the measurement. On a test motion the contour error of all of them is at most "
+        "explain the measurement. On a test motion, delays of the axes aside, the contour error of "
+        "all of them is at most "
         f"{choice.worst_to_none:.2f} of what it is without compensation, and {choice.mean:.2f} of "
         f"the shaper's ({choice.worst:.2f} on the worst of them)."
     )
@@ -125,7 +140,8 @@ def choose_caution(
     choice: Choice | None = None
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
         found = json.loads(path.read_text(encoding="utf-8"))
-        choice = Choice(**{**found, "shares": tuple(found["shares"])})
+        ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
+        choice = Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
     if choice is None:
         choice = _tried(machine, shaper, dt_s, basis)
         directory.mkdir(parents=True, exist_ok=True)
@@ -181,7 +197,28 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
             if share <= most[i]
         ]
         best = min([best, *others], key=_rank)
-    return best
+    a = np.array(best.shares)[:, None]
+    channels = {
+        "before": path,
+        "after": a * commands[0] + (1 - a) * commands[1],
+        "shaper": commands[1],
+    }
+    return replace(best, ranges=_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+
+
+def _ranges(
+    machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
+) -> dict[str, tuple[float, float]]:
+    """Return least and largest error of the members against the nominal plants', by command."""
+    x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
+    nominal = (x.nominal, y.nominal)
+    pairs = _side_by_side(x.members, y.members)
+    out = {}
+    for name, command in commands.items():
+        usual = max(rms(response(nominal, command)), 1e-12)
+        found = [rms(response(pair, command)) / usual for pair in pairs]
+        out[name] = (min(1.0, *found), max(1.0, *found))
+    return out
 
 
 def _rank(choice: Choice) -> float:
@@ -203,10 +240,13 @@ def _weights(machine: Machine, count: int) -> Array:
     return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
 
 
-def _pairs(machine: Machine, dt_s: float) -> Sequence[tuple]:  # type: ignore[type-arg]
-    """Return members of X and Y side by side; the shorter list again from its start."""
+def _pairs(machine: Machine, dt_s: float) -> list[Pair]:
+    """Return members of X and Y side by side, slow motion on time."""
     # A delay that differs between the axes spoils all commands alike: it tells none from another.
     axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
-    x, y = (plant_set(axis, dt_s).members for axis in axes)
-    count = max(len(x), len(y))
-    return [(x[j % len(x)], y[j % len(y)]) for j in range(count)]
+    return _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
+
+
+def _side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:
+    """Return pairs of members; the shorter list again from its start."""
+    return [(x[j % len(x)], y[j % len(y)]) for j in range(max(len(x), len(y)))]

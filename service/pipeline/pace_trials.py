@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.cautious import Caution
 from compensation.shapers import shape, shaper_pulses
 from gcode.errors import GcodeError
 from gcode.firmware.planning import intended
@@ -125,16 +126,21 @@ class PaceTrials:
 
 
 def compensated(
-    machine: Machine, options: Options, shaper: BestShaper
+    machine: Machine, options: Options, shaper: BestShaper, caution: Caution | None = None
 ) -> Callable[[Sample, Piece], Motion]:
     """Return how samples move as they will be written.
+
+    Parameters
+    ----------
+    caution : Caution, optional
+        What the command takes of the shaper.
 
     Raises
     ------
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
-    work = PieceCompensator(machine, options, shaper)
+    work = PieceCompensator(machine, options, shaper, caution)
     step_mm = kit(machine).step_mm
 
     def motion(sample: Sample, piece: Piece) -> Motion:

@@ -49,6 +49,9 @@ class Channel(_Figures):
     """The same for a person."""
     extruding: ErrorFigures
     """While something is extruded [um]."""
+    contour_range_um: tuple[float, float] | None = None
+    """Least and largest contour error while extruding, root mean square, of all plants that explain
+    the machine's measurement [um]; null for a machine without such a set."""
     all_motion: ErrorFigures
     """Over all motion, travel included [um]."""
     residual_rms_um: float

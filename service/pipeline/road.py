@@ -225,12 +225,13 @@ class _Job:
             chosen = caution_for(
                 machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S
             )
-        caution = chosen[0] if chosen else None
+        self._caution = chosen[0] if chosen else None
+        self._choice = chosen[1] if chosen else None
         self._standing = [prediction_note(machine, chosen[1])] if chosen else []
         if self._changes:
             self._standing.append(f"The machine's model: {confirmation_text(machine)}.")
-        if tuned_first or caution is not None:
-            self._work = PieceCompensator(machine, options, self._shaper, caution)
+        if tuned_first or self._caution is not None:
+            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
         dialect = dialect_for(machine, options.dialect)
         self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)
@@ -316,7 +317,9 @@ class _Job:
                 dialect_for(self._machine, self._options.dialect),
                 lambda read: self._say("choosing speeds", read / size),
             )
-            return SpeedBudget.chosen(found, self._machine, self._options, self._shaper)
+            return SpeedBudget.chosen(
+                found, self._machine, self._options, self._shaper, self._caution
+            )
 
     def _items(self) -> Iterator[Piece | Passage]:
         while True:
@@ -592,6 +595,8 @@ class _Job:
         if self._changes and self._writer.shaper_note is not None:
             warnings.append(self._writer.shaper_note)
         channels = measured.channels()
+        if self._choice is not None:
+            channels = [self._choice.ranged(channel) for channel in channels]
         if self._changes:
             warnings += total.left_alone()
             warnings += self._outdone({c.name: c.extruding.contour_rms_um for c in channels})

@@ -90,7 +90,10 @@ def _headline(channels: Sequence[Channel]) -> dict[str, Any]:
     rms = {channel.name: getattr(channel, scope).contour_rms_um for channel in channels}
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
+    ranges = {channel.name: channel.contour_range_um for channel in channels}
     return {
+        "range": ranges.get("after") if extrudes else None,
+        "shaper_range": ranges.get("shaper") if extrudes else None,
         "of": "while extruding" if extrudes else "of all motion (nothing is extruded)",
         "before": before,
         "after": after,

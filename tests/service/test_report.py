@@ -38,6 +38,7 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
         "report.json",
     ]
     text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
+    text = text.replace('"contour_range_um":"nan"', '"contour_range_um":null')
     read = Result.model_validate(json.loads(text) | {"budget": None, "advice": None})
     assert read.channels == result.channels
     assert read.put_back == result.put_back
@@ -49,6 +50,16 @@ def test_headline_and_table(page: str):
     assert "+0.06 % against the original" in page
     assert "missed its command by 13.1 µm" in page
     assert "The firmware&#39;s shaper is off" in page
+
+
+def test_a_set_of_plants_says_a_range(result: Result):
+    ranges = {"before": (120.0, 190.0), "after": (4.21, 17.3), "shaper": (20.0, 41.0)}
+    channels = [c.model_copy(update={"contour_range_um": ranges[c.name]}) for c in result.channels]
+    page = render_report(result.model_copy(update={"channels": channels}))
+    assert "4.21 to 17.3" in page
+    assert "20.0 to 41.0" in page
+    assert "all plants that explain" in page
+    assert "times smaller" not in page
 
 
 def test_nothing_is_fetched(page: str):

@@ -41,9 +41,9 @@ def plants(draw: st.DrawFn) -> PlantSpec:
             for _ in range(n - 1)
         )
         poles = tuple(PolePair(f_hz=f, zeta=z) for f, z in zip(f_hz, zeta, strict=True))
-        tau_s = draw(st.floats(-2e-3, 2e-3))
+        tau_s = draw(st.floats(1e-6, 2e-3) | st.floats(-2e-3, -1e-6) | st.just(0.0))
         return PairsSpec(poles=poles, zeros=zeros, real_zero_tau_s=tau_s)
-    grounded = draw(st.floats(0.0, 1.0))
+    grounded = draw(st.floats(0.01, 1.0) | st.just(0.0))
     share = np.array([draw(st.floats(0.05, 1.0)) for _ in range(n)])
     modes = zip(f_hz, zeta, share / share.sum(), strict=True)
     return RelativeModesSpec(

@@ -10,13 +10,13 @@ import pytest
 
 from models.errors import ModelError
 from models.identification.excitation import drive_spectrum, klipper_psd
+from models.identification.frame import without_frame
 from models.identification.readers import read_measurements
 from models.identification.shaper_choice import choose_shaper_of
 from models.identification.spectrum_fit import (
     explain_spectra,
     fit_spectrum,
     refit_spectrum,
-    without_frame,
 )
 from models.identification.spectrum_model import cross_axis_share, driven_column, spectrum_model
 from models.identification.synthetic import Sensor, simulate_spectrum

@@ -1,0 +1,72 @@
+"""The frame on its feet, which a sensor feels and a nozzle over its bed does not.
+
+An accelerometer measures against the ground. A frame that shakes by reaction (mass ratio mu,
+frequency w) multiplies what the nozzle does over the bed by 1 - mu s^2/(s^2 + 2 z w s + w^2): a
+mode of share mu, or a pair of poles beside a pair of zeros, far below the mode that rings most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar, cast
+
+import numpy as np
+
+from models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
+
+__all__ = ["shaken", "without_frame"]
+
+P = TypeVar("P", bound=PlantSpec)
+
+_HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
+"""What may be a frame: no higher, well below the strongest mode, of no more share."""
+_BESIDE = 0.25
+"""Logarithm of the ratio of a pair of zeros to the pair of poles that it belongs to."""
+_LIKELY = 0.5
+"""That such a mode is the frame's: one sensor does not tell."""
+
+
+def shaken(crowd: Sequence[P], rng: np.random.Generator) -> list[P]:
+    """Take the frame out of some plants, as the nozzle over the bed does not feel it."""
+    frame = rng.random(len(crowd)) < _LIKELY
+    return [without_frame(p) if shakes else p for p, shakes in zip(crowd, frame, strict=True)]
+
+
+def without_frame(plant: P) -> P:
+    """Return the plant without weak modes far below its strongest one; others as they are."""
+    made: PlantSpec = plant
+    if isinstance(plant, RelativeModesSpec):
+        made = _modes_without(plant)
+    elif isinstance(plant, PairsSpec):
+        made = _pairs_without(plant)
+    return cast(P, made)
+
+
+def _modes_without(plant: RelativeModesSpec) -> RelativeModesSpec:
+    strongest = max(plant.modes, key=lambda m: abs(m.share) / m.zeta)
+    most_hz = min(_HIGHEST_HZ, _BELOW * strongest.f_hz)
+    kept = [m for m in plant.modes if abs(m.share) > _SHARE or m.f_hz > most_hz]
+    total = sum(m.share for m in kept)
+    return RelativeModesSpec(
+        modes=tuple(m.model_copy(update={"share": m.share / total}) for m in kept)
+    )
+
+
+def _pairs_without(plant: PairsSpec) -> PairsSpec:
+    poles, zeros = list(plant.poles), list(plant.zeros)
+    if len(poles) < 2:
+        return plant
+    peaks = np.abs(frequency_response(plant, [p.f_hz for p in poles]))
+    most_hz = min(_HIGHEST_HZ, _BELOW * poles[int(np.argmax(peaks))].f_hz)
+    for pole in plant.poles:
+        if pole.f_hz > most_hz:
+            continue
+        beside = [z for z in zeros if abs(z.zeta) < 1 and _apart(z.f_hz, pole.f_hz) < _BESIDE]
+        if beside:
+            poles.remove(pole)
+            zeros.remove(min(beside, key=lambda z: _apart(z.f_hz, pole.f_hz)))
+    return plant.model_copy(update={"poles": tuple(poles), "zeros": tuple(zeros)})
+
+
+def _apart(one_hz: float, other_hz: float) -> float:
+    return float(abs(np.log(one_hz / other_hz)))

@@ -1,0 +1,64 @@
+"""What may be the frame on its feet, taken out of plants."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.identification.frame import shaken, without_frame
+from models.plants import (
+    PairsSpec,
+    PolePair,
+    RelativeMode,
+    RelativeModesSpec,
+    ZeroPair,
+    frequency_response,
+)
+
+F = np.linspace(1.0, 150.0, 300)
+ALONE = PairsSpec(poles=(PolePair(f_hz=45.0, zeta=0.06), PolePair(f_hz=90.0, zeta=0.05)))
+
+
+def on_feet(f_hz: float, mu: float, zeta: float = 0.1) -> PairsSpec:
+    """What a sensor feels of `ALONE`: 1 - mu s^2/(s^2 + 2 z w s + w^2) times it."""
+    low = 1.0 / np.sqrt(1.0 - mu)
+    zero = ZeroPair(f_hz=f_hz * low, zeta=zeta * low)
+    return PairsSpec(poles=(PolePair(f_hz=f_hz, zeta=zeta), *ALONE.poles), zeros=(zero,))
+
+
+@pytest.mark.parametrize(("f_hz", "mu"), [(8.0, 0.1), (18.0, 0.06), (25.0, 0.15)])
+def test_a_pair_beside_zeros_is_taken_out(f_hz: float, mu: float) -> None:
+    felt = on_feet(f_hz, mu)
+    s = 2j * np.pi * F
+    w = 2 * np.pi * f_hz
+    frame = 1 - mu * s**2 / (s**2 + 2 * 0.1 * w * s + w**2)
+    np.testing.assert_allclose(
+        frequency_response(felt, F), frame * frequency_response(ALONE, F), rtol=1e-9
+    )
+    assert without_frame(felt) == ALONE
+
+
+def test_what_rings_most_stays() -> None:
+    assert without_frame(ALONE) == ALONE
+    near = on_feet(44.0, 0.1)  # no frame: as high as the axis itself
+    assert without_frame(near) == near
+    one = PairsSpec(poles=(PolePair(f_hz=12.0, zeta=0.06),))
+    assert without_frame(one) == one
+
+
+def test_a_mode_of_small_share_is_taken_out() -> None:
+    low, main = (
+        RelativeMode(f_hz=14.0, zeta=0.1, share=0.1),
+        RelativeMode(f_hz=45.0, zeta=0.06, share=0.9),
+    )
+    (left,) = without_frame(RelativeModesSpec(modes=(low, main))).modes
+    assert (left.f_hz, left.share) == (45.0, pytest.approx(1.0))
+    heavy = low.model_copy(update={"share": 0.5}), main.model_copy(update={"share": 0.5})
+    assert len(without_frame(RelativeModesSpec(modes=heavy)).modes) == 2
+
+
+def test_half_of_a_crowd_is_without() -> None:
+    felt = on_feet(18.0, 0.06)
+    found = shaken([felt] * 200, np.random.default_rng(0))
+    assert 70 < found.count(ALONE) < 130
+    assert found.count(ALONE) + found.count(felt) == 200
