@@ -63,6 +63,8 @@ def print_result(result: Result, console: Console | None = None) -> None:
     table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
     console.print(table)
     console.print(f"best shaper for this machine: {result.best_shaper}")
+    if result.confirmation:
+        console.print(f"the machine's model: {result.confirmation}")
     if any(channel.name == "after" for channel in result.channels):
         change = 100 * (result.time_s / result.original_time_s - 1) if result.original_time_s else 0
         console.print(

@@ -225,7 +225,7 @@ def _group_starts(
 ) -> NDArray[np.float64]:
     """When each group begins; one without moves begins where the one before ends."""
     starts = np.full(len(timeline.groups), np.nan)
-    first = np.append(True, group[1:] != group[:-1])
+    first = np.diff(group, prepend=-1) != 0  # of no moves, where all round to nothing, none
     starts[group[first]] = start_s[first]
     for i in np.flatnonzero(np.isnan(starts)):
         earlier = np.flatnonzero(group < i)

@@ -40,6 +40,8 @@ _AS_GOOD, _EXPLAINED, _IRRELEVANT = 1.05, 1.3, 0.005
 """A fit is as good as another within 5 % of its residual, within 1.3 times the noise, or within
 half a percent: no axis is more linear than that."""
 _CLEARLY = 0.7
+_LEAST_PEAK, _LEAST_SHARE = 0.1, 0.005
+"""What a mode adds to |G| at its own frequency, and far below it."""
 _ASSUMED = (1e-3, 0.01)
 """Relative deviation of frequency and damping by what damping is assumed to act on."""
 _POLES_BAND, _ZETA, _SHARE = (1.1, 1.6), (3e-3, 1.0), (-2.0, 2.5)
@@ -113,7 +115,13 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
         kept = [m for m in modes if m is not weakest]
         starts.append(_of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
     tried = [_calm(data, _polished(data, s)) for s in starts if s is not None]
-    return tuple(_as_fit(data, one) for one in tried if one.nrmse <= enough)
+    return tuple(_as_fit(data, t) for t in tried if t.nrmse <= enough and _all_ring(t))
+
+
+def _all_ring(fit: Modal) -> bool:
+    """Tell whether every mode does something that a measurement can show."""
+    _, zeta, share = fit.structure.split(fit.theta)
+    return bool(np.all((np.abs(share) > _LEAST_PEAK * 2 * zeta) & (np.abs(share) > _LEAST_SHARE)))
 
 
 def _enough(data: ResponseData, residual: float) -> float:

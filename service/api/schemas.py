@@ -41,7 +41,7 @@ _EXAMPLE: dict[str, Any] = {
     "options": {
         "method": "fbf",
         "basis": "ce-opt",
-        "robust": "off",
+        "robust": "auto",
         "along": None,
         "plate": None,
         "tolerance_um": 2.0,
@@ -99,14 +99,15 @@ class JobQuery(BaseModel):
     )
     basis: BasisName = Field(default="ce-opt", description="Basis functions of `fbf`.")
     robust: RobustMode = Field(
-        default="off",
-        description="What `fbf` is designed for: the nominal plant (`off`), or the machine's "
-        "plant set by least squares (`ensemble`) or for its worst member (`minimax`).",
+        default="auto",
+        description="What `fbf` is designed for: all plants that explain the measurement, with as "
+        "much of a shaper's smoothing as they ask for (`auto`), the nominal plant (`off`), or the "
+        "machine's plant set by least squares (`ensemble`) or for its worst member (`minimax`).",
     )
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = Field(
         default=None,
         description="Weight of errors along the path against those across it, for `fbf`; less "
-        "than 1 takes longer. By default .09 with a set, else 1.",
+        "than 1 takes longer.",
     )
     tolerance_um: float = Field(
         default=DEFAULT_TOLERANCE_UM,

@@ -13,11 +13,12 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from compensation.base import DesignError
 from compensation.cautious import Caution
 from compensation.fbf import PreviewFbf
 from compensation.shapers import ShaperCompensator
@@ -36,11 +37,13 @@ __all__ = [
     "caution_for",
     "choose_caution",
     "design_mode",
+    "designed",
     "measured_set",
     "prediction_note",
 ]
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
 _VERSION = 4
@@ -95,6 +98,19 @@ def design_mode(machine: Machine, options: Options) -> str:
     if options.robust != "auto":
         return options.robust
     return "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
+
+
+def designed(options: Options, mode: str, design: Callable[[str], T]) -> T:
+    """Return the design of a mode, or by default of the plants in the middle if it refuses itself.
+
+    Plants that ring for longer than any window make a set refuse itself.
+    """
+    try:
+        return design(mode)
+    except DesignError:
+        if options.robust != "auto" or mode == "off":
+            raise
+        return design("off")
 
 
 def caution_for(
@@ -153,7 +169,11 @@ def choose_caution(
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
     path, extruding = reference_motion(dt_s)
     no_rests = np.zeros((0, 2), np.int64)
-    exact = PreviewFbf(machine, dt_s, basis=basis, robust="ensemble")
+    exact = designed(
+        Options(),
+        "ensemble",
+        lambda mode: PreviewFbf(machine, dt_s, basis=basis, robust=mode),
+    )
     exact.reset(path[:, 0])
     smooth = ShaperCompensator(
         machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz

@@ -26,7 +26,7 @@ from models.operating import OperatingGrid, machine_at
 from models.plants import plant_set
 from models.schedule import EMPTY, OperatingPoint
 from service.pipeline._peak_kernels import peaks, speed_step
-from service.pipeline.caution import design_mode
+from service.pipeline.caution import design_mode, designed
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
@@ -100,15 +100,22 @@ class PieceCompensator:
         settings: dict[str, object] = {}
         vibration = options.method.removesuffix("+ripple")
         if vibration == "fbf":
-            robust = design_mode(machine, options)
-            settings.update(basis=options.basis, robust=robust, along=options.along)
+            settings.update(basis=options.basis, along=options.along)
             if caution is not None:
                 settings.update(caution=caution)
         elif shaper is not None and vibration == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine
         self._tolerance_mm = 1e-3 * options.tolerance_um
-        self.compensator: Compensator = compensator(options.method, machine, DT_S, **settings)
+
+        def design(mode: str | None) -> Compensator:
+            chosen = settings if mode is None else {**settings, "robust": mode}
+            return compensator(options.method, machine, DT_S, **chosen)
+
+        fbf = vibration == "fbf"
+        self.compensator: Compensator = (
+            designed(options, design_mode(machine, options), design) if fbf else design(None)
+        )
         firmware = kit(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
@@ -222,6 +229,9 @@ class PieceCompensator:
             )
             self._keep_inside(segments)
             encoded = self.encoder.encode(piece, timeline, segments)
+            if len(encoded.row) == 0:
+                line = int(piece.moves.line[0])
+                raise Unfit(f"line {line}: all moves round to nothing on the grid of a file")
             step = self._speed_step(encoded.phases)
             if step <= limit:
                 return segments, encoded

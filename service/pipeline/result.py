@@ -278,6 +278,8 @@ class Result(_Figures):
     """What asks for attention, for a person."""
     notes: list[str] = []
     """What is worth knowing and no trouble, for instance how plants followed a schedule."""
+    confirmation: str = ""
+    """What ring tests on the machine said of its model; empty where nothing was compensated."""
     layers: list[GroupFigures]
     """Figures by layer, in order."""
     features: list[GroupFigures]

@@ -228,8 +228,6 @@ class _Job:
         self._caution = chosen[0] if chosen else None
         self._choice = chosen[1] if chosen else None
         self._standing = [prediction_note(machine, chosen[1])] if chosen else []
-        if self._changes:
-            self._standing.append(f"The machine's model: {confirmation_text(machine)}.")
         if tuned_first or self._caution is not None:
             self._work = PieceCompensator(machine, options, self._shaper, self._caution)
         dialect = dialect_for(machine, options.dialect)
@@ -636,6 +634,7 @@ class _Job:
             put_back_extruding_share=total.put_back_share,
             warnings=warnings,
             notes=notes,
+            confirmation=confirmation_text(self._machine) if self._changes else "",
             layers=measured.layers(),
             features=measured.features(self._reader.feature_names),
             track=measured.track(),

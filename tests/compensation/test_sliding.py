@@ -56,7 +56,7 @@ def test_sliding_helps_every_summary(machine: Machine, motion) -> None:
     path, extruding = motion
     _, plain = contours(machine, path, extruding, robust="ensemble", along=1.0)
     u, slid = contours(machine, path, extruding, robust="ensemble", along=0.1)
-    _, balanced = contours(machine, path, extruding, robust="minimax")
+    _, balanced = contours(machine, path, extruding, robust="minimax", along=0.1)
     assert slid.mean() < 0.8 * plain.mean()
     assert slid.max() < 0.8 * plain.max()
     assert balanced.max() < 0.9 * slid.max()

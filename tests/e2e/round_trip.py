@@ -38,7 +38,8 @@ def corpus_folder() -> Path:
 def corpus_files() -> list[str]:
     """Return the names of the corpus' files; none if it is not there."""
     folder = corpus_folder()
-    return [str(p.relative_to(folder)) for p in sorted(folder.glob("*/*.*"))]
+    files = (p for p in sorted(folder.glob("*/*.*")) if p.suffix != ".md")
+    return [str(p.relative_to(folder)) for p in files]
 
 
 def text_of(path: Path) -> bytes:

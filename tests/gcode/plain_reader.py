@@ -18,6 +18,8 @@ Firmware = Literal["klipper", "marlin", "reprapfirmware"]
 
 _LINE = re.compile(rb"^\s*(?:[Nn]\s*\d+\s*)?([A-Za-z])\s*(\d+)(?![\d.])(.*)$", re.DOTALL)
 _WORD = re.compile(rb"([A-Za-z])\s*([-+]?(?:\d+\.?\d*|\.\d+))")
+_EXPONENTS = re.compile(rb"([A-Za-z])\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+"""RepRapFirmware's numbers: Y9E2 is 900."""
 _MOTION = {b"G0", b"G1", b"G2", b"G3", b"G5"}
 
 
@@ -77,7 +79,8 @@ def read(data: bytes, firmware: Firmware = "klipper") -> Reading:
         rest = found[3].split(b"*", 1)[0]
         if name in (b"M117", b"M118", b"M23"):
             continue
-        words = {k.upper(): float(v) for k, v in _WORD.findall(rest)}
+        pattern = _EXPONENTS if firmware == "reprapfirmware" else _WORD
+        words = {k.upper(): float(v) for k, v in pattern.findall(rest)}
         if name in _MOTION:
             out.feed_mm_min = words.get(b"F", out.feed_mm_min)
             before = list(place)

@@ -72,7 +72,7 @@ def test_a_job_from_upload_to_deletion(client: TestClient, data_dir: Path):
     assert job["options"] == {
         "method": "fbf",
         "basis": "ce-opt",
-        "robust": "off",
+        "robust": "auto",
         "along": None,
         "plate": None,
         "tolerance_um": 2.0,

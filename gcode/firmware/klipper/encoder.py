@@ -140,7 +140,7 @@ class KlipperEncoder:
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
             miss = actual - predicted
-            if np.max(np.abs(np.cumsum(miss))) < _TIME_TOLERANCE_S:
+            if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             correction += miss
         return encoded_piece(timeline, moves, self._limits, feedrate, phases)

@@ -21,7 +21,8 @@ export function reportSections(job, report, signal) {
   return [
     headline(report, channels),
     warnings(report),
-    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, note)), errorTable(channels, labels),
+    section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, note)),
+      report.confirmation ? h("p", null, `The machine's model: ${report.confirmation}.`) : null, errorTable(channels, labels),
       h("p.hint", null, "Contour: distance to the planned path. Tracking: distance to where the nozzle was planned to be at that moment.")),
     layers(job, labels, signal),
     trackChart(report, channels, labels, signal),

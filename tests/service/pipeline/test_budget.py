@@ -77,7 +77,7 @@ def test_it_is_quicker_and_keeps_the_budget(tmp_path: Path, cache: Path, sliced:
             next(c.extruding.contour_rms_um for c in one.channels if c.name == name)
             for one in (plain, result)
         ]
-        assert figures[1] == pytest.approx(figures[0], rel=0.05)
+        assert figures[1] == pytest.approx(figures[0], rel=0.05, abs=0.2)
     assert "budget 12 µm" in budget_line(found)
     again, same = compensated(sliced, tmp_path, cache, budget_um=12)
     assert same == written
