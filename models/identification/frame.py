@@ -22,13 +22,11 @@ _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
 """What may be a frame: no higher, well below the strongest mode, of no more share."""
 _BESIDE = 0.25
 """Logarithm of the ratio of a pair of zeros to the pair of poles that it belongs to."""
-_LIKELY = 0.5
-"""That such a mode is the frame's: one sensor does not tell."""
 
 
-def shaken(crowd: Sequence[P], rng: np.random.Generator) -> list[P]:
-    """Take the frame out of some plants, as the nozzle over the bed does not feel it."""
-    frame = rng.random(len(crowd)) < _LIKELY
+def shaken(crowd: Sequence[P], rng: np.random.Generator, likely: float) -> list[P]:
+    """Take the frame out of a share `likely` of plants, as the nozzle over the bed feels none."""
+    frame = rng.random(len(crowd)) < likely
     return [without_frame(p) if shakes else p for p, shakes in zip(crowd, frame, strict=True)]
 
 

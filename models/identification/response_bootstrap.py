@@ -33,6 +33,9 @@ _DRAWS = 32
 _POINTS = 120
 _LEAST_SD = 0.005
 """Relative; no axis is more linear than that."""
+_FRAME_LIKELY = 0.8
+"""That a weak mode far below the strongest is the frame's: a response shows it, but may be wrong
+about whose it is."""
 _RUN_TO_RUN = (0.007, 0.12)
 """Relative standard deviation of frequencies and damping within a session, on real axes."""
 
@@ -82,7 +85,7 @@ def explain_response(
             progress((k + 1) / _DRAWS)
     centres = [prompt(fit)]
     if not frame_firm:
-        crowd = shaken(crowd, rng)
+        crowd = shaken(crowd, rng, _FRAME_LIKELY)
         centres.append(without_frame(centres[0]))
     population = representatives(centres, crowd)
     return population, (float(min(delays_s)), float(max(delays_s)))

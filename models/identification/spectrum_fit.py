@@ -62,6 +62,8 @@ _BEYOND = 0.6
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above so many times the highest bin were not seen, and damping that they may have."""
 _PEAKS = 4
+_FRAME_LIKELY = 0.5
+"""That a weak mode far below the strongest is the frame's: a table hardly shows one."""
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
 _PER_PARAMETER = 2.0
@@ -322,7 +324,7 @@ class _Search:
 
     def shaken(self, crowd: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
         """Take the frame out of some plants."""
-        return shaken(crowd, self._rng)
+        return shaken(crowd, self._rng, _FRAME_LIKELY)
 
     def _rung(self, fit: _Candidate) -> _Candidate:
         """Give modes beyond the band any damping: of them only a flank was seen."""

@@ -59,6 +59,6 @@ def test_a_mode_of_small_share_is_taken_out() -> None:
 
 def test_half_of_a_crowd_is_without() -> None:
     felt = on_feet(18.0, 0.06)
-    found = shaken([felt] * 200, np.random.default_rng(0))
+    found = shaken([felt] * 200, np.random.default_rng(0), 0.5)
     assert 70 < found.count(ALONE) < 130
     assert found.count(ALONE) + found.count(felt) == 200
