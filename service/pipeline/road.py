@@ -19,6 +19,7 @@ from typing import BinaryIO, TypeVar
 
 import numpy as np
 
+from compensation.base import DesignError
 from gcode.containers.opening import open_text, rewriting
 from gcode.errors import GcodeError
 from gcode.firmware.planning import intended, join_phases, plan_moves
@@ -172,6 +173,12 @@ def compensate_file(
             "written_bytes": temporary.stat().st_size,
         }
         return result.model_copy(update=sizes)
+
+
+_SAID = (Unfit, GcodeError, DesignError, ModelError)
+"""What says of itself why a piece cannot be compensated."""
+_FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
+"""With those of our own: a piece that meets one stays as it came, and the others are printed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,11 +405,16 @@ class _Job:
                 motion = self._motion(piece, paced, made, executed)
                 if self._budget is None:
                     self._verifier.check_gain(motion, self._point)
-        except (Unfit, GcodeError):
+        except _FAULTS as error:
             self._writer = writer
             if checker is not None:
                 self._checker = checker
-            raise
+            if isinstance(error, _SAID):
+                raise
+            raise Unfit(
+                f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
+                f"{error}); please report it with the file"
+            ) from error
         return _Attempt(made, executed, gap_mm, text, motion)
 
     def _motion(

@@ -20,8 +20,13 @@ _GAP_SAMPLES = 2.5
 """Two periods are one lost sample, which is let pass; half a period allows for jitter."""
 
 
-def check_long(table: Table, least: int, what: str) -> None:
-    """Raise ModelError if the table has fewer than `least` rows."""
+def check_long(table: Table, least: int, what: str, most: int | None = None) -> None:
+    """Raise ModelError if the table has fewer than `least` rows, or more than `most`."""
+    if most is not None and len(table.rows) > most:
+        raise ModelError(
+            f"{table.source}: {len(table.rows)} {what}, at most {most} are read: a test has some "
+            "hundred; give the file as the firmware wrote it"
+        )
     if len(table.rows) < least:
         raise ModelError(
             f"{table.source}: {len(table.rows)} {what}, at least {least} are needed; "

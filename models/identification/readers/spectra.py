@@ -17,7 +17,8 @@ __all__ = ["is_spectrum", "read_spectrum"]
 
 Array = NDArray[np.float64]
 
-_LEAST_BINS = 16
+_LEAST_BINS, _MOST_BINS = 16, 2000
+"""Klipper writes some 130, up to 200 Hz; work and memory grow with their square."""
 _PER_HZ = "accel_per_hz"
 _SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
 _MIN_FREQ_HZ = 5.0
@@ -43,7 +44,7 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
         If there is no density, one is negative, or the tested axis has none.
     """
     names, shapers = _densities(table)
-    check_long(table, _LEAST_BINS, "frequencies")
+    check_long(table, _LEAST_BINS, "frequencies", _MOST_BINS)
     has_per_hz = _PER_HZ in table.names
     values = table.numbers(["freq", *names, *([_PER_HZ] if has_per_hz else [])])
     f_hz, psd = values[:, 0], values[:, 1 : 1 + len(names)]

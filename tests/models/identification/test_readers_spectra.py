@@ -234,3 +234,9 @@ def test_response_faults() -> None:
         read_content(text("freq_hz,real", "3"), "f.csv")
     with pytest.raises(ModelError, match="dB is beyond"):
         read_content(text("freq_hz,mag_db,phase_deg", "900,1"), "f.csv")
+
+
+def test_a_table_of_more_rows_than_a_test_has() -> None:
+    rows = "".join(f"{0.01 * k:.2f},1.0,1.0,1.0,3.0\n" for k in range(2001))
+    with pytest.raises(ModelError, match=r"2001 frequencies, at most 2000 are read"):
+        read("freq,psd_x,psd_y,psd_z,psd_xyz\n" + rows)
