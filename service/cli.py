@@ -272,7 +272,7 @@ def design(
     machine: MachineOption,
     axis: Annotated[str, typer.Option(help="x or y.")],
     basis: Annotated[str, typer.Option(help="ce-opt, robust, bspline or dct.")] = "ce-opt",
-    robust: Annotated[str, typer.Option(help="off, ensemble or minimax.")] = "off",
+    robust: Annotated[str, typer.Option(help="auto, off, ensemble or minimax.")] = "off",
     report: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
     ] = None,

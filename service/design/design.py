@@ -43,6 +43,7 @@ from service.design.figures import (
     ZeroFigures,
 )
 from service.design.robustness import Trial
+from service.pipeline.caution import measured_set
 from service.pipeline.yardstick import BestShaper, tune_each
 from service.version import __version__
 
@@ -78,7 +79,8 @@ def design_report(
     axis : str
         x or y.
     basis, robust, along : str, str, float or None
-        What `compensation.fbf.PreviewFbf` is told.
+        What `compensation.fbf.PreviewFbf` is told; `auto` is what jobs take by default of it, as it
+        is before a shaper's smoothing comes in.
     dt_s, window_s, update_s : float
         Sampling time, preview window, and how much of it is committed.
     errors_percent : sequence of float
@@ -96,6 +98,8 @@ def design_report(
         For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
         error: the report says which and why.
     """
+    if robust == "auto":
+        robust = "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
     _check_names(axis, basis, robust)
     row = AXES.index(axis)
     plants = plant_set(machine.axes["x" if axis == "x" else "y"], dt_s)

@@ -487,3 +487,9 @@ def test_whole_report(name: str, axis: str) -> None:
     for curve in report.robustness.curves:
         assert curve.contour_um[10] == pytest.approx(curve.nominal_um, rel=1e-6)
     Page(render_design(report))
+
+
+@pytest.mark.parametrize(("name", "mode"), [("ender3", "ensemble"), ("generic-corexy", "off")])
+def test_automatic_is_what_jobs_take(name: str, mode: str) -> None:
+    machine = load_machine(name)
+    assert design_report(machine, "x", robust="auto", errors_percent=(0.0,)).robust == mode
