@@ -138,7 +138,7 @@ def main() -> None:
     parser.add_argument("file", nargs="?", help=f"path, or corpus name (default {_FILE})")
     parser.add_argument("--machine", default="ender3")
     parser.add_argument("--tolerance-um", type=float, default=2.0)
-    parser.add_argument("--robust", default="off", help="off, ensemble or minimax")
+    parser.add_argument("--robust", default="auto", help="auto, off, ensemble or minimax")
     parser.add_argument("--times", type=int, default=10, help="length of the long file; 1: none")
     parser.add_argument("--mb", type=float, help="length of the long file in MB, instead of times")
     parser.add_argument("--runs", type=int, default=1, help="of the file itself")

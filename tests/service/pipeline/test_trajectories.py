@@ -55,7 +55,7 @@ def test_the_whole_print(source: Path, tmp_path: Path, cache: Path) -> None:
     for channel in report.channels[:2]:
         error = table[f"{channel.name}_contour_um"][table["extruding"] > 0]
         rms = float(np.sqrt(np.mean(error**2)))
-        # At their ends extruded moves count by parts of a sample.
+        # The table holds the last milliseconds before a stop, which the report leaves out.
         assert rms == pytest.approx(channel.extruding.contour_rms_um, rel=0.1, abs=0.4)
     # The written file is planned by itself, and moves as the table says.
     plan_file(tmp_path / "o.gcode", tmp_path / "p.npz", machine)
