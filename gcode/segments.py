@@ -34,7 +34,8 @@ ALONG_SHARE = 0.8
 LOOSE_MM = 0.3e-3
 FULL_GAIN = 5.0
 Z_TOLERANCE_MM = 1e-3
-E_TOLERANCE_MM = 1e-3
+E_TOLERANCE_MM = 3e-4
+"""Filament that comes unevenly is a step of the extruder's speed, which firmwares brake for."""
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
 END_EXCESS_MM = 1.5e-3

@@ -6,6 +6,7 @@ knows no firmware by name; whatever differs between firmwares is behind these pr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,7 +24,20 @@ if TYPE_CHECKING:
     from models.machine import CommandLimits
     from models.shaping import Shaping
 
-__all__ = ["Adviser", "Encoder", "FirmwareKit", "Planner", "Voice", "scaled"]
+__all__ = [
+    "Adviser",
+    "Encoder",
+    "FirmwareKit",
+    "Planner",
+    "Voice",
+    "corner_step_mm_s",
+    "scaled",
+    "square_corner_mm_s",
+]
+
+_CORNER_SHARE = 0.6
+"""Of the motors' step of speed, what a corner of a stream may take; the ramps around it have the
+rest."""
 
 
 class Planner(Protocol):
@@ -271,6 +285,24 @@ class FirmwareKit(Protocol):
         travel_mm : ndarray, shape (n, 4)
             x y z e; moves that do not climb in the file may still climb along a bed mesh.
         """
+
+
+def corner_step_mm_s(command: CommandLimits) -> float:
+    """Return the largest step of velocity that the firmware may make at a corner of a stream.
+
+    A stream runs under the motors' own acceleration and such corners, so that it may break off at
+    any line and go on from there: braking and starting again, the firmware keeps its limits.
+    """
+    return _CORNER_SHARE * command.speed_step_mm_s
+
+
+def square_corner_mm_s(command: CommandLimits) -> float:
+    """Return the same as the speed through a square corner, which junction deviation goes by.
+
+    Around a small angle t velocity steps most: the speed there is s sqrt(8 (sqrt(2) - 1)) / t
+    (klippy/toolhead.py `calc_junction`, 2026-08), s being the speed through a square corner.
+    """
+    return corner_step_mm_s(command) / math.sqrt(8.0 * (math.sqrt(2.0) - 1.0))
 
 
 def scaled(value: float, ratio: float, most: float) -> float:

@@ -13,6 +13,7 @@ from compensation.cautious import Caution
 from compensation.registry import compensator
 from compensation.scheduled import BLEND_STEP, STEP
 from gcode.errors import GcodeError
+from gcode.firmware.base import FirmwareKit
 from gcode.firmware.encoding import Encoded
 from gcode.firmware.planning import intended
 from gcode.firmware.registry import kit
@@ -30,7 +31,16 @@ from service.pipeline.caution import design_mode, designed
 from service.pipeline.options import Options
 from service.pipeline.yardstick import BestShaper
 
-__all__ = ["DT_S", "CompensatedPiece", "PieceCompensator", "Unfit", "as_executed", "deviation"]
+__all__ = [
+    "DT_S",
+    "CompensatedPiece",
+    "PieceCompensator",
+    "Unfit",
+    "as_executed",
+    "deviation",
+    "follow_tolerance_mm",
+    "strayed",
+]
 
 DT_S = 1e-3
 """Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
@@ -44,12 +54,19 @@ _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
 
 
+_FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
+"""Filament is smoothed over so many times its mm per mm, before and behind, and no further."""
+_EXTRUDING_EXCESS_MM = 15e-3
+_TRAVEL_EXCESS_MM = 200e-3
+"""How far the executed motion may be from the command beyond the tolerance, at worst."""
+
+
 class Unfit(ValueError):
     """A piece that had better leave as it came; the message is the reason."""
 
 
-class _Jerky(Unfit):
-    """A motor's speed would step by too much."""
+class _Sudden(Unfit):
+    """A motor's speed would step by too much, or the firmware cannot follow within its limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +136,7 @@ class PieceCompensator:
         firmware = kit(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
+        self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
         self._filter = _error_filter(machine)
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
@@ -146,14 +164,14 @@ class PieceCompensator:
 
     def _eased(self, piece: Piece) -> CompensatedPiece:
         """Compensate, with less acceleration or rounder corners where the motors need it."""
-        first: _Jerky | DesignError | None = None
+        first: _Sudden | DesignError | None = None
         for share in _ACCEL_SHARES:
             if not self.compensator.ease(share):
                 assert first is not None
                 raise first
             try:
                 return self._compensate(piece)
-            except _Jerky as error:
+            except _Sudden as error:
                 first = first or error
             except DesignError as error:
                 # With less it does not follow the path.
@@ -161,7 +179,7 @@ class PieceCompensator:
                 break
         self.compensator.ease(1.0)
         for soft_s in _SOFT_S:
-            with contextlib.suppress(_Jerky, DesignError):
+            with contextlib.suppress(_Sudden, DesignError):
                 return self._compensate(piece, soft_s)
         assert first is not None
         raise first
@@ -197,6 +215,7 @@ class PieceCompensator:
             xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
             command = np.concatenate([xy_mm, path[2:]])
             _retract_along(command, timeline, phases)
+            _feed_evenly(command, extruding)
             self._check_travel(command[:2], timeline.row, piece)
             step_mm, bend_mm = peaks(command)
             segments, encoded = self._fit(piece, timeline, command, bend_mm)
@@ -208,7 +227,12 @@ class PieceCompensator:
         at = np.rint(encoded.start_s / DT_S).astype(np.int64)
         row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
         self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
-        return CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
+        made = CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
+        if (
+            reason := strayed(deviation(made, encoded.phases), extruding, self._follow_mm)
+        ) is not None:
+            raise _Sudden(f"planned by the firmware's rules, {reason}")
+        return made
 
     def _fit(
         self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
@@ -236,7 +260,7 @@ class PieceCompensator:
             if step <= limit:
                 return segments, encoded
             tolerance *= 0.5
-        raise _Jerky(
+        raise _Sudden(
             f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
             f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
         )
@@ -324,6 +348,64 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
         if way[-1] > 0.0:
             share = way[first - span.start : end - span.start] / way[-1]
             command[3, first:end] = begins + (ends - begins) * share
+
+
+def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> None:
+    """Smooth the filament over the command's way wherever it prints without a break, in place.
+
+    The command has other speeds in a corner than the plan has, the filament has the plan's: per mm
+    of way it comes in steps there, which firmwares brake for, the more the thicker the line.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], extruding, [False]])))
+    for first, end in edges.reshape(-1, 2):
+        span = slice(max(first - 1, 0), end)
+        fed_mm = command[3, span] - command[3, span.start]
+        way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))
+        if way_mm[-1] <= 0.0:
+            continue
+        # Up to the ends of the run the mean is over less, so that all of it stays between them.
+        reach_mm = min(_FEED_REACH * fed_mm[-1] / way_mm[-1], _FEED_REACH_MM)
+        reach = np.minimum(np.minimum(way_mm, way_mm[-1] - way_mm), reach_mm)
+        area = np.append(0.0, np.cumsum(0.5 * (fed_mm[1:] + fed_mm[:-1]) * np.diff(way_mm)))
+        low, high = (np.interp(way_mm + side * reach, way_mm, area) for side in (-1.0, 1.0))
+        wide = reach > 1e-3
+        fed_mm[wide] = ((high - low)[wide]) / (2.0 * reach[wide])
+        command[3, span] = command[3, span.start] + fed_mm
+
+
+def follow_tolerance_mm(firmware: FirmwareKit, tolerance_um: float) -> float:
+    """Return how far executed motion may be from its command, but for some exceptions.
+
+    Where vertices lie on steps, and when steps come, are off by up to a step each. What is shorter
+    than the shortest move goes another way, there and back.
+    """
+    coarse_mm = max(2.0 * np.hypot(*firmware.step_mm[:2]), 2.0 * firmware.shortest_move_mm)
+    return 1e-3 * tolerance_um + float(coarse_mm)
+
+
+def strayed(
+    gap_mm: NDArray[np.float64], extruding: NDArray[np.bool_], tolerance_mm: float
+) -> str | None:
+    """Return in words how far motion is from its command if that is too far.
+
+    Parameters
+    ----------
+    gap_mm : ndarray, shape (n,)
+        As `deviation` gives it.
+    extruding : ndarray of bool, shape (n,)
+    tolerance_mm : float
+        As `follow_tolerance_mm` gives it.
+    """
+    worst = float(np.max(gap_mm, initial=0.0))
+    if worst <= tolerance_mm + _EXTRUDING_EXCESS_MM:
+        return None
+    printed = float(np.max(gap_mm[extruding], initial=0.0))
+    if printed <= tolerance_mm + _EXTRUDING_EXCESS_MM and worst <= tolerance_mm + _TRAVEL_EXCESS_MM:
+        return None
+    return (
+        f"the motion is {1e3 * printed:.1f} um from its command while extruding and "
+        f"{1e3 * worst:.1f} um at worst (tolerance {1e3 * tolerance_mm:g} um)"
+    )
 
 
 def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:

@@ -10,7 +10,13 @@ from gcode.pieces import Piece
 from gcode.types import Phases
 from models.machine import Machine
 from models.schedule import OperatingPoint
-from service.pipeline.compensating import DT_S, CompensatedPiece, Unfit
+from service.pipeline.compensating import (
+    DT_S,
+    CompensatedPiece,
+    Unfit,
+    follow_tolerance_mm,
+    strayed,
+)
 from service.pipeline.passages import last_length_mm
 from service.pipeline.points import MotionSamples
 from simulation.measures import MotionMeter
@@ -21,9 +27,6 @@ __all__ = ["NEGLIGIBLE_UM", "Verifier"]
 NEGLIGIBLE_UM = 1.0
 """Contour error that nobody sees, whoever has less of it."""
 
-_EXTRUDING_EXCESS_MM = 15e-3
-_TRAVEL_EXCESS_MM = 200e-3
-"""How far the executed motion may be from the command beyond the tolerance, at worst."""
 _TIME_EXCESS_S = 20e-3
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
 """How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
@@ -46,10 +49,7 @@ class Verifier:
         firmware = kit(machine)
         self._machine = machine
         self._step_mm = np.array(firmware.step_mm)
-        # Where vertices lie on steps, and when steps come, are off by up to a step each. What is
-        # shorter than the shortest move goes another way, there and back.
-        coarse_mm = max(2.0 * np.hypot(*self._step_mm[:2]), 2.0 * firmware.shortest_move_mm)
-        self._tolerance_mm = 1e-3 * tolerance_um + float(coarse_mm)
+        self._tolerance_mm = follow_tolerance_mm(firmware, tolerance_um)
         # What is too short for a move of its own is executed by the next one.
         self._waits_mm = firmware.shortest_move_mm
         self._end_mm = self._step_mm + _END_MM
@@ -76,16 +76,8 @@ class Verifier:
         Unfit
             With the reason.
         """
-        tolerance = self._tolerance_mm
-        worst = float(np.max(gap_mm, initial=0.0))
-        if worst > tolerance + _EXTRUDING_EXCESS_MM:
-            printed = float(np.max(gap_mm[made.extruding], initial=0.0))
-            if printed > tolerance + _EXTRUDING_EXCESS_MM or worst > tolerance + _TRAVEL_EXCESS_MM:
-                raise Unfit(
-                    f"read back, the motion is {1e3 * printed:.1f} um from its command while "
-                    f"extruding and {1e3 * worst:.1f} um at worst (tolerance "
-                    f"{1e3 * tolerance:g} um)"
-                )
+        if (reason := strayed(gap_mm, made.extruding, self._tolerance_mm)) is not None:
+            raise Unfit(f"read back, {reason}")
         timeline, begins_s = made.timeline, float(made.timeline.start_s[0])
         lasts_s = float(timeline.end_s[-1] - timeline.start_s[-1])
         begun_s = float(made.encoded.group_start_s[-1]) - begins_s

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcode.firmware.marlin._encoder_kernels import spread_advance
-from gcode.firmware.marlin.encoder import STREAM_ACCEL_MM_S2, stream_limits
+from gcode.firmware.marlin.encoder import stream_limits
 from gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
 from gcode.firmware.marlin.planner import Planner
 from gcode.firmware.marlin.voice import MarlinVoice
 from gcode.sampler import sample_phases
 from models.firmware import Marlin
 from models.firmware.marlin import MarlinPlanner, PerAxis
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 from models.store import load_machine
 from service.pipeline.compensating import CompensatedPiece, PieceCompensator, Unfit
 from service.pipeline.options import Options
@@ -78,11 +78,11 @@ def test_the_firmwares_own_follows_a_ramp_and_not_a_stream(release: str) -> None
     leads = lead_steps(ramp, 3000.0, release)
     assert leads[0] == pytest.approx(full, rel=0.05)
     assert leads[1] == pytest.approx(0.02 * full, abs=3.0)
-    # The same as a stream: 5 mm/s slower every .2 mm. No block has a step in which it brakes.
+    # Under limits far above, 5 mm/s slower every .2 mm: no block has a step of braking.
     speeds = np.arange(100.0, 4.0, -5.0)
     stream = [(0.2, 5.0, 100.0, 100.0)]
     stream += [(0.2, v, v, max(v - 5.0, 5.0)) for v in speeds]
-    leads = lead_steps(stream, STREAM_ACCEL_MM_S2, release)
+    leads = lead_steps(stream, 300_000.0, release)
     assert leads[-1] >= full
 
 
@@ -191,7 +191,7 @@ def test_where_nobody_says_that_there_is_advance_nothing_is_slower_for_it() -> N
 def test_advance_is_off_in_a_stream_and_in_its_rests() -> None:
     firmware = Marlin(linear_advance=True, linear_advance_k_s=K_S)
     own, voice = initial_limits(firmware), MarlinVoice(firmware)
-    stream = stream_limits(own, 500.0)
+    stream = stream_limits(own, CommandLimits())
     assert voice.limits(own).splitlines()[-1] == b"M900 K0.05"
     assert voice.limits(stream).splitlines()[-1] == b"M900 K0"
     assert voice.limits(voice.in_stream(own)).splitlines()[-1] == b"M900 K0"
@@ -201,7 +201,7 @@ def test_advance_is_off_in_a_stream_and_in_its_rests() -> None:
     )
     for none in (Marlin(linear_advance=True), Marlin(linear_advance=False)):
         limits = initial_limits(none)
-        assert b"M900" not in MarlinVoice(none).limits(stream_limits(limits, 500.0))
+        assert b"M900" not in MarlinVoice(none).limits(stream_limits(limits, CommandLimits()))
 
 
 def test_a_stream_is_not_slowed_down_by_advance() -> None:
@@ -209,7 +209,7 @@ def test_a_stream_is_not_slowed_down_by_advance() -> None:
     own = initial_limits(firmware)
     piece = pieces_of(HEAD + PRINTED, machine_of(linear_advance_k_s=1.0))[1]
     durations = []
-    for limits in (own, stream_limits(own, 500.0)):
+    for limits in (own, stream_limits(own, CommandLimits())):
         planner = Planner(firmware)
         tables = [limits] * len(piece.limits)
         planner.push_moves(piece.moves, tables)

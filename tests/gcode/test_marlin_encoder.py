@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
-from gcode.firmware.marlin.encoder import STREAM_ACCEL_MM_S2, stream_limits
+from gcode.firmware.marlin.encoder import stream_limits
 from gcode.firmware.marlin.kit import MarlinKit
 from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from gcode.firmware.marlin.voice import MarlinVoice
 from gcode.interpreter import Interpreter
 from models.firmware import Marlin
 from models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
-from models.machine import Machine
+from models.machine import CommandLimits, Machine
 from models.store import load_machine
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file
@@ -112,7 +112,7 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
         np.zeros(n),
         np.zeros(n),
         np.zeros(n),
-        STREAM_ACCEL_MM_S2,
+        20_000.0,
         False,
         False,
         2e6,
@@ -134,20 +134,20 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
 
 def test_limits_of_a_stream() -> None:
     own = initial_limits(FIRMWARE)
-    stream = stream_limits(own, 500.0)
+    stream = stream_limits(own, CommandLimits())
     assert stream.min_segment_time_us == 0.0
     assert stream.retract_accel_mm_s2 == own.retract_accel_mm_s2
     assert stream.advance_in_filament == 0.0
     lines = MarlinVoice(FIRMWARE).limits(stream).decode().splitlines()
     assert lines == [
-        "M201 X300000 Y300000 Z20000 E300000",
+        "M201 X20000 Y20000 Z200 E300000",
         "M203 X525 Y525 Z20 E200",
-        "M204 P300000 R500 T300000",
-        "M205 B0 S0 T0 J0.3",
+        "M204 P20000 R500 T20000",
+        "M205 B0 S0 T0 J0.01",
     ]
     assert all(len(line) < 96 for line in lines)
     classic = MarlinVoice(Marlin(junction="classic_jerk")).limits(stream).decode()
-    assert classic.splitlines()[3] == "M205 B0 S0 T0 X500 Y500 Z10 E100"
+    assert classic.splitlines()[3] == "M205 B0 S0 T0 X19.09 Y19.09 Z0.3 E100"
 
 
 def test_the_shaper_of_the_firmware() -> None:

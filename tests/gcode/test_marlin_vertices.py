@@ -46,6 +46,7 @@ def lattice(least: int, *, corexy: bool = False, speed_step: float = np.inf) -> 
         least=least,
         corexy=corexy,
         speed_step_mm_s=speed_step,
+        accel_mm_s2=np.inf,
         moves_per_s=1000.0,
     )
 
@@ -249,6 +250,7 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
             6,
             np.ones(2),
             np.full(2, np.inf),
+            np.inf,
             False,
             answers.pole,
             answers.weight,

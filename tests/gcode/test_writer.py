@@ -117,7 +117,7 @@ def test_limits_are_raised_and_restored(road: Road) -> None:
     on = lines.index(b"; stillpath: stream on")
     assert lines[on + 1].startswith(b"SET_INPUT_SHAPER")
     raised = [k for k, line in enumerate(lines) if line.startswith(b"SET_VELOCITY_LIMIT")]
-    assert b"ACCEL=300000" in lines[raised[0]]
+    assert b"ACCEL=20000" in lines[raised[0]]
     off = [k for k, line in enumerate(lines) if line == OFF][1]
     stop = next(k for k, line in enumerate(lines) if line.startswith(b"M400"))
     last = [k for k in raised if k < stop][-1]
@@ -237,7 +237,7 @@ def test_rests_run_under_the_limits_of_the_file(road: Road, machine: Machine) ->
         if b";#" in line and line.startswith((b"G1 E", b"G1 Z")):
             seen[line.split(b" ;#")[0]] = accel
         elif line.startswith(b"G1 X") and b";#" not in line:
-            assert accel == 300_000
+            assert accel == 20_000
     assert seen == {
         b"G1 E-1 F2100": 5000,
         b"G1 Z5.4 F600": 5000,

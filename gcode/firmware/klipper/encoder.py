@@ -1,18 +1,20 @@
 """From a compensated command to the G1 lines that make Klipper execute it.
 
-Klipper re-plans every line. Under limits far above the motion's own the re-planned motion is the
-written one but for small losses at speed steps; these are predicted by their law and taken off the
-feedrate. The firmware's own planner then says whether that was right; what the law misses, which is
-rare, is corrected in another pass (docs/emission.md).
+Klipper re-plans every line, under the acceleration and corners that the motors bear: so the stream
+may break off at any line. What ramps cost at steps of speed is predicted by its law and taken off
+the feedrate. The firmware's own planner then says whether that was right; what the law misses,
+which is rare, is corrected in another pass (docs/emission.md).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gcode.firmware.base import square_corner_mm_s
 from gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -31,13 +33,10 @@ from gcode.segments import Segments
 from gcode.timeline import Group, Timeline
 from gcode.types import Limits, Phases
 from models.firmware import Klipper
+from models.machine import CommandLimits
 
 __all__ = ["KlipperEncoder", "stream_limits"]
 
-STREAM_ACCEL_MM_S2 = 300_000.0
-"""The acceleration that the stream runs under: high enough for the losses to be small, low enough
-that a command of somebody else that slips in is no disaster (docs/emission.md)."""
-STREAM_CORNER_MM_S = 500.0
 
 _Z_GRID = 10
 """A slow climb, a vase's, on steps of a um is flat and then too steep for Z's low acceleration."""
@@ -46,27 +45,29 @@ _TIME_TOLERANCE_S = 2e-6
 
 
 def stream_limits(
-    firmware: Klipper, velocity_mm_s: float, mesh_slope: float = 0.0
+    firmware: Klipper, command: CommandLimits, mesh_slope: float = 0.0
 ) -> KlipperLimits:
-    """Return what a stream runs under.
+    """Return what a stream runs under: what the motors bear, so that it may break off anywhere.
 
     Parameters
     ----------
-    velocity_mm_s : float
-        Highest speed of the command.
+    command : CommandLimits
+        What the motors bear.
     mesh_slope : float
         Largest slope of the bed mesh. Klipper adds the mesh's Z to every move and then caps it by
         the limits of Z (klippy/extras/bed_mesh.py, kinematics/cartesian.py, 2026-08). Those limits
         divided by the slope never bind, however the bed lies, so that times stay as planned.
     """
-    accel = STREAM_ACCEL_MM_S2
+    accel = command.accel_mm_s2
+    # The command keeps its speed axis by axis, Klipper its limit along the path.
+    velocity_mm_s = math.hypot(command.velocity_mm_s, command.velocity_mm_s)
     if mesh_slope > 0.0:
         accel = min(accel, firmware.planner.max_z_accel_mm_s2 / mesh_slope)
         velocity_mm_s = min(velocity_mm_s, firmware.planner.max_z_velocity_mm_s / mesh_slope)
     return KlipperLimits(
         velocity_mm_s=velocity_mm_s,
         accel_mm_s2=accel,
-        square_corner_velocity_mm_s=STREAM_CORNER_MM_S,
+        square_corner_velocity_mm_s=square_corner_mm_s(command),
         minimum_cruise_ratio=0.0,
     )
 

@@ -20,10 +20,7 @@ from gcode.types import Limits
 from models.firmware import Klipper
 from models.machine import CommandLimits, Machine
 
-__all__ = ["MIN_STREAM_ACCEL_MM_S2", "KlipperKit"]
-
-MIN_STREAM_ACCEL_MM_S2 = 30_000.0
-"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+__all__ = ["KlipperKit"]
 
 
 class KlipperKit:
@@ -36,25 +33,23 @@ class KlipperKit:
     def __init__(self, machine: Machine, firmware: Klipper) -> None:
         self._machine = machine
         self._firmware = firmware
-        # The command keeps its speed axis by axis, Klipper its limit along the path.
-        fastest = math.hypot(machine.command.velocity_mm_s, machine.command.velocity_mm_s)
-        self._stream = stream_limits(firmware, fastest, machine.mesh_slope)
+        self._stream = stream_limits(firmware, machine.command, machine.mesh_slope)
 
     @property
     def refusal(self) -> str | None:
         """The bed is too crooked for the machine's Z, or None."""
-        left = self._stream.accel_mm_s2
-        if left >= MIN_STREAM_ACCEL_MM_S2:
+        left, needed = self._stream.accel_mm_s2, self._machine.command.accel_mm_s2
+        if left >= needed:
             return None
-        least = MIN_STREAM_ACCEL_MM_S2 * self._machine.mesh_slope
+        least = needed * self._machine.mesh_slope
         return (
             f"the bed mesh rises by up to {self._machine.mesh_slope:g} mm per mm (mesh_slope), and "
             f"Z, which follows it, leaves X and Y an acceleration of {left:.0f} mm/s2 "
             f"(firmware.planner.max_z_accel_mm_s2 = "
-            f"{self._firmware.planner.max_z_accel_mm_s2:g}); a stream needs "
-            f"{MIN_STREAM_ACCEL_MM_S2:.0f}: level the bed, or raise max_z_accel in printer.cfg and "
-            f"here to {least:.0f}. Or use --method advise, which leaves all moves as they are and "
-            "sets the firmware's own shaper."
+            f"{self._firmware.planner.max_z_accel_mm_s2:g}); a command may ask for "
+            f"{needed:.0f} (command.accel_mm_s2): level the bed, raise max_z_accel in printer.cfg "
+            f"and here to {least:.0f}, or lower command.accel_mm_s2. Or use --method advise, which "
+            "leaves all moves as they are and sets the firmware's own shaper."
         )
 
     def initial_limits(self) -> KlipperLimits:
@@ -102,9 +97,9 @@ class KlipperKit:
         return KlipperAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb so much that Z's limit leaves too little acceleration."""
+        """Tell which moves climb so much that Z's limit leaves a stream too little."""
         length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
         flat = np.hypot(travel_mm[:, 0], travel_mm[:, 1])
         climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * flat
-        least = self._firmware.planner.max_z_accel_mm_s2
-        return np.asarray(climb * MIN_STREAM_ACCEL_MM_S2 > length * least)
+        least = self._firmware.planner.max_z_accel_mm_s2 * (1.0 + 1e-9)
+        return np.asarray(climb * self._stream.accel_mm_s2 > length * least)

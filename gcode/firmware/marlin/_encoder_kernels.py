@@ -236,7 +236,8 @@ def assign_rates(
             now += foreign_s[i]
             before = 0.0
             continue
-        if i == 0 or not ours[i - 1]:
+        first = i == 0 or not ours[i - 1]
+        if first:
             # The stretch starts when its rest is over, whenever that is.
             late = now + planned_s[i] - end_s[i]
         if steps[i] == 0.0:
@@ -247,8 +248,8 @@ def assign_rates(
         per_mm = n / path
         # Where it cannot keep up it may run behind for a while, but must not fall to pieces.
         wanted = end_s[i] + late - now - correction_s[i]
-        if i == 0:
-            # From rest the releases take 1/120 s for the first step: the stretch begins behind it.
+        if first:
+            # From rest the first step takes up to 1/120 s: the stretch begins behind it.
             wanted = planned_s[i]
         hurried = RUSH * path / planned_s[i] + RUSH_MM_S
         least = path / min(fastest_mm_s[i], hurried)
@@ -288,7 +289,7 @@ def assign_rates(
         ticks = np.floor(timer_hz / rate)
         predicted_s[i] = n * ticks / timer_hz + lost + correction_s[i]
         now += predicted_s[i]
-        if i == 0:
+        if first:
             late += predicted_s[i] - planned_s[i]
         v = rate / per_mm
         if bugfix and i > 0 and ours[i - 1] and steps[i - 1] > 1.0 and before > v:

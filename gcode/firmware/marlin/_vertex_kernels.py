@@ -174,6 +174,7 @@ def choose_vertices(
     least: int,
     unit: Any,
     step: Any,
+    bend: float,
     corexy: bool,
     pole: Any,
     weight: Any,
@@ -198,6 +199,9 @@ def choose_vertices(
     step : ndarray, shape (2,)
         By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
         at a vertex, beyond what rounding brings; more is made to cost much.
+    bend : float
+        Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
+        shorter of two segments; what does not fit is made to cost as much.
     pole, weight : ndarray, shape (2, 2 order)
     direct : ndarray, shape (2,)
         The printer's answer to an error e is direct e + sum of Re(weight x), x <- pole x + e, for
@@ -234,6 +238,7 @@ def choose_vertices(
         least,
         unit,
         step,
+        bend,
         corexy,
         pole,
         weight,
@@ -263,6 +268,7 @@ def _follow(
     least: int,
     unit: Any,
     step: Any,
+    bend: float,
     corexy: bool,
     pole: Any,
     weight: Any,
@@ -323,11 +329,12 @@ def _follow(
                 i = came[j, d]
                 from_x, from_y, begin = place[j, d, 0], place[j, d, 1], place_at[j, d]
                 fed = _fed(command, begin)
-                ax, ay, rate_x, rate_y, rounding = 0.0, 0.0, 0.0, 0.0, 0.0
+                ax, ay, rate_x, rate_y, rounding, lasts = 0.0, 0.0, 0.0, 0.0, 0.0, np.inf
                 if i >= 0:
                     h, b = i // MOST_PLACES, i % MOST_PLACES
                     ax, ay = float(from_x - place[h, b, 0]), float(from_y - place[h, b, 1])
-                    rounding = 1.0 / (begin - place_at[h, b])
+                    lasts = begin - place_at[h, b]
+                    rounding = 1.0 / lasts
                     rate_x, rate_y = ax * rounding, ay * rounding
                 for c in range(count[k]):
                     bx, by = float(place[k, c, 0] - from_x), float(place[k, c, 1] - from_y)
@@ -345,9 +352,14 @@ def _follow(
                     some = True
                     per = 1.0 / span
                     jump = per + rounding
-                    total += _jolt(bx * per - rate_x, by * per - rate_y, jump, step, corexy)
+                    dx, dy = bx * per - rate_x, by * per - rate_y
+                    total += _jolt(dx, dy, jump, step, corexy)
+                    # From a stand the mean speed of a ramp is half of what it reaches.
+                    room = bend * (min(span, lasts) if i >= 0 else 0.5 * span)
+                    total += _crowded(dx * unit[0], dy * unit[1], room)
                     if last:
                         total += _jolt(bx * per, by * per, per, step, corexy)
+                        total += _crowded(bx * per * unit[0], by * per * unit[1], 0.5 * bend * span)
                     for q in range(width):
                         x[q] = states[j, d, q]
                     s = int(np.ceil(begin + 1e-6))
@@ -441,6 +453,13 @@ def _jolt(dx: float, dy: float, rounding: float, most: Any, corexy: bool) -> flo
         dx = dy = dx + dy
         rounding *= 2.0
     excess = max(dx - most[0], dy - most[1]) - rounding
+    return (_JOLT * excess) ** 2 if excess > 0.0 else 0.0
+
+
+@kernel(inline=True)
+def _crowded(dx: float, dy: float, most: float) -> float:
+    """Cost of a step of speed, steps of X per sample, for which there is not the time."""
+    excess = np.sqrt(dx * dx + dy * dy) - most
     return (_JOLT * excess) ** 2 if excess > 0.0 else 0.0
 
 

@@ -9,6 +9,7 @@ the filament (docs/marlin.md).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.advance import feed_at_ends, final_segments
+from gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
 from gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
@@ -44,18 +46,20 @@ from gcode.segments import Segments
 from gcode.timeline import Group, Timeline
 from gcode.types import Limits, Phases
 from models.firmware import Marlin
+from models.machine import CommandLimits
 
-__all__ = ["MarlinEncoder", "stream_limits"]
+__all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 
-STREAM_ACCEL_MM_S2 = 300_000.0
-"""High enough for ramps to be parts of a step, low enough that a command of somebody else that
-slips in is no disaster, and within the 32 bits of Marlin's acceleration_rate."""
-STREAM_Z_ACCEL_MM_S2 = 20_000.0
-STREAM_DEVIATION_MM = 0.3
-"""The largest that M205 J takes."""
-STREAM_JERK_MM_S = 500.0
+STEEPEST = 0.01
+"""Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
+STREAM_E_ACCEL_MM_S2 = 300_000.0
+"""The filament carries linear advance, and must not be what limits X and Y; within the 32 bits of
+Marlin's acceleration_rate."""
+STREAM_MESH_ACCEL_MM_S2 = 20_000.0
+"""Of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
 STREAM_E_JERK_MM_S = 100.0
-STREAM_Z_JERK_MM_S = 10.0
+DEVIATION_MM = (0.01, 0.3)
+"""What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
 
 _MOST_FEED = 3.0
 """Filament per mm, above which the firmware takes a move for a retraction and advances none."""
@@ -68,31 +72,41 @@ _BYTES_PER_LINE = 32.0
 """Of a line of ours with its line number, checksum and the host's share of the acknowledgement."""
 
 
-def stream_limits(own: MarlinLimits, velocity_mm_s: float) -> MarlinLimits:
+def stream_limits(
+    own: MarlinLimits, command: CommandLimits, mesh_slope: float = 0.0
+) -> MarlinLimits:
     """Return what a stream runs under where the file has set `own`.
 
-    Retractions are not ours, so their acceleration stays. Linear advance is off, and the extruder
-    may be as much faster as the filament has to do for it.
+    X and Y keep what the motors bear, so that the stream may break off anywhere. Retractions are
+    not ours, so their acceleration stays. Linear advance is off, and the extruder may be as much
+    faster as the filament has to do for it.
     """
     feed = 2.0 * own.feedrate_e_mm_s
     if own.linear_advance_k_s > 0.0:
         feed += 2.0 * max(advance_speed_mm_s(own, classic_jerk=jerk) for jerk in (False, True))
+    accel, step = command.accel_mm_s2, corner_step_mm_s(command)
+    slope = mesh_slope + STEEPEST
+    # Along a mesh Z takes a step within one segment, and none within the next.
+    hop = STREAM_MESH_ACCEL_MM_S2 if mesh_slope > 0.0 else 0.0
+    # By junction deviation a corner is passed as by Klipper's square corner velocity.
+    deviation_mm = (math.sqrt(2.0) - 1.0) * square_corner_mm_s(command) ** 2 / accel
     return replace(
         without_advance(own),
-        accel_x_mm_s2=STREAM_ACCEL_MM_S2,
-        accel_y_mm_s2=STREAM_ACCEL_MM_S2,
-        accel_z_mm_s2=max(own.accel_z_mm_s2, STREAM_Z_ACCEL_MM_S2),
-        accel_e_mm_s2=STREAM_ACCEL_MM_S2,
-        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * velocity_mm_s),
-        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * velocity_mm_s),
+        accel_x_mm_s2=accel,
+        accel_y_mm_s2=accel,
+        accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel, hop),
+        accel_e_mm_s2=STREAM_E_ACCEL_MM_S2,
+        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * command.velocity_mm_s),
+        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * command.velocity_mm_s),
         feedrate_e_mm_s=feed,
-        print_accel_mm_s2=STREAM_ACCEL_MM_S2,
-        travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
-        jerk_x_mm_s=STREAM_JERK_MM_S,
-        jerk_y_mm_s=STREAM_JERK_MM_S,
-        jerk_z_mm_s=max(own.jerk_z_mm_s, STREAM_Z_JERK_MM_S),
+        print_accel_mm_s2=accel,
+        travel_accel_mm_s2=accel,
+        # It limits the step of each axis.
+        jerk_x_mm_s=round(step / math.sqrt(2.0), 2),
+        jerk_y_mm_s=round(step / math.sqrt(2.0), 2),
+        jerk_z_mm_s=max(own.jerk_z_mm_s, slope * step),
         jerk_e_mm_s=max(own.jerk_e_mm_s, STREAM_E_JERK_MM_S),
-        junction_deviation_mm=max(own.junction_deviation_mm, STREAM_DEVIATION_MM),
+        junction_deviation_mm=min(max(deviation_mm, DEVIATION_MM[0]), DEVIATION_MM[1]),
         min_segment_time_us=0.0,
         min_feedrate_mm_s=0.0,
         min_travel_feedrate_mm_s=0.0,
@@ -105,11 +119,10 @@ class MarlinEncoder:
     Parameters
     ----------
     firmware : Marlin
-    velocity_mm_s : float
-        Highest speed of the command.
+    command : CommandLimits
+        What the motors bear.
     corexy : bool
-    speed_step_mm_s : float
-        Largest step of a motor's speed.
+    mesh_slope : float
     travel_mm : sequence of (float, float), optional
         Least and largest X, and Y.
     """
@@ -117,14 +130,15 @@ class MarlinEncoder:
     def __init__(
         self,
         firmware: Marlin,
-        velocity_mm_s: float,
+        command: CommandLimits,
         *,
         corexy: bool,
-        speed_step_mm_s: float = np.inf,
+        mesh_slope: float = 0.0,
         travel_mm: Sequence[tuple[float, float]] = ((-1e6, 1e6), (-1e6, 1e6)),
     ) -> None:
         self._firmware = firmware
-        self._velocity = velocity_mm_s
+        self._command = command
+        self._mesh_slope = mesh_slope
         self._corexy = corexy
         self._releases = firmware.variant in ("2.0", "2.1")
         scale = firmware.steps_per_mm
@@ -142,7 +156,8 @@ class MarlinEncoder:
             high=np.floor(high_mm * self._scale[:2] + 1e-6).astype(np.int64),
             least=firmware.min_steps_per_segment,
             corexy=corexy,
-            speed_step_mm_s=speed_step_mm_s,
+            speed_step_mm_s=command.speed_step_mm_s,
+            accel_mm_s2=command.accel_mm_s2,
             moves_per_s=rate,
         )
 
@@ -162,7 +177,7 @@ class MarlinEncoder:
             Where linear advance would drive the extruder faster than the firmware lets it.
         """
         own = cast(MarlinLimits, piece.limits_before)
-        limits = stream_limits(own, self._velocity)
+        limits = stream_limits(own, self._command, self._mesh_slope)
         segments = self._advanced(piece, timeline, self._on_steps(timeline, segments))
         moves = interleave(piece, timeline, segments, 1)
         moves = self._where_the_file_says(piece, timeline, moves)
@@ -171,13 +186,16 @@ class MarlinEncoder:
         start_mm, end_mm = start / UNITS_PER_MM, moves.position / UNITS_PER_MM
         ours = rows < 0
         limits_id, table = limits_in_force(piece, rows, limits)
-        speed = np.where(ours, _DIAGONAL * self._velocity, piece.moves.speed_mm_s[rows])
+        speed = np.where(
+            ours, _DIAGONAL * self._command.velocity_mm_s, piece.moves.speed_mm_s[rows]
+        )
         steps, path = self._blocks(start_mm, end_mm)
 
         phases = self._plan(start_mm, end_mm, speed, limits_id, table)
         actual = phases.accel_s + phases.cruise_s + phases.decel_s
         correction, feedrate, predicted = (np.zeros(len(rows)) for _ in range(3))
-        floor_mm_s = np.sqrt(0.5 * STREAM_ACCEL_MM_S2 * path / np.maximum(steps, 1.0))
+        accel = self._command.accel_mm_s2
+        floor_mm_s = np.sqrt(0.5 * accel * path / np.maximum(steps, 1.0))
         for attempt in range(_PASSES):
             assign_rates(
                 ours,
@@ -189,7 +207,7 @@ class MarlinEncoder:
                 actual,
                 correction,
                 floor_mm_s,
-                STREAM_ACCEL_MM_S2,
+                accel,
                 self._firmware.variant == "bugfix",
                 self._releases and self._firmware.junction == "classic_jerk",
                 self._firmware.step_timer_hz,
@@ -206,14 +224,16 @@ class MarlinEncoder:
             # Rates have steps: a full correction would swing to and fro.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
         encoded = encoded_piece(timeline, moves, limits, feedrate, phases)
-        if not ours[0]:
-            return encoded
         # What the first step from rest takes too long, the stretch begins later.
-        delay_s = float(actual[0] - moves.planned_s[0])
-        group_start_s, row_start_s = encoded.group_start_s.copy(), encoded.row_start_s.copy()
-        group_start_s[0] += delay_s
-        row_start_s[: timeline.groups[0].last] += delay_s
-        return replace(encoded, group_start_s=group_start_s, row_start_s=row_start_s)
+        first = ours & np.append(True, ~ours[:-1])
+        delay_s = np.zeros(len(timeline.groups))
+        delay_s[moves.group[first]] = (actual - moves.planned_s)[first]
+        rows = [group.last - group.first for group in timeline.groups]
+        return replace(
+            encoded,
+            group_start_s=encoded.group_start_s + delay_s,
+            row_start_s=encoded.row_start_s + np.repeat(delay_s, rows),
+        )
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Segments with linear advance in their filament.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gcode.dialect import Dialect
 from gcode.firmware.base import scaled
 from gcode.firmware.marlin.advice import MarlinAdviser
-from gcode.firmware.marlin.encoder import STREAM_Z_ACCEL_MM_S2, MarlinEncoder, stream_limits
+from gcode.firmware.marlin.encoder import DEVIATION_MM, STEEPEST, MarlinEncoder, stream_limits
 from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from gcode.firmware.marlin.planner import Planner
 from gcode.firmware.marlin.voice import MarlinVoice
@@ -20,17 +20,14 @@ from gcode.types import Limits
 from models.firmware import Marlin
 from models.machine import CommandLimits, Machine
 
-__all__ = ["LONGEST_LEAST_MM", "MIN_STREAM_ACCEL_MM_S2", "MarlinKit"]
+__all__ = ["LONGEST_LEAST_MM", "MarlinKit"]
 
-MIN_STREAM_ACCEL_MM_S2 = 30_000.0
-"""Below this acceleration a dense stream cannot keep its times; such moves stay as they are."""
+STEEPEST_MESH = 0.1
+"""Z is driven with the stream's acceleration times the slope."""
 
 LONGEST_LEAST_MM = 0.1
 """Longest of the shortest moves that a firmware may execute: a turn straight back is cut off by a
 quarter of it, and a stand in the middle of a stretch is crossed by half of it (docs/marlin.md)."""
-
-JUNCTION_DEVIATION_MM = (0.01, 0.3)
-"""What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
 
 _ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
 
@@ -48,8 +45,7 @@ class MarlinKit:
     def __init__(self, machine: Machine, firmware: Marlin) -> None:
         self._firmware = firmware
         self._corexy = machine.kinematics == "corexy"
-        self._velocity = machine.command.velocity_mm_s
-        self._speed_step = machine.command.speed_step_mm_s
+        self._command = machine.command
         self._mesh_slope = machine.mesh_slope
         x, y = machine.travel["x"], machine.travel["y"]
         self._travel_mm = ((x.min_mm, x.max_mm), (y.min_mm, y.max_mm))
@@ -89,7 +85,7 @@ class MarlinKit:
                 "second at most; print from a 32-bit board, or " + _ALTERNATIVE
             )
         deviation_mm = firmware.planner.junction_deviation_mm
-        low, high = JUNCTION_DEVIATION_MM
+        low, high = DEVIATION_MM
         if firmware.junction == "deviation" and not low <= deviation_mm <= high:
             return (
                 f"M205 J takes {low:g} to {high:g} mm, so the machine's junction deviation of "
@@ -107,12 +103,11 @@ class MarlinKit:
                 "microsteps, or " + _ALTERNATIVE
             )
         slope = self._mesh_slope
-        if slope > 0.0 and slope * MIN_STREAM_ACCEL_MM_S2 > STREAM_Z_ACCEL_MM_S2:
+        if slope > STEEPEST_MESH:
             return (
                 f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z, which "
                 "follows it, takes part in a stream up to "
-                f"{STREAM_Z_ACCEL_MM_S2 / MIN_STREAM_ACCEL_MM_S2:.2g}: tram the bed, or "
-                + _ALTERNATIVE
+                f"{STEEPEST_MESH:g}: tram the bed, or " + _ALTERNATIVE
             )
         return None
 
@@ -122,7 +117,7 @@ class MarlinKit:
 
     def stream_limits(self, own: Limits) -> MarlinLimits:
         """Return what a stream runs under where the file has set `own`."""
-        return stream_limits(cast(MarlinLimits, own), self._velocity)
+        return stream_limits(cast(MarlinLimits, own), self._command, self._mesh_slope)
 
     def quickened(
         self, own: Limits, accel: float, speed: float, most: CommandLimits
@@ -150,9 +145,9 @@ class MarlinKit:
         """Return an encoder of the stream."""
         return MarlinEncoder(
             self._firmware,
-            self._velocity,
+            self._command,
             corexy=self._corexy,
-            speed_step_mm_s=self._speed_step,
+            mesh_slope=self._mesh_slope,
             travel_mm=self._travel_mm,
         )
 
@@ -165,9 +160,9 @@ class MarlinKit:
         return MarlinAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb so much that Z leaves too little acceleration."""
+        """Tell which moves climb more, beside the bed mesh, than Z can follow a stream."""
         length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
         climb = np.abs(travel_mm[:, 2])
-        steep = climb * MIN_STREAM_ACCEL_MM_S2 > length * STREAM_Z_ACCEL_MM_S2
+        steep = climb > STEEPEST * length
         fast = self._firmware.planner.max_feedrate_mm_s.z * length
-        return np.asarray(steep | (climb * self._velocity > fast))
+        return np.asarray(steep | (climb * self._command.velocity_mm_s > fast))

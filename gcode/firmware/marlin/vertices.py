@@ -41,6 +41,8 @@ class Lattice:
     corexy : bool
     speed_step_mm_s : float
         Largest step of a motor's speed.
+    accel_mm_s2 : float
+        That the moves are executed with.
     moves_per_s : float
         As many moves come in.
     """
@@ -51,6 +53,7 @@ class Lattice:
     least: int
     corexy: bool
     speed_step_mm_s: float
+    accel_mm_s2: float
     moves_per_s: float
 
 
@@ -173,6 +176,7 @@ def _chosen(
         lattice.least,
         scale[0] / scale[:2],
         _CALM * lattice.speed_step_mm_s * scale[:2] * dt_s,
+        lattice.accel_mm_s2 * scale[0] * dt_s**2,
         lattice.corexy,
         answers.pole,
         answers.weight,

@@ -1,13 +1,14 @@
 """From a compensated command to the G1 lines that make RepRapFirmware execute it.
 
 The speed along the path is continuous in this firmware: a step of it costs time, a step of
-direction costs none within the jerk limits. Under limits far above the motion's own the losses are
-small, and foreseen to the clock. Places are whole motor steps, reached when the command is nearest
-to them. Pressure advance is written into the filament (docs/reprapfirmware.md).
+direction costs none within the jerk limits. The stream runs under what the motors bear, so that it
+may break off at any line; what ramps cost is foreseen to the clock. Places are whole motor steps,
+reached when the command is nearest to them. Pressure advance is written into the filament (docs/reprapfirmware.md).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from gcode.errors import GcodeError
 from gcode.firmware.advance import feed_at_ends, final_segments
+from gcode.firmware.base import corner_step_mm_s
 from gcode.firmware.encoding import (
     Encoded,
     as_moves,
@@ -35,20 +37,21 @@ from gcode.types import Limits, Phases
 from models.firmware import RepRapFirmware
 from models.machine import CommandLimits
 
-__all__ = ["RepRapEncoder", "stream_limits"]
+__all__ = ["STEEPEST", "RepRapEncoder", "stream_limits"]
 
-STREAM_ACCEL_MM_S2 = 60_000.0
-"""Several times what a command asks for. A peak of speed that this reaches in less than ten clocks
-is cut off (0.8 mm/s), and the cut costs the more time the higher the acceleration is."""
+STEEPEST = 0.01
+"""Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
+STREAM_E_ACCEL_MM_S2 = 60_000.0
+"""The filament carries pressure advance, and must not be what limits X and Y."""
 LEAST_SPEED_MM_S = 0.01
 """The least that the firmware can be set to; slower moves are hurried."""
-_JERK_SHARE = 2.0
-"""Of `command.speed_step_mm_s`, and of the extruder's own jerk: between acceleration and
-deceleration the firmware's own pressure advance steps by twice the jerk."""
+_E_JERK_SHARE = 2.0
+"""Of the extruder's own jerk: between acceleration and deceleration the firmware's own pressure
+advance steps by twice the jerk."""
 _DIAGONAL = 1.5
 """A CoreXY motor may run so much faster than the path, and Z's direction change so much more."""
-_PASSES = 2
-_EXACT_S = 1e-9
+_PASSES = 4
+_EXACT_S = 2e-6
 _POLL_S = 2e-3
 """The firmware looks every 2 ms whether moves are to be frozen."""
 _SHIFT = 0.3
@@ -65,25 +68,28 @@ def stream_limits(
 ) -> RepRapLimits:
     """Return what the stream runs under.
 
-    X, Y and the filament of printing moves are free; what Z and the extruder may do by themselves
-    stays, because a rest's own move runs on into the stream. Z follows a bed mesh, though, and its
-    speed steps by the slope times what X and Y do.
+    X and Y keep what the motors bear, so that the stream may break off anywhere. What Z and the
+    extruder may do by themselves stays, because a rest's own move runs on into the stream. Z
+    follows a bed mesh, though, and is asked for the slope times what X and Y do.
     """
     own = RepRapLimits.of(firmware, 0.0)
-    jerk = _JERK_SHARE * command.speed_step_mm_s
-    extruder = _JERK_SHARE * own.jerk_e_mm_s
-    climb = max(own.jerk_z_mm_s, _DIAGONAL * mesh_slope * jerk)
+    accel = command.accel_mm_s2
+    # It limits the step of each axis.
+    jerk = round(corner_step_mm_s(command) / math.sqrt(2.0), 2)
+    extruder = _E_JERK_SHARE * own.jerk_e_mm_s
+    slope = mesh_slope + STEEPEST
+    climb = max(own.jerk_z_mm_s, _DIAGONAL * slope * jerk)
     return replace(
         own,
-        accel_x_mm_s2=STREAM_ACCEL_MM_S2,
-        accel_y_mm_s2=STREAM_ACCEL_MM_S2,
-        accel_z_mm_s2=STREAM_ACCEL_MM_S2,
-        accel_e_mm_s2=STREAM_ACCEL_MM_S2,
+        accel_x_mm_s2=accel,
+        accel_y_mm_s2=accel,
+        accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel),
+        accel_e_mm_s2=max(own.accel_e_mm_s2, STREAM_E_ACCEL_MM_S2),
         speed_x_mm_s=_DIAGONAL * command.velocity_mm_s,
         speed_y_mm_s=_DIAGONAL * command.velocity_mm_s,
         min_speed_mm_s=LEAST_SPEED_MM_S,
-        print_accel_mm_s2=STREAM_ACCEL_MM_S2,
-        travel_accel_mm_s2=STREAM_ACCEL_MM_S2,
+        print_accel_mm_s2=accel,
+        travel_accel_mm_s2=accel,
         jerk_x_mm_s=jerk,
         jerk_y_mm_s=jerk,
         jerk_z_mm_s=climb,
@@ -143,17 +149,22 @@ class RepRapEncoder:
         foreseen = (length, moves.end_s, moves.planned_s, speed, accel, junction)
         begin_s, clock_hz = float(timeline.start_s[0]), self._firmware.step_clock_hz
         feedrate, predicted, missed = (np.zeros(len(rows)) for _ in range(3))
-        for _ in range(_PASSES):
+        least_s = np.inf
+        for attempt in range(_PASSES):
             assign_speeds(ours, *foreseen, missed, begin_s, clock_hz, feedrate, predicted)
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
-            # Only rests, whose moves brake for what comes later, are foreseen a little wrong.
+            # Rests, whose moves brake for what comes later, are foreseen a little wrong; and a peak
+            # of speed that is nearly cut off may be or not be, whatever was foreseen.
             miss = phases.accel_s + phases.cruise_s + phases.decel_s - predicted
-            if np.max(np.abs(miss), initial=0.0) < _EXACT_S:
+            wrong_s = float(np.max(np.abs(np.cumsum(miss)), initial=0.0))
+            if wrong_s < least_s:
+                best, plan, least_s = feedrate.copy(), phases, wrong_s
+            if wrong_s < _EXACT_S:
                 break
-            missed += miss
-        self._check_rate(phases, piece)
-        return encoded_piece(timeline, moves, self._limits, feedrate, phases)
+            missed += miss if attempt == 0 else 0.5 * miss
+        self._check_rate(plan, piece)
+        return encoded_piece(timeline, moves, self._limits, best, plan)
 
     def _sparse(self, timeline: Timeline, segments: Segments) -> Segments:
         """Leave out ends where segments come faster than the firmware's queue can take them."""

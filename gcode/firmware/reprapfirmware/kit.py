@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gcode.dialect import Dialect
 from gcode.firmware.base import scaled
 from gcode.firmware.reprapfirmware.advice import RepRapAdviser
-from gcode.firmware.reprapfirmware.encoder import RepRapEncoder, stream_limits
+from gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
 from gcode.firmware.reprapfirmware.limits import RepRapLimits
 from gcode.firmware.reprapfirmware.planner import RepRapPlanner
 from gcode.firmware.reprapfirmware.voice import RepRapVoice
@@ -22,8 +22,8 @@ from models.machine import CommandLimits, Machine
 
 __all__ = ["RepRapKit"]
 
-STEEPEST = 0.1
-"""Z is driven with the stream's acceleration times the slope; steeper moves stay as they are."""
+STEEPEST_MESH = 0.1
+"""Z is driven with the stream's acceleration times the slope."""
 
 
 _ACCELERATIONS = ("accel_x_mm_s2", "accel_y_mm_s2", "print_accel_mm_s2", "travel_accel_mm_s2")
@@ -50,12 +50,12 @@ class RepRapKit:
     def refusal(self) -> str | None:
         """Why no stream can be made."""
         slope = self._machine.mesh_slope
-        if slope <= STEEPEST:
+        if slope <= STEEPEST_MESH:
             return None
         return (
             f"the bed mesh rises by up to {slope:g} mm per mm (mesh_slope), and Z can follow a "
-            f"stream up to {STEEPEST:g}: tram the bed, or use --method advise, which leaves all "
-            "moves as they are and sets shaper and accelerations"
+            f"stream up to {STEEPEST_MESH:g}: tram the bed, or use --method advise, which leaves "
+            "all moves as they are and sets shaper and accelerations"
         )
 
     def initial_limits(self) -> RepRapLimits:
@@ -97,7 +97,6 @@ class RepRapKit:
         return RepRapAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb more than Z can follow a stream, the bed mesh included."""
+        """Tell which moves climb more, beside the bed mesh, than Z can follow a stream."""
         way = np.sqrt(np.sum(travel_mm[:, :2] ** 2, axis=1))
-        climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * way
-        return np.asarray(climb > STEEPEST * way)
+        return np.asarray(np.abs(travel_mm[:, 2]) > STEEPEST * way)
