@@ -228,11 +228,11 @@ class MarlinEncoder:
         first = ours & np.append(True, ~ours[:-1])
         delay_s = np.zeros(len(timeline.groups))
         delay_s[moves.group[first]] = (actual - moves.planned_s)[first]
-        rows = [group.last - group.first for group in timeline.groups]
+        counts = [group.last - group.first for group in timeline.groups]
         return replace(
             encoded,
             group_start_s=encoded.group_start_s + delay_s,
-            row_start_s=encoded.row_start_s + np.repeat(delay_s, rows),
+            row_start_s=encoded.row_start_s + np.repeat(delay_s, counts),
         )
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:

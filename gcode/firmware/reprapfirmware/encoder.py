@@ -3,7 +3,8 @@
 The speed along the path is continuous in this firmware: a step of it costs time, a step of
 direction costs none within the jerk limits. The stream runs under what the motors bear, so that it
 may break off at any line; what ramps cost is foreseen to the clock. Places are whole motor steps,
-reached when the command is nearest to them. Pressure advance is written into the filament (docs/reprapfirmware.md).
+reached when the command is nearest to them. Pressure advance is written into the filament
+(docs/reprapfirmware.md).
 """
 
 from __future__ import annotations
