@@ -42,12 +42,16 @@ class AxisTravel(Document):
 
 
 class CommandLimits(Document):
-    """What the compensated command of X and Y may ask of the machine."""
+    """What the motors of X and Y bear: no command asks for more, nor does a stream that breaks off.
+
+    The written stream runs under these limits, so that the firmware itself keeps them whatever
+    happens: braking for a pause, going on behind it, at any line.
+    """
 
     velocity_mm_s: Positive = 500.0
     accel_mm_s2: Positive = 20_000.0
     speed_step_mm_s: Positive = 45.0
-    """Largest step of a motor's speed from one straight segment to the next."""
+    """Largest step of a motor's speed within a ms, from one straight segment to the next."""
 
 
 class Machine(Document):

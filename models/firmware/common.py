@@ -67,6 +67,11 @@ class FirmwareFacts(Document):
         raise NotImplementedError
 
     @property
+    def corner_mm_s(self) -> float:
+        """Configured speed through a square corner of X and Y."""
+        raise NotImplementedError
+
+    @property
     def fastest_z_mm_s(self) -> float:
         """Highest configured speed of Z."""
         raise NotImplementedError

@@ -70,6 +70,11 @@ class Klipper(FirmwareFacts):
         return self.planner.max_accel_mm_s2
 
     @property
+    def corner_mm_s(self) -> float:
+        """Configured speed through a square corner of X and Y."""
+        return self.planner.square_corner_velocity_mm_s
+
+    @property
     def fastest_z_mm_s(self) -> float:
         """Highest configured speed of Z."""
         return self.planner.max_z_velocity_mm_s

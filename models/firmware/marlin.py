@@ -6,6 +6,7 @@ config/examples/Creality/Ender-3/CrealityV1, 2.1.x). Rules and sources: docs/mar
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -162,6 +163,15 @@ class Marlin(FirmwareFacts):
         """Largest configured acceleration of moves that print."""
         limit = self.planner.max_accel_mm_s2
         return min(self.planner.accel_mm_s2, max(limit.x, limit.y))
+
+    @property
+    def corner_mm_s(self) -> float:
+        """Configured speed through a square corner of X and Y."""
+        planner = self.planner
+        if self.junction == "classic_jerk":
+            return min(planner.jerk_mm_s.x, planner.jerk_mm_s.y)
+        bend = planner.junction_deviation_mm * self.largest_accel_mm_s2
+        return math.sqrt(bend / (math.sqrt(2.0) - 1.0))
 
     @property
     def fastest_z_mm_s(self) -> float:

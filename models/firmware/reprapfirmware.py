@@ -99,6 +99,11 @@ class RepRapFirmware(FirmwareFacts):
         return min(self.print_accel_mm_s2, max(self.x.max_accel_mm_s2, self.y.max_accel_mm_s2))
 
     @property
+    def corner_mm_s(self) -> float:
+        """Configured speed through a square corner of X and Y."""
+        return min(self.x.jerk_mm_s, self.y.jerk_mm_s)
+
+    @property
     def fastest_z_mm_s(self) -> float:
         """Highest configured speed of Z."""
         return self.z.max_speed_mm_s

@@ -17,19 +17,23 @@ __all__ = [
     "Difference",
     "age_warnings",
     "check_before_job",
+    "derived_envelope",
     "differences",
+    "envelope_warnings",
     "machine_from_config",
     "not_followed",
     "typed_in",
-    "with_room",
 ]
 
 _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
 _FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
 _DAMPING_SCALE = (0.5, 1.0, 1.5)
-_COMMAND_ROOM = 1.4
-"""A command may ask for so many times the acceleration of its path (`compensation.fbf`)."""
+_ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
+"""What motors are taken to bear when nobody says: these multiples of the acceleration, speed and
+corner speed that the printer allows a file."""
+_LEAST_STEP_MM_S = 20.0
+_NOT_MORE = 1.001
 _RELATIVE = 1e-6
 
 
@@ -73,7 +77,11 @@ def check_before_job(
         The printer's configuration as it is now.
     """
     found = [] if config is None else differences(machine, config)
-    return [*age_warnings(machine, now, max_age_days), *(entry.text for entry in found)]
+    return [
+        *age_warnings(machine, now, max_age_days),
+        *envelope_warnings(machine),
+        *(entry.text for entry in found),
+    ]
 
 
 def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:
@@ -176,7 +184,7 @@ def machine_from_config(
     except ValidationError as error:
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
-    return machine.model_copy(update={"command": with_room(machine.firmware)})
+    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
@@ -200,13 +208,35 @@ def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
     }
 
 
-def with_room(firmware: FirmwareFacts) -> CommandLimits:
-    """Return limits of the command that leave it room above what the printer allows a file."""
-    usual = CommandLimits()
+def derived_envelope(firmware: FirmwareFacts) -> CommandLimits:
+    """Return what the motors are taken to bear, from what the printer allows a file.
+
+    A little more than that, since a command has to lead the nozzle; who knows more says so in the
+    machine's `command`.
+    """
+    step = _CORNERS * firmware.corner_mm_s
     return CommandLimits(
-        velocity_mm_s=max(usual.velocity_mm_s, _COMMAND_ROOM * firmware.fastest_mm_s),
-        accel_mm_s2=max(usual.accel_mm_s2, _COMMAND_ROOM * firmware.largest_accel_mm_s2),
+        velocity_mm_s=_SPEED_ROOM * firmware.fastest_mm_s,
+        accel_mm_s2=_ACCEL_ROOM * firmware.largest_accel_mm_s2,
+        speed_step_mm_s=min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     )
+
+
+def envelope_warnings(machine: Machine) -> list[str]:
+    """Return a line if a command may ask for more than the printer's own limits suggest.
+
+    Until 2026-11 machines were made with 20 000 mm/s2 whatever the printer's limit was.
+    """
+    derived, stated = derived_envelope(machine.firmware), machine.command
+    if stated.accel_mm_s2 <= _NOT_MORE * derived.accel_mm_s2:
+        return []
+    text = (
+        f"{machine.name}: a command may ask the motors for {stated.accel_mm_s2:.0f} mm/s2 "
+        f"(command.accel_mm_s2), more than {_ACCEL_ROOM:g} times what the printer allows a file "
+        f"({machine.firmware.largest_accel_mm_s2:.0f}): right if the motors were tried at it; "
+        f"otherwise put {derived.accel_mm_s2:.0f} there"
+    )
+    return [text]
 
 
 def _at(document: Any, place: str) -> Any:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from models.errors import ModelError
 from models.machine import Machine
 from models.store import explain
-from service.machines.checks import typed_in, with_room
+from service.machines.checks import derived_envelope, typed_in
 
 __all__ = [
     "ASSUMED",
@@ -158,7 +158,7 @@ def machine_from_m503(
         machine = Machine.model_validate(document)
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
-    return machine.model_copy(update={"command": with_room(machine.firmware)})
+    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
 
 
 def with_m503(machine: Machine, text: str, file: str) -> Machine:
