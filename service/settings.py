@@ -58,8 +58,15 @@ class Settings(MachineSettings, BaseSettings):
         How long a worker may take to obey a cancel before its process is ended.
     max_job_s, max_job_bytes : float, int
         A job that takes longer, or whose process grows larger, fails.
+    computing_processes : int
+        Processes that compute for requests: designs, identifications, controllers.
+    max_computing_s, max_computing_bytes : float, int
+        What one of these may take, beside what is loaded at its start.
     max_upload_bytes : int
         A larger upload is refused with status 413.
+    disk_reserve_bytes : int
+        Stays free on the disk of `data_dir`: uploads that would leave less are refused with status
+        507, jobs wait for half of it. 0: the disk is not looked at.
     max_jobs_per_owner, max_bytes_per_owner : int
         Jobs not yet over, and bytes of all jobs kept, that one owner may have.
     requests_per_minute : int
@@ -94,7 +101,11 @@ class Settings(MachineSettings, BaseSettings):
     cancel_grace_s: Annotated[float, Field(gt=0)] = 10.0
     max_job_s: Annotated[float, Field(gt=0)] = 4 * 3600.0
     max_job_bytes: Annotated[int, Field(gt=0)] = 4 << 30
+    computing_processes: Annotated[int, Field(ge=1, le=64)] = 2
+    max_computing_s: Annotated[float, Field(gt=0)] = 300.0
+    max_computing_bytes: Annotated[int, Field(ge=64 << 20)] = 1 << 30
     max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30
+    disk_reserve_bytes: Annotated[int, Field(ge=0)] = 512 << 20
     max_jobs_per_owner: Annotated[int, Field(ge=1)] = 1000
     max_bytes_per_owner: Annotated[int, Field(gt=0)] = 100 << 30
     requests_per_minute: Annotated[int, Field(ge=1)] = 1200

@@ -16,6 +16,7 @@ from fastapi import Depends, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from service.api.limits import Limits, name_of
+from service.api.patience import patience_of
 from service.api.problems import Problem
 from service.database.engine import DatabaseAway
 from service.security.audit import AuditLog
@@ -83,7 +84,7 @@ Operator = Annotated[Caller, Depends(_operator)]
 
 async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller]:
     limits: Limits = request.app.state.limits
-    with limits.uploading(caller):
+    with limits.uploading(caller, patience_of(request.scope)):
         yield caller
 
 

@@ -20,6 +20,7 @@ from models.complaints import complaint
 from service.database.engine import DatabaseAway
 from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from service.storage.base import StorageError
+from service.storage.disk import NoRoom
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
 
@@ -152,6 +153,8 @@ def _away(request: Request, title: str, error: Exception) -> Response:
 def _full(request: Request, error: OSError) -> Response:
     structlog.get_logger("api").error("disk full", path=request.url.path, reason=str(error))
     detail = "The disk of the service is full. Delete old jobs, or make room on it."
+    if isinstance(error, NoRoom):
+        detail = f"{error.message[0].upper()}{error.message[1:]}."
     return problem_response(problem(507, "No space left", detail), {"Connection": "close"})
 
 
