@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from models.errors import ModelError
 
-__all__ = ["Table", "as_table"]
+__all__ = ["MOST_ROWS", "Table", "as_table", "check_size"]
 
 Array = NDArray[np.float64]
 
+MOST_ROWS = 1_000_000
+"""A test of 135 s with a sensor of 6.6 kHz has 900 000 samples; most have half as many."""
+_MOST_COMMENTS = 1000
+_LONGEST_LINE = 20_000
 _LARGEST = 1e30
 """Nothing measured is larger; beyond it, squares and sums would overflow."""
 
@@ -132,6 +136,29 @@ class Table:
                         "remove the line or measure again",
                     )
         return ModelError(f"{self.source}: the rows cannot be read as numbers")
+
+
+def check_size(content: bytes, source: str) -> None:
+    """Raise ModelError if a text has more lines than anything measured, or longer ones.
+
+    What is refused here costs nothing; what is read takes memory and time in proportion.
+    """
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    if lines > MOST_ROWS + _MOST_COMMENTS:
+        raise ModelError(
+            f"{source}: {lines} lines, at most {MOST_ROWS} samples are read: a resonance test of "
+            "135 s has 432000 at 3200 Hz; cut the file to the test, or record with a lower rate"
+        )
+    at = 0
+    while at + _LONGEST_LINE < len(content):
+        end = max(content.rfind(mark, at, at + _LONGEST_LINE) for mark in (b"\n", b"\r"))
+        if end < 0:
+            line = content.count(b"\n", 0, at) + 1
+            raise ModelError(
+                f"{source}, line {line}: longer than {_LONGEST_LINE} characters, the limit; export "
+                "the file again, a row for each sample"
+            )
+        at = end + 1
 
 
 def as_table(text: str, source: str) -> Table:
