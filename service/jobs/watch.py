@@ -18,7 +18,7 @@ import structlog
 
 from service.database.engine import DatabaseAway
 from service.jobs.problems import problem
-from service.jobs.state import Event, Failed, Job, Lost
+from service.jobs.state import Event, Failed, Job, Lost, NoRoom
 from service.jobs.store import JobStore
 from service.pipeline.progress import Cancelled, Progress
 
@@ -49,6 +49,8 @@ class Watch:
     limits : Limits
     interrupted : callable
         Says why this worker has to give its job back, or None.
+    has_room : callable
+        Whether the disk has room for more; the rest of it belongs to the database.
     end : callable
         Ends this process with an exit code.
 
@@ -65,12 +67,14 @@ class Watch:
         limits: Limits,
         *,
         interrupted: Callable[[], str | None],
+        has_room: Callable[[], bool] = lambda: True,
         end: Callable[[int], object],
     ) -> None:
         self._store = store
         self._job = job
         self._limits = limits
         self._interrupted = interrupted
+        self._has_room = has_room
         self._end = end
         self._began = time.monotonic()
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)
@@ -148,6 +152,8 @@ class Watch:
             self._decide(Lost(attempt, now, reason, 0, blame=False))
         elif (found := self._limit_reached()) is not None:
             self._decide(Failed(attempt, now, found))
+        elif not self._has_room():
+            self._decide(NoRoom(attempt, now))
         else:
             at = self._latest
             if not self._store.beat(self._job.id, attempt, now, at.stage, at.fraction, at.eta_s):

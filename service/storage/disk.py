@@ -13,7 +13,7 @@ import structlog
 __all__ = ["Disk", "NoRoom"]
 
 _MIB = 1 << 20
-_BALLAST = "reserve"
+_BALLAST = "disk-reserve"
 _BALLAST_BYTES = 8 * _MIB
 _CHUNK = bytes(_MIB)
 
@@ -78,6 +78,11 @@ class Disk:
     def lets_jobs_go_on(self) -> bool:
         """Whether a job that runs may write more."""
         return not self._reserve_bytes or self.free_bytes() >= self._reserve_bytes // 4
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a database can hardly write any more."""
+        return bool(self._reserve_bytes) and self.free_bytes() < _BALLAST_BYTES
 
     def hold(self) -> None:
         """Hold some room for `give_up`, if the disk has plenty of it."""
