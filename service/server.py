@@ -61,6 +61,8 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         log_level="warning",
         access_log=False,
         server_header=False,
+        # `service.api.proxies` knows which to trust.
+        proxy_headers=False,
         h11_max_incomplete_event_size=_LONGEST_HEADERS_BYTES,
         timeout_graceful_shutdown=_GOODBYE_S,
     )

@@ -6,7 +6,7 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import AfterValidator, Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.machines.settings import (
@@ -17,6 +17,18 @@ from service.machines.settings import (
 )
 
 __all__ = ["Settings", "is_loopback"]
+
+
+def _network(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text, strict=False))
+    except ValueError:
+        raise ValueError(
+            f"{text!r:.80} is no address or network; write for instance 127.0.0.1 or 10.0.0.0/8"
+        ) from None
+
+
+Network = Annotated[str, AfterValidator(_network)]
 
 
 def _data_dir() -> Path:
@@ -80,6 +92,8 @@ class Settings(MachineSettings, BaseSettings):
         Made a key with all scopes at the first start, instead of a random one that is printed.
     allowed_hosts : list of str
         Names in the Host header that are answered besides those of this computer; ``*`` for all.
+    trusted_proxies : list of str
+        Addresses or networks of proxies whose ``X-Forwarded-For``, ``-Host`` and ``-Proto`` count.
     printers : Path, optional
         TOML file of printers that results can be forwarded to.
     webhook_targets : list of str
@@ -113,6 +127,7 @@ class Settings(MachineSettings, BaseSettings):
     keys: bool | None = None
     first_key: SecretStr | None = None
     allowed_hosts: list[str] = []
+    trusted_proxies: list[Network] = []
     printers: Path | None = None
     webhook_targets: list[str] = []
     webhook_secret: SecretStr | None = None

@@ -32,6 +32,7 @@ from service.api.guard import Guard, hosts_of
 from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.limits import Limits
+from service.api.proxies import Proxies
 from service.computing.room import Room, RoomLimits
 from service.database.documents import open_documents
 from service.database.engine import open_database
@@ -110,6 +111,7 @@ def create_app(
         Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
     )
     app.add_middleware(metrics.Measured, metrics=state.metrics)
+    app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
     app.include_router(health.router)
     app.include_router(pages.router)

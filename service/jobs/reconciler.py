@@ -142,6 +142,8 @@ class Reconciler:
                 self._tick()
             except (DatabaseAway, ClusterAway) as error:
                 self._say(str(error))
+                if isinstance(error, DatabaseAway) and self._disk.is_full:
+                    self._disk.give_up()  # jobs wait; what became of them can be written down
                 self.slots = 0
                 if isinstance(error, ClusterAway):
                     self._in_flight.clear()
