@@ -7,13 +7,14 @@ them, and all others begin as its copies: they start at once, and share its memo
 from __future__ import annotations
 
 import multiprocessing
+import os
 import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
-__all__ = ["METHOD", "loaded_context"]
+__all__ = ["METHOD", "loaded_context", "quiet_tracker"]
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 """Windows has no fork, and on macOS libraries of the system do not bear one."""
@@ -34,3 +35,24 @@ def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["service.preloaded", *more])
     return context
+
+
+def quiet_tracker() -> None:
+    """Start Python's tracker of semaphores with nothing to say; before any thread.
+
+    It tidies up behind processes that were killed, which is all there is to do, and would write
+    about it, with tracebacks, among our logs.
+    """
+    if sys.platform == "win32":
+        return
+    from multiprocessing import resource_tracker
+
+    kept = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        resource_tracker.ensure_running()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

@@ -89,7 +89,8 @@ class Settings(MachineSettings, BaseSettings):
         Whether callers must show a key. By default they must unless the service is bound to
         loopback.
     first_key : str, optional
-        Made a key with all scopes at the first start, instead of a random one that is printed.
+        Made a key with all scopes at the first start, instead of a random one in the file
+        ``first-key`` of `data_dir`.
     allowed_hosts : list of str
         Names in the Host header that are answered besides those of this computer; ``*`` for all.
     trusted_proxies : list of str

@@ -148,7 +148,9 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     state.keys = KeyStore(engine)
     state.audit = AuditLog(engine)
     if state.keys_required:
-        await run_in_threadpool(announce_first_key, state.keys, settings.first_key)
+        await run_in_threadpool(
+            announce_first_key, state.keys, settings.first_key, settings.data_dir
+        )
     state.machines = Resolver(
         MachineStore(open_documents(settings, engine, "machines")),
         require_approval=settings.require_approval,
