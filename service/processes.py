@@ -9,12 +9,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
-__all__ = ["METHOD", "loaded_context", "quiet_tracker"]
+__all__ = ["METHOD", "limit_memory", "loaded_context", "quiet_tracker"]
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 """Windows has no fork, and on macOS libraries of the system do not bear one."""
@@ -35,6 +36,30 @@ def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["service.preloaded", *more])
     return context
+
+
+def limit_memory(max_bytes: int) -> None:
+    """Let the system refuse this process more memory; where it cannot (macOS, Windows), do nothing.
+
+    What is counted is private memory that may be written (RLIMIT_DATA): libraries and the addresses
+    that compilers keep free are none.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Beside what the process holds already.
+    """
+    if sys.platform != "linux":
+        return
+    import resource
+
+    status = Path("/proc/self/status").read_text()
+    held_kib = next(int(line.split()[1]) for line in status.splitlines() if line[:6] == "VmData")
+    most = (held_kib << 10) + max_bytes
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard != resource.RLIM_INFINITY:
+        most = min(most, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
 def quiet_tracker() -> None:

@@ -10,11 +10,9 @@ from __future__ import annotations
 import json
 import os
 import pkgutil
-import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 __all__ = ["BROKE", "DONE", "OUTGROWN", "REFUSED", "Task", "work"]
@@ -44,13 +42,14 @@ def work(connection: Connection, task: str, given: dict[str, Any], max_bytes: in
     """
     from service.environment import prepare_environment
     from service.logs import configure_logging
+    from service.processes import limit_memory
 
     prepare_environment()
     configure_logging()
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
     threading.Thread(target=_end_with_asker, args=(connection,), daemon=True).start()
-    _limit_memory(max_bytes)
+    limit_memory(max_bytes)
     ended, answer = _outcome(task, given)
     connection.send_bytes(json.dumps([ended, answer]).encode())
     # Nothing is to be tidied up, and what is left over of a full memory could only get stuck.
@@ -84,22 +83,3 @@ def _end_with_asker(connection: Connection) -> None:
         connection.recv_bytes()
     except (EOFError, OSError):
         os._exit(_ENDED)
-
-
-def _limit_memory(max_bytes: int) -> None:
-    """Let the system refuse more memory; where it cannot (macOS, Windows), only time is limited.
-
-    What is counted is private memory that may be written (RLIMIT_DATA): libraries and the addresses
-    that compilers keep free are none.
-    """
-    if sys.platform != "linux":
-        return
-    import resource
-
-    status = Path("/proc/self/status").read_text()
-    held_kib = next(int(line.split()[1]) for line in status.splitlines() if line[:6] == "VmData")
-    most = (held_kib << 10) + max_bytes
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    if hard != resource.RLIM_INFINITY:
-        most = min(most, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))

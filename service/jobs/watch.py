@@ -22,7 +22,7 @@ from service.jobs.state import Event, Failed, Job, Lost, NoRoom
 from service.jobs.store import JobStore
 from service.pipeline.progress import Cancelled, Progress
 
-__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch"]
+__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "too_large"]
 
 STUCK_EXIT_CODE = 70
 _BEAT_S = 0.5
@@ -179,11 +179,15 @@ class Watch:
         size = psutil.Process().memory_info().rss
         if size > self._limits.max_job_bytes:
             self.outgrown = True
-            return problem(
-                422,
-                "The job needs too much memory",
-                f"Its process grew to {size // _MIB} MiB; the limit is "
-                f"{self._limits.max_job_bytes // _MIB} MiB (STILLPATH_MAX_JOB_BYTES). Cut the "
-                "print into several files, or have the limit raised.",
-            )
+            return too_large(f"Its process grew to {size // _MIB} MiB", self._limits.max_job_bytes)
         return None
+
+
+def too_large(what: str, max_job_bytes: int) -> dict[str, object]:
+    """Return the problem of a job that needs too much memory; `what` happened."""
+    return problem(
+        422,
+        "The job needs too much memory",
+        f"{what}; the limit is {max_job_bytes // _MIB} MiB (STILLPATH_MAX_JOB_BYTES). Cut the "
+        "print into several files, or have the limit raised.",
+    )

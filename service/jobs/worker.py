@@ -29,9 +29,10 @@ from service.environment import prepare_environment
 from service.jobs.problems import DISK_FULL, problem_of
 from service.jobs.state import Event, Failed, Finished, Job, Lost, NoRoom
 from service.jobs.store import JobStore
-from service.jobs.watch import Limits, Watch
+from service.jobs.watch import Limits, Watch, too_large
 from service.logs import configure_logging
 from service.pipeline.progress import Cancelled, Progress
+from service.processes import limit_memory
 from service.settings import Settings
 from service.storage import Storage, StorageError
 from service.storage.disk import Disk
@@ -42,6 +43,7 @@ __all__ = ["Runner", "Task", "Workplace", "execute", "run_job", "run_task"]
 _PATIENCE_S = 60.0
 """How long storage and database may be away before an attempt is given up."""
 _LONGEST_PAUSE_S = 4.0
+_KEPT_BYTES = 256 << 20
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 _Given = TypeVar("_Given")
@@ -206,6 +208,9 @@ def _attempt(job: Job, workplace: Workplace, runner: Runner, watch: Watch) -> Ev
             return _work(job, workplace, runner, watch, folder)
     except Cancelled:
         return None
+    except MemoryError:
+        what = "The system refused its process more memory"
+        return Failed(job.attempt, time.time(), too_large(what, workplace.settings.max_job_bytes))
     except OSError as error:
         if error.errno in _NO_ROOM:
             structlog.get_logger("worker").warning("no room for the job", reason=str(error))
@@ -321,6 +326,8 @@ def _opened(given: str | None) -> tuple[Settings, JobStore, Storage]:
     prepare_environment()
     configure_logging()
     settings = Settings() if given is None else Settings.model_validate_json(given)
+    # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
+    limit_memory(settings.max_job_bytes + max(settings.max_job_bytes // 4, _KEPT_BYTES))
     engine = _patiently(lambda: open_database(settings), StoreError, time.sleep)
     return settings, JobStore(engine), open_storage(settings)
 
