@@ -107,7 +107,7 @@ async def list_jobs(
     response_model=JobView,
     responses={
         200: {"model": JobView, "description": "The same job is there already"},
-        **responses(403, 413, 422, 429, 507),
+        **responses(403, 408, 413, 422, 429, 507),
     },
     openapi_extra=upload_body(),
     summary="Hand in a G-code file",
