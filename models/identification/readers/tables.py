@@ -169,23 +169,28 @@ def as_table(text: str, source: str) -> Table:
     writing is left out, with a note.
     """
     listed = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    filled = [(i + 1, line) for i, line in enumerate(listed) if line and not line.isspace()]
-    comments = [line for _, line in filled if line.startswith("#")]
-    rows = [(i, line) for i, line in filled if not line.startswith("#")]
+    # Of a million lines every list counts: only the places of rows, and the rows.
+    lines = [
+        i for i, line in enumerate(listed, 1) if line and line[0] != "#" and not line.isspace()
+    ]
+    rows = [listed[i - 1] for i in lines]
+    comments = [line for line in listed if line.startswith("#")]
+    first = next((line for line in listed if line and not line.isspace()), "")
     header = ""
-    if rows and not _numeric_start(rows[0][1]):
-        header = rows.pop(0)[1]
-    delimiter = _delimiter(rows[0][1] if rows else header)
+    if rows and not _numeric_start(rows[0]):
+        header = rows.pop(0)
+        lines.pop(0)
+    delimiter = _delimiter(rows[0] if rows else header)
     if not header and rows:
-        header = _commented_header(comments, delimiter, len(rows[0][1].split(delimiter)))
+        header = _commented_header(comments, delimiter, len(rows[0].split(delimiter)))
     table = Table(
         source=source,
         names=_names(header, delimiter),
-        rows=[line for _, line in rows],
-        lines=[i for i, _ in rows],
+        rows=rows,
+        lines=lines,
         delimiter=delimiter,
         comments=tuple(line for line in comments if line != header),
-        first_line=filled[0][1] if filled else "",
+        first_line=first,
     )
     return table if not listed[-1] else _without_cut_line(table)
 
