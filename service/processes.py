@@ -15,7 +15,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
-__all__ = ["METHOD", "limit_memory", "loaded_context", "quiet_tracker"]
+__all__ = ["METHOD", "OF_THE_SERVICE", "limit_memory", "loaded_context", "quiet_tracker"]
+
+OF_THE_SERVICE = ("distributed", "service.jobs.worker", "service.computing.preloaded")
+"""Modules for the processes of a service; all of them are copies of the same one."""
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
 """Windows has no fork, and on macOS libraries of the system do not bear one."""

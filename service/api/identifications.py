@@ -101,7 +101,10 @@ def _settings(
     "/measurements",
     status_code=201,
     response_model=IdentificationView,
-    responses={200: {"model": IdentificationView}, **responses(403, 404, 408, 409, 412, 413, 422, 507)},
+    responses={
+        200: {"model": IdentificationView},
+        **responses(403, 404, 408, 409, 412, 413, 422, 507),
+    },
     openapi_extra=_BODY,
     summary="Identify a machine from measurements",
 )

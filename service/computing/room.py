@@ -20,7 +20,7 @@ from anyio import CapacityLimiter, to_thread
 
 from service.computing.process import BROKE, DONE, OUTGROWN, REFUSED, work
 from service.computing.turns import TooMany, Turns, Waited
-from service.processes import loaded_context
+from service.processes import OF_THE_SERVICE, loaded_context
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -120,7 +120,7 @@ class Room:
     ) -> Any:
         if self._ended.is_set():
             raise Broke("the service ends")
-        context = loaded_context("distributed", "service.jobs.worker")
+        context = loaded_context(*OF_THE_SERVICE)
         ours, theirs = context.Pipe()
         process = context.Process(
             target=work, args=(theirs, task, given, self._limits.memory_bytes), daemon=True
