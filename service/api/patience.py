@@ -76,10 +76,11 @@ class Patience:
 
     def yield_place(self) -> bool:
         """End the request if its sender has been quiet for some seconds: somebody else is there."""
-        if self._waiting is None or self._has_yielded or self.quiet_s < _YIELDS_AFTER_S:
+        waiting = self._waiting
+        if waiting is None or waiting.expired() or self.quiet_s < _YIELDS_AFTER_S:
             return False
         self._has_yielded = True
-        self._waiting.reschedule(asyncio.get_running_loop().time())
+        waiting.reschedule(asyncio.get_running_loop().time())
         return True
 
     def _too_quiet(self) -> HTTPException:

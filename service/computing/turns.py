@@ -91,9 +91,12 @@ class Turns:
             if not owners:
                 return
             owner = min(owners, key=lambda name: (self._running[name], self._served.get(name, 0)))
-            self._lines[owner].popleft().set_result(None)
+            next_one = self._lines[owner].popleft()
             if not self._lines[owner]:
                 del self._lines[owner]
+            if next_one.done():
+                continue  # has gone away at this moment
+            next_one.set_result(None)
             self._running[owner] += 1
             self._serving += 1
             self._served[owner] = self._serving

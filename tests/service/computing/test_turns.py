@@ -69,3 +69,32 @@ def test_who_goes_away_leaves_the_line() -> None:
         assert await served(turns, "cb") == "cb"
 
     asyncio.run(ask())
+
+
+def test_who_goes_away_as_his_turn_comes_keeps_no_place() -> None:
+    async def ask() -> None:
+        turns = Turns(1)
+        held = turns.turn("a")
+        await held.__aenter__()
+        waiting = [asyncio.ensure_future(served(turns, owner)) for owner in "bc"]
+        await asyncio.sleep(0)
+        waiting[0].cancel()
+        await held.__aexit__(None, None, None)  # before the cancelled one has heard of it
+        assert await asyncio.wait_for(waiting[1], 5) == "c"
+        assert await asyncio.wait_for(served(turns, "d"), 5) == "d"
+
+    asyncio.run(ask())
+
+
+def test_who_goes_away_with_his_place_gives_it_back() -> None:
+    async def ask() -> None:
+        turns = Turns(1)
+        held = turns.turn("a")
+        await held.__aenter__()
+        waiting = asyncio.ensure_future(served(turns, "b"))
+        await asyncio.sleep(0)
+        await held.__aexit__(None, None, None)
+        waiting.cancel()  # it has the place, and has not heard of that
+        assert await asyncio.wait_for(served(turns, "c"), 5) == "c"
+
+    asyncio.run(ask())
