@@ -10,6 +10,8 @@ from pathlib import Path
 
 import structlog
 
+from service.private import private_folder
+
 __all__ = ["Disk", "NoRoom"]
 
 _MIB = 1 << 20
@@ -47,7 +49,11 @@ class Disk:
 
     def free_bytes(self) -> int:
         """Return how much may still be written."""
-        return shutil.disk_usage(self._folder).free
+        try:
+            return shutil.disk_usage(self._folder).free
+        except FileNotFoundError:
+            private_folder(self._folder)
+            return shutil.disk_usage(self._folder).free
 
     def refusal(self, more_bytes: int = 0) -> str | None:
         """Return why the service takes no upload of so many bytes, or None."""

@@ -62,6 +62,9 @@ def test_what_the_reserve_is_for(small_disk: Path) -> None:
     disk.give_up()
     assert disk.free_bytes() == 4 * MIB
     assert Disk(small_disk, 0).refusal(1 << 40) is None
+    foreign = small_disk / "foreign"
+    foreign.unlink()
+    assert Disk(small_disk / "new" / "data", RESERVE_MIB * MIB).lets_jobs_go_on
 
 
 @pytest.mark.slow
