@@ -11,21 +11,18 @@ __all__ = ["Document", "Finite", "NonNegative", "Positive"]
 _LEAST, _MOST = 1e-100, 1e100
 
 
-def _computable(number: float) -> float:
-    """Refuse what is nothing that exists: its square would be 0 or infinite."""
-    if number and not _LEAST <= abs(number) <= _MOST:
+def _size(number: float) -> float:
+    """Refuse what is no size of anything: its square would be 0 or infinite, and so would times."""
+    if not _LEAST <= number <= _MOST:
         raise ValueError(
-            f"{number:g} is no size of anything: give 0 or something between {_LEAST:g} and "
-            f"{_MOST:g}, as far as the field allows it"
+            f"{number:g} is no size of anything: give something between {_LEAST:g} and {_MOST:g}"
         )
     return number
 
 
-_Computable = AfterValidator(_computable)
-
-Finite = Annotated[float, Field(allow_inf_nan=False), _Computable]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), _Computable]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), _Computable]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_size)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class Document(BaseModel):
