@@ -49,6 +49,6 @@ EXPOSE 8000
 STOPSIGNAL SIGTERM
 HEALTHCHECK --interval=30s --timeout=5s --start-period=30s \
     CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8000/readyz', timeout=4)"]
-# Other computers can reach this address, so callers must show a key. The first one is printed once
-# (docker logs), or is what STILLPATH_FIRST_KEY says.
+# Other computers can reach this address, so callers must show a key. The first one is in the file
+# /data/first-key, or is what STILLPATH_FIRST_KEY says.
 CMD ["stillpath", "serve", "--host", "0.0.0.0", "--port", "8000"]

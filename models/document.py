@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 __all__ = ["Document", "Finite", "NonNegative", "Positive"]
 
+_LEAST, _MOST = 1e-100, 1e100
+
+
+def _size(number: float) -> float:
+    """Refuse what is no size of anything: its square would be 0 or infinite, and so would times."""
+    if not _LEAST <= number <= _MOST:
+        raise ValueError(
+            f"{number:g} is no size of anything: give something between {_LEAST:g} and {_MOST:g}"
+        )
+    return number
+
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_size)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 

@@ -37,7 +37,7 @@ Tell = Callable[[str, float | None], object]
 Found = TypeVar("Found")
 
 _CHUNK_BYTES = 1 << 18
-_BUSY = (429, 502, 503, 504)
+_BUSY = (408, 429, 502, 503, 504)
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.2, 5.0
 _SILENCE_S = 45.0
 """Watching is given up when nothing came for so long; the service sends something every 15 s."""

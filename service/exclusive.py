@@ -13,6 +13,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from service.private import private_folder
+
 __all__ = ["exclusive"]
 
 _TAKEN = (errno.EAGAIN, errno.EACCES, errno.EDEADLK)
@@ -27,7 +29,7 @@ def exclusive(folder: Path) -> Iterator[None]:
     OSError
         EBUSY if somebody else keeps it. File systems without locks keep nothing.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    private_folder(folder)
     handle = os.open(folder / "service.lock", os.O_RDWR | os.O_CREAT, 0o666)
     try:
         try:

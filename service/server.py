@@ -5,17 +5,20 @@ from __future__ import annotations
 import contextlib
 import socket
 import sys
+import time
 from collections.abc import Iterator
 
 import structlog
 import uvicorn
 
 from service.api import create_app
-from service.database.engine import open_database
+from service.database.engine import DatabaseAway, database_url, open_database
 from service.exclusive import exclusive
 from service.jobs.worker import Runner, run_task
 from service.logs import configure_logging
 from service.machines.settings import EARLIER_DATA_DIR
+from service.private import private_folder
+from service.processes import quiet_tracker
 from service.security.keys import keys_needed
 from service.settings import Settings
 
@@ -25,6 +28,7 @@ _SWITCH_S = 0.001
 """How long a thread may keep the others waiting; by default 5 ms, at every turn of an upload."""
 _BACKLOG = 1024
 _LONGEST_HEADERS_BYTES = 32 << 10
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 5.0
 _GOODBYE_S = 5
 """How long requests under way may take once the service was asked to end."""
 
@@ -47,7 +51,7 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
     OSError
         If the address cannot be bound, or another service works with the data directory.
     StoreError
-        If the database cannot be opened.
+        If the database cannot be opened; one on another computer that is away is waited for.
     UnsafeBinding
         If other computers can reach the address, and keys are switched off.
     """
@@ -61,16 +65,18 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         log_level="warning",
         access_log=False,
         server_header=False,
+        # `service.api.proxies` knows which to trust.
+        proxy_headers=False,
         h11_max_incomplete_event_size=_LONGEST_HEADERS_BYTES,
         timeout_graceful_shutdown=_GOODBYE_S,
     )
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    quiet_tracker()
     with (
         _alone(settings),
+        _database(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
-        # The application does so again; what uvicorn makes of an error there nobody can read.
-        open_database(settings).dispose()
         _tell_where(settings)
         for address in _addresses(host, listener.getsockname()[1]):
             sys.stdout.write(f"stillpath: {address}\n")
@@ -100,9 +106,33 @@ def _tell_where(settings: Settings) -> None:
 
 
 @contextlib.contextmanager
+def _database(settings: Settings) -> Iterator[None]:
+    """Wait until the database answers: where several computers start, in any order.
+
+    The application opens it again; what uvicorn makes of an error there nobody can read.
+    """
+    wait_s = _FIRST_WAIT_S
+    while True:
+        try:
+            open_database(settings).dispose()
+        except DatabaseAway as error:
+            if database_url(settings).get_backend_name() == "sqlite":
+                raise  # a file that cannot be read does not come back by itself
+            structlog.get_logger("serve").warning(
+                "waiting for the database", reason=str(error), again_in_s=wait_s
+            )
+        else:
+            break
+        time.sleep(wait_s)
+        wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+    yield
+
+
+@contextlib.contextmanager
 def _alone(settings: Settings) -> Iterator[None]:
     """Keep the folder of data, unless the workers are elsewhere: then nothing lasting is in it."""
     if settings.scheduler is not None:
+        private_folder(settings.data_dir)
         yield
         return
     with exclusive(settings.data_dir):

@@ -6,7 +6,7 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, SecretStr, model_validator
+from pydantic import AfterValidator, Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.machines.settings import (
@@ -17,6 +17,18 @@ from service.machines.settings import (
 )
 
 __all__ = ["Settings", "is_loopback"]
+
+
+def _network(text: str) -> str:
+    try:
+        return str(ipaddress.ip_network(text, strict=False))
+    except ValueError:
+        raise ValueError(
+            f"{text!r:.80} is no address or network; write for instance 127.0.0.1 or 10.0.0.0/8"
+        ) from None
+
+
+Network = Annotated[str, AfterValidator(_network)]
 
 
 def _data_dir() -> Path:
@@ -58,8 +70,15 @@ class Settings(MachineSettings, BaseSettings):
         How long a worker may take to obey a cancel before its process is ended.
     max_job_s, max_job_bytes : float, int
         A job that takes longer, or whose process grows larger, fails.
+    computing_processes : int
+        Processes that compute for requests: designs, identifications, controllers.
+    max_computing_s, max_computing_bytes : float, int
+        What one of these may take, beside what is loaded at its start.
     max_upload_bytes : int
         A larger upload is refused with status 413.
+    disk_reserve_bytes : int
+        Stays free on the disk of `data_dir`: uploads that would leave less are refused with status
+        507, jobs wait for half of it. 0: the disk is not looked at.
     max_jobs_per_owner, max_bytes_per_owner : int
         Jobs not yet over, and bytes of all jobs kept, that one owner may have.
     requests_per_minute : int
@@ -70,9 +89,12 @@ class Settings(MachineSettings, BaseSettings):
         Whether callers must show a key. By default they must unless the service is bound to
         loopback.
     first_key : str, optional
-        Made a key with all scopes at the first start, instead of a random one that is printed.
+        Made a key with all scopes at the first start, instead of a random one in the file
+        ``first-key`` of `data_dir`.
     allowed_hosts : list of str
         Names in the Host header that are answered besides those of this computer; ``*`` for all.
+    trusted_proxies : list of str
+        Addresses or networks of proxies whose ``X-Forwarded-For``, ``-Host`` and ``-Proto`` count.
     printers : Path, optional
         TOML file of printers that results can be forwarded to.
     webhook_targets : list of str
@@ -94,7 +116,11 @@ class Settings(MachineSettings, BaseSettings):
     cancel_grace_s: Annotated[float, Field(gt=0)] = 10.0
     max_job_s: Annotated[float, Field(gt=0)] = 4 * 3600.0
     max_job_bytes: Annotated[int, Field(gt=0)] = 4 << 30
+    computing_processes: Annotated[int, Field(ge=1, le=64)] = 2
+    max_computing_s: Annotated[float, Field(gt=0)] = 300.0
+    max_computing_bytes: Annotated[int, Field(ge=64 << 20)] = 1 << 30
     max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30
+    disk_reserve_bytes: Annotated[int, Field(ge=0)] = 512 << 20
     max_jobs_per_owner: Annotated[int, Field(ge=1)] = 1000
     max_bytes_per_owner: Annotated[int, Field(gt=0)] = 100 << 30
     requests_per_minute: Annotated[int, Field(ge=1)] = 1200
@@ -102,6 +128,7 @@ class Settings(MachineSettings, BaseSettings):
     keys: bool | None = None
     first_key: SecretStr | None = None
     allowed_hosts: list[str] = []
+    trusted_proxies: list[Network] = []
     printers: Path | None = None
     webhook_targets: list[str] = []
     webhook_secret: SecretStr | None = None

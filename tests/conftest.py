@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from tests.missing import tell
+from tests.nginx import MISSING as _NO_NGINX
+from tests.nginx import is_installed as _nginx_is_installed
 from tests.service.database.postgres import MISSING as _NO_POSTGRESQL
 from tests.service.database.postgres import is_installed, postgres_server, postgres_url
 
@@ -18,6 +20,7 @@ __all__ = ["postgres_server", "postgres_url", "shared_dir"]
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
+_NO_SMALL_DISK = "no small disk"
 _MISSING = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
 _ROOT = Path(__file__).resolve().parent.parent
 if "NUMBA_CACHE_DIR" not in os.environ and not os.access(_ROOT / "models", os.W_OK):
@@ -59,6 +62,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         ("shared", lambda: _shared() is not None, _MISSING, True),
         # `.ci/run` installs it; where that is impossible, the rest is still worth knowing.
         ("postgresql", is_installed, _NO_POSTGRESQL, False),
+        ("nginx", _nginx_is_installed, _NO_NGINX, False),
     ):
         if item.get_closest_marker(marker) is not None and not is_there():
             if in_ci and _in_ci():
@@ -69,3 +73,5 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     tell(terminalreporter, _MISSING, "the shared test data (STILLPATH_SHARED)")
     tell(terminalreporter, _NO_POSTGRESQL, "PostgreSQL")
+    tell(terminalreporter, _NO_NGINX, "nginx")
+    tell(terminalreporter, _NO_SMALL_DISK, "root, to mount a small disk")

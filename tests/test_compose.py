@@ -75,6 +75,13 @@ def test_least_privilege(name):
     assert service["tmpfs"] == ["/tmp"]
 
 
+@pytest.mark.parametrize("name", list(SERVICES))
+def test_memory_and_processes_are_limited(name):
+    service = SERVICES[name]
+    assert re.fullmatch(r"\d+[mg]", DEFAULT.sub(r"\1", str(service["mem_limit"])))
+    assert 64 <= service["pids_limit"] <= 1024
+
+
 @pytest.mark.parametrize("name", ["scheduler", "worker"])
 def test_commands_exist(name):
     from typer.main import get_command

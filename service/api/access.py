@@ -2,7 +2,7 @@
 
 `Watcher` is a reader whose requests are not counted, for whoever follows a job; `Uploader` is a
 submitter who holds one of his places for uploads until he is answered; `Operator` is an admin, or
-somebody on this computer.
+somebody on this computer where no keys are asked for.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from fastapi import Depends, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
 from service.api.limits import Limits, name_of
+from service.api.patience import patience_of
 from service.api.problems import Problem
 from service.database.engine import DatabaseAway
 from service.security.audit import AuditLog
@@ -68,8 +69,10 @@ def _admin(request: Request, shown: _Shown) -> Caller:
 
 def _operator(request: Request, shown: _Shown) -> Caller:
     remote = _remote(request)
-    # By name, too: a page of somebody else can make this computer's browser ask.
-    if shown is None and is_loopback(remote or "") and is_loopback(request.url.hostname or ""):
+    # By name, too: a page of somebody else can make this computer's browser ask. Where keys are
+    # asked for, a proxy may be on this computer, and pass on any name.
+    here = is_loopback(remote or "") and is_loopback(request.url.hostname or "")
+    if shown is None and here and not request.app.state.keys_required:
         return _local(remote)
     return _allowed(request, shown, Scope.ADMIN)
 
@@ -83,7 +86,7 @@ Operator = Annotated[Caller, Depends(_operator)]
 
 async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller]:
     limits: Limits = request.app.state.limits
-    with limits.uploading(caller):
+    with limits.uploading(caller, patience_of(request.scope)):
         yield caller
 
 

@@ -32,6 +32,8 @@ from service.api.guard import Guard, hosts_of
 from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.limits import Limits
+from service.api.proxies import Proxies
+from service.computing.room import Room, RoomLimits
 from service.database.documents import open_documents
 from service.database.engine import open_database
 from service.deliveries.checking import Checker
@@ -46,6 +48,7 @@ from service.machines.store import MachineStore
 from service.security.audit import AuditLog
 from service.security.keys import KeyStore, announce_first_key
 from service.settings import Settings
+from service.storage.disk import Disk
 from service.storage.opened import open_storage
 from service.version import __version__
 
@@ -100,8 +103,7 @@ def create_app(
     state.readiness = health.Readiness()
     state.printers = load_printers(settings.printers)
     state.designs = designs.Designs()
-    state.controllers = controllers.Controllers()
-    state.trajectories = trajectories.Trajectories(settings)
+    state.loops = None
     state.metrics = metrics.Metrics(
         lambda: state.store, lambda: state.work.workers, lambda: state.hub.watchers
     )
@@ -109,6 +111,7 @@ def create_app(
         Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
     )
     app.add_middleware(metrics.Measured, metrics=state.metrics)
+    app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
     app.include_router(health.router)
     app.include_router(pages.router)
@@ -141,22 +144,46 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
     storage = await run_in_threadpool(open_storage, settings)
     state.store = JobStore(engine)
     state.storage = storage
+    state.disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
     state.keys = KeyStore(engine)
     state.audit = AuditLog(engine)
     if state.keys_required:
-        await run_in_threadpool(announce_first_key, state.keys, settings.first_key)
+        await run_in_threadpool(
+            announce_first_key, state.keys, settings.first_key, settings.data_dir
+        )
     state.machines = Resolver(
         MachineStore(open_documents(settings, engine, "machines")),
         require_approval=settings.require_approval,
         max_age_days=settings.measurement_max_age_days,
     )
-    state.identifications = identifications.Identifications(
-        Archive(open_documents(settings, engine, "identifications"))
+    state.identifications = Archive(open_documents(settings, engine, "identifications"))
+    state.room = Room(
+        settings.computing_processes,
+        RoomLimits(settings.max_computing_s, settings.max_computing_bytes),
     )
+    # They take as long as a job does: others need not wait for that.
+    state.trajectory_room = Room(
+        1,
+        RoomLimits(
+            settings.max_job_s,
+            settings.max_job_bytes,
+            "STILLPATH_MAX_JOB_S",
+            "STILLPATH_MAX_JOB_BYTES",
+        ),
+    )
+    for room in (state.room, state.trajectory_room):
+        stack.callback(room.close)
     state.layers = assets.Layers(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(
-        settings, state.store, storage, state.machines, state.printers, state.audit, state.checker
+        settings,
+        state.store,
+        storage,
+        state.machines,
+        state.printers,
+        state.audit,
+        state.checker,
+        state.disk,
     )
     await run_in_threadpool(state.intake.prepare)
     state.deliveries = Sender(engine, state.store, storage, settings, state.printers, state.checker)

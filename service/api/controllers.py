@@ -2,48 +2,38 @@
 
 from __future__ import annotations
 
-import asyncio
-from functools import cache
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Body, Header, Path, Query, Request
-from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
-from compensation.base import DesignError
-from models.errors import ModelError
 from models.loops import builtin_loops
 from service.api.access import Reader
+from service.api.computing import computed
 from service.api.problems import Problem, responses
 from service.controllers.figures import ControllerReport, LoopFigures
-from service.controllers.options import ControllerOptions, resolved
+from service.controllers.options import ControllerOptions
 
-__all__ = ["Controllers", "router"]
+__all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["controllers"])
 
 
-class Controllers:
-    """Designs one controller at a time, in a thread, while the service goes on answering."""
-
-    def __init__(self) -> None:
-        self._turn = asyncio.Lock()
-
-    async def design(self, name: str, options: ControllerOptions) -> Any:
-        """Return what `service.controllers.design.design_controller` makes.
-
-        Raises
-        ------
-        DesignError, ModelError
-        """
-        async with self._turn:
-            return await run_in_threadpool(_made, name, options)
-
-
 @router.get("/loops", response_model=list[LoopFigures], summary="List the closed-loop machines")
-async def list_loops(_: Reader) -> Any:
+async def list_loops(request: Request, caller: Reader) -> Any:
     """Return the built-in closed-loop machines and the methods that fit each."""
-    return await run_in_threadpool(_loops)
+    state = request.app.state
+    if state.loops is None:
+        state.loops = await computed(
+            request,
+            state.room,
+            caller,
+            "list_loops",
+            {},
+            refused="No machines",
+            remedy="Have the limit raised.",
+        )
+    return state.loops
 
 
 @router.post(
@@ -61,7 +51,7 @@ async def design_controller(
         ControllerOptions,
         Body(openapi_examples={"fmsdob": {"value": {"method": "fmsdob", "targets_hz": [2000.0]}}}),
     ],
-    _: Reader,
+    caller: Reader,
     format: Annotated[  # noqa: A002 - the parameter's name on the wire
         Literal["json", "html", "c"] | None, Query(description="Goes before `Accept`.")
     ] = None,
@@ -79,45 +69,25 @@ async def design_controller(
             f"No closed-loop machine is called {name!r}. GET /v1/loops lists them; your own goes "
             "into the body as `loop`.",
         )
-    controllers: Controllers = request.app.state.controllers
-    try:
-        made = await controllers.design(name, options)
-    except (DesignError, ModelError) as error:
-        reason = getattr(error, "reason", None)
-        extra = {} if reason is None else {"reason": reason}
-        raise Problem(422, "No such controller", str(error), **extra) from error
+    made = await computed(
+        request,
+        request.app.state.room,
+        caller,
+        "design_controller",
+        {"name": name, "options": options.model_dump(mode="json", exclude_unset=True)},
+        refused="No such controller",
+        remedy="Give the machine fewer states or plants, or have the limit raised.",
+    )
     vary = {"Vary": "Accept"}
     wanted = format or ("html" if _first(accept) == "text/html" else "json")
     if wanted == "html":
-        return HTMLResponse(await run_in_threadpool(_page, made.report), headers=vary)
+        return HTMLResponse(made["page"], headers=vary)
     if wanted == "c":
-        return PlainTextResponse(made.controller.to_c_header(), headers=vary)
-    return Response(made.report.model_dump_json(), media_type="application/json", headers=vary)
+        return PlainTextResponse(made["c"], headers=vary)
+    return Response(made["report"], media_type="application/json", headers=vary)
 
 
 def _first(accept: str) -> str:
     """Return the kind that `Accept` names first of those there are."""
     kinds = (part.split(";")[0].strip() for part in accept.split(","))
     return next((k for k in kinds if k in ("text/html", "application/json", "*/*")), "*/*")
-
-
-# What is imported here takes a second, which the service's start need not wait for.
-
-
-@cache
-def _loops() -> list[LoopFigures]:
-    from service.controllers.design import loop_figures
-
-    return loop_figures()
-
-
-def _made(name: str, options: ControllerOptions) -> Any:
-    from service.controllers.design import design_controller as design
-
-    return design(resolved(name, options), options)
-
-
-def _page(report: ControllerReport) -> str:
-    from service.controllers.page import render_controller
-
-    return render_controller(report)

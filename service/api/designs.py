@@ -1,21 +1,22 @@
-"""Routes of designs: what `stillpath design` shows, computed once and kept in the process."""
+"""Routes of designs: what `stillpath design` shows, computed once and kept."""
 
 from __future__ import annotations
 
 import asyncio
 from collections import OrderedDict
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Literal
+from weakref import WeakValueDictionary
 
 from fastapi import APIRouter, Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, Response
 
-from compensation.base import DesignError
-from models.errors import ModelError
 from models.machine import Machine
 from service.api.access import Reader
+from service.api.computing import computed
 from service.api.machines import Name, look_up
-from service.api.problems import Problem, responses
+from service.api.problems import responses
 from service.design.figures import DesignReport
 from service.pipeline.options import BasisName, RobustMode
 
@@ -28,23 +29,27 @@ _KEPT = 64
 
 
 class Designs:
-    """Designs made by this process, the last ones kept.
-
-    A design takes seconds of computing, so that one is made at a time, in a thread, while the
-    service goes on answering; whoever asks for the same one meanwhile waits for it.
-    """
+    """The last designs that were made; whoever asks for one that is being made waits for it."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[str, _Settings], DesignReport] = OrderedDict()
-        self._turn = asyncio.Lock()
+        self._making: WeakValueDictionary[tuple[str, _Settings], asyncio.Lock] = (
+            WeakValueDictionary()
+        )
 
-    async def get(self, machine: Machine, settings: _Settings) -> DesignReport:
+    async def get(
+        self,
+        machine: Machine,
+        settings: _Settings,
+        make: Callable[[], Awaitable[DesignReport]],
+    ) -> DesignReport:
         """Return the design of a machine's axis, made if nobody asked for it before."""
         key = (machine.revision, settings)
         if key not in self._kept:
-            async with self._turn:
+            making = self._making.setdefault(key, asyncio.Lock())
+            async with making:
                 if key not in self._kept:
-                    self._kept[key] = await run_in_threadpool(_made, machine, settings)
+                    self._kept[key] = await make()
                     if len(self._kept) > _KEPT:
                         self._kept.popitem(last=False)
         self._kept.move_to_end(key)
@@ -54,17 +59,32 @@ class Designs:
 async def _asked(
     request: Request,
     name: Name,
-    _: Reader,
+    caller: Reader,
     axis: Literal["x", "y"],
     basis: BasisName = "ce-opt",
     robust: RobustMode = "off",
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)
+
+    async def make() -> DesignReport:
+        found = await computed(
+            request,
+            request.app.state.room,
+            caller,
+            "design",
+            {
+                "machine": machine.model_dump(mode="json"),
+                "axis": axis,
+                "basis": basis,
+                "robust": robust,
+            },
+            refused="No such design",
+            remedy="Give the machine fewer members or places, or have the limit raised.",
+        )
+        return DesignReport.model_validate(found)
+
     designs: Designs = request.app.state.designs
-    try:
-        return await designs.get(machine, (axis, basis, robust))
-    except (DesignError, ModelError) as error:
-        raise Problem(422, "No such design", str(error)) from error
+    return await designs.get(machine, (axis, basis, robust), make)
 
 
 Asked = Annotated[DesignReport, Depends(_asked)]
@@ -101,13 +121,6 @@ async def read_design_page(found: Asked) -> HTMLResponse:
 
 
 # What is imported here takes a second, which the service's start need not wait for.
-
-
-def _made(machine: Machine, settings: _Settings) -> DesignReport:
-    from service.design.design import design_report
-
-    axis, basis, robust = settings
-    return design_report(machine, axis, basis=basis, robust=robust)
 
 
 def _page(found: DesignReport, headers: dict[str, str] | None = None) -> HTMLResponse:

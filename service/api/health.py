@@ -14,6 +14,7 @@ from service.api.schemas import Health
 from service.database.engine import StoreError
 from service.jobs.store import JobStore
 from service.storage.base import Storage, StorageError
+from service.storage.disk import Disk
 from service.version import __version__
 
 __all__ = ["Readiness", "router"]
@@ -31,7 +32,7 @@ async def healthz() -> Health:
 
 @router.get("/readyz", responses=responses(503), summary="Are jobs taken and done?")
 async def readyz(request: Request) -> Health:
-    """Answer `ok` while database, storage and workers are there, else 503 and which is not.
+    """Answer `ok` while database, storage, disk and workers do, else 503 and which does not.
 
     Anybody may ask, as often as he likes: the parts are asked once in two seconds, and why one
     does not answer, which may name other computers, stands in the log.
@@ -51,7 +52,7 @@ class Readiness:
         self._missing: str | None = None
 
     async def missing(self, request: Request) -> str | None:
-        """Return `database`, `storage` or `workers`; None: all answer."""
+        """Return `database`, `storage`, `disk` or `workers`; None: all are well."""
         async with self._lock:
             if time.monotonic() - self._asked_at >= _FRESH_S:
                 found = await run_in_threadpool(_reason, request)
@@ -75,5 +76,9 @@ def _reason(request: Request) -> tuple[str, str] | None:
         storage.check()
     except StorageError as error:
         return "storage", str(error)
+    disk: Disk = request.app.state.disk
+    full = disk.refusal()
+    if full is not None:
+        return "disk", full
     reason: str | None = request.app.state.work.is_ready
     return None if reason is None else ("workers", reason)

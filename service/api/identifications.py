@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-import asyncio
+import tempfile
+from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import UploadFile
-from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.responses import HTMLResponse
 
-from models.errors import ModelError
 from models.identification.readers.settings import ReadSettings
 from models.machine import Machine
 from models.store import explain
-from service.api.access import Reader, Submitter
+from service.api.access import Reader, Uploader
+from service.api.computing import computed
+from service.api.forms import is_form
 from service.api.machine_views import RevisionView
 from service.api.machines import Author, Message, Name, as_problems, look_up
 from service.api.problems import Problem, responses
-from service.api.uploads import limited_body, safe_name
+from service.api.uploads import receive_files, safe_name
 from service.identification.archive import Archive
 from service.identification.figures import IdentificationReport
 from service.machines.resolve import Resolver
 from service.machines.revision import Revision
 from service.security.audit import record
-from service.security.callers import Scope
+from service.security.callers import Caller, Scope
+from service.storage.disk import Disk
 
-__all__ = ["Identifications", "router"]
+__all__ = ["router"]
 
 router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
 
@@ -58,19 +59,6 @@ class IdentificationView(BaseModel):
 
     revision: RevisionView | None
     report: IdentificationReport
-
-
-class Identifications:
-    """Identifies one machine at a time, in a thread, while the service goes on answering."""
-
-    def __init__(self, archive: Archive) -> None:
-        self.archive = archive
-        self._turn = asyncio.Lock()
-
-    async def run(self, work: Any, *arguments: Any) -> Any:
-        """Return what `work` returns, when its turn has come."""
-        async with self._turn:
-            return await run_in_threadpool(work, *arguments)
 
 
 def _settings(
@@ -113,7 +101,10 @@ def _settings(
     "/measurements",
     status_code=201,
     response_model=IdentificationView,
-    responses={200: {"model": IdentificationView}, **responses(403, 404, 409, 412, 413, 422)},
+    responses={
+        200: {"model": IdentificationView},
+        **responses(403, 404, 408, 409, 412, 413, 422, 507),
+    },
     openapi_extra=_BODY,
     summary="Identify a machine from measurements",
 )
@@ -121,7 +112,7 @@ async def post_measurements(
     request: Request,
     response: Response,
     name: Name,
-    caller: Submitter,
+    caller: Uploader,
     settings: Annotated[ReadSettings, Depends(_settings)],
     base: Annotated[
         str | None, Query(description="What a machine that does not exist yet starts from.")
@@ -144,21 +135,25 @@ async def post_measurements(
         )
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
-    files = await _received(request)
-    identifications: Identifications = request.app.state.identifications
+    given = {
+        "start": start.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json", exclude_unset=True),
+        "name": name,
+        "title": title,
+        "order": max_order,
+    }
+    machine, report = await _identified(request, caller, given)
+    if trial:
+        response.status_code = 200
+        return IdentificationView(revision=None, report=report)
     with as_problems():
-        found = await identifications.run(
-            _identified, files, start, settings, name, title, max_order
-        )
-        if trial:
-            response.status_code = 200
-            return IdentificationView(revision=None, report=found.report)
         made: Revision = await run_in_threadpool(
             _stored,
             machines,
-            identifications.archive,
+            request.app.state.identifications,
             name,
-            found,
+            machine,
+            report,
             author or caller.owner,
             message,
             expected,
@@ -173,7 +168,7 @@ async def post_measurements(
         number=made.number,
     )
     response.headers["Location"] = f"/v1/machines/{name}/revisions/{made.number}"
-    return IdentificationView(revision=RevisionView.of(made, None), report=found.report)
+    return IdentificationView(revision=RevisionView.of(made, None), report=report)
 
 
 @router.get(
@@ -199,9 +194,9 @@ def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLRes
 
 def _kept(request: Request, name: str) -> IdentificationReport:
     machine = look_up(request, name)
-    identifications: Identifications = request.app.state.identifications
+    archive: Archive = request.app.state.identifications
     with as_problems():
-        found = identifications.archive.find(machine.revision)
+        found = archive.find(machine.revision)
     if found is None:
         raise Problem(
             404,
@@ -212,22 +207,51 @@ def _kept(request: Request, name: str) -> IdentificationReport:
     return found
 
 
-async def _received(request: Request) -> list[tuple[str, bytes]]:
-    """Return names and contents of the files of a form."""
-    if not request.headers.get("content-type", "").startswith("multipart/form-data"):
+async def _identified(
+    request: Request, caller: Caller, given: dict[str, Any]
+) -> tuple[Machine, IdentificationReport]:
+    """Take the files in, on the disk, and have the machine identified from them."""
+    state = request.app.state
+    with tempfile.TemporaryDirectory(dir=state.intake.folder, prefix="measurements-") as folder:
+        files = []
+        for label, path in await _received(request, Path(folder), state.disk):
+            before, _, condition = label.partition("@")
+            files.append((str(path), safe_name(before), condition))
+        found = await computed(
+            request,
+            state.room,
+            caller,
+            "identify",
+            given | {"files": files},
+            refused="The machine cannot be used",
+            remedy="Send the test as the firmware wrote it, fewer files at once, or have the limit "
+            "raised.",
+        )
+    # In a thread: a report has some ten thousand numbers.
+    return await run_in_threadpool(
+        lambda: (
+            Machine.model_validate(found["machine"]),
+            IdentificationReport.model_validate(found["report"]),
+        )
+    )
+
+
+async def _received(request: Request, folder: Path, disk: Disk) -> list[tuple[str, Path]]:
+    """Return names and places of the files of a form."""
+    if not is_form(request):
         raise Problem(
             422, "No form", "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv)."
         )
-    body = limited_body(request, _LARGEST_BYTES)
-    try:
-        form = await MultiPartParser(request.headers, body, max_files=_MOST_FILES).parse()
-    except (MultiPartException, KeyError) as error:
-        raise Problem(422, "Broken form", f"The form cannot be read: {error}.") from None
-    try:
-        uploads = [part for _, part in form.multi_items() if isinstance(part, UploadFile)]
-        return [(part.filename or "", await part.read()) for part in uploads]
-    finally:
-        await form.close()
+    files = await receive_files(
+        request, folder, max_bytes=_LARGEST_BYTES, max_files=_MOST_FILES, disk=disk
+    )
+    if not files:
+        raise Problem(
+            422,
+            "The machine cannot be used",
+            "the form holds no file; send at least one measurement",
+        )
+    return files
 
 
 def _start(machines: Resolver, name: str, base: str | None) -> tuple[Machine, int]:
@@ -244,46 +268,23 @@ def _start(machines: Resolver, name: str, base: str | None) -> tuple[Machine, in
     return machines.to_look_at(base).machine, 0
 
 
-# What is imported here takes a second, which the service's start need not wait for.
-
-
-def _identified(
-    files: list[tuple[str, bytes]],
-    start: Machine,
-    settings: ReadSettings,
-    name: str,
-    title: str | None,
-    order: int,
-) -> Any:
-    from models.identification.conditions import Condition
-    from service.identification.run import InputFile, identify_files
-
-    if not files:
-        raise ModelError("the form holds no file; send at least one measurement")
-    inputs = []
-    for label, content in files:
-        before, _, condition = label.partition("@")
-        inputs.append(InputFile(safe_name(before), content, Condition.parse(condition)))
-    return identify_files(inputs, start, settings, name=name, title=title, max_order=order)
-
-
 def _stored(
     machines: Resolver,
     archive: Archive,
     name: str,
-    found: Any,
+    machine: Machine,
+    report: IdentificationReport,
     author: str,
     message: str,
     expected: int,
 ) -> Revision:
     # First what may lie unused, then what refers to it.
-    archive.keep(found.report)
-    sources = found.report.sources
+    archive.keep(report)
     return machines.store.add_revision(
         name,
-        found.machine,
+        machine,
         author=author,
-        message=message or f"identified from {', '.join(s.name for s in sources)}",
-        sources=sources,
+        message=message or f"identified from {', '.join(s.name for s in report.sources)}",
+        sources=report.sources,
         expected=expected,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import time
 import uuid
 from collections.abc import Iterator, Mapping
@@ -37,6 +38,7 @@ from service.security.audit import AuditLog, tell
 from service.security.callers import Caller
 from service.settings import Settings
 from service.storage.base import Storage, StorageError
+from service.storage.disk import Disk
 from service.version import __version__
 
 __all__ = ["Intake", "Taken"]
@@ -76,6 +78,13 @@ class Intake:
     audit : AuditLog
     checker : Checker
         Compares a job's printer with its machine; what differs stands in the report.
+    disk : Disk
+        That uploads lie on.
+
+    Attributes
+    ----------
+    folder : Path
+        Of uploads on their way.
     """
 
     def __init__(
@@ -87,6 +96,7 @@ class Intake:
         printers: Mapping[str, Printer],
         audit: AuditLog,
         checker: Checker,
+        disk: Disk,
     ) -> None:
         self._settings = settings
         self._audit = audit
@@ -96,17 +106,21 @@ class Intake:
         self._machines = machines
         self._printers = printers
         self._quota = Quota(settings.max_jobs_per_owner, settings.max_bytes_per_owner)
-        self._folder = settings.data_dir / "incoming"
+        self._disk = disk
+        self.folder = settings.data_dir / "incoming"
         self._turns = CapacityLimiter(_STORED_AT_ONCE)
         self._printers_asked = CapacityLimiter(_ASKED_AT_ONCE)
 
     def prepare(self) -> None:
         """Make the folder of uploads on their way, and delete what a killed service left there."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         if self._settings.scheduler is not None:
             return  # it may be shared; the sweep knows what is old
-        for leftover in self._folder.iterdir():
-            leftover.unlink(missing_ok=True)
+        for leftover in self.folder.iterdir():
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
 
     async def take(
         self,
@@ -129,7 +143,7 @@ class Intake:
         Raises
         ------
         Problem
-            413, 422, 429 or 507; nothing of the upload is left then.
+            408, 413, 422, 429 or 507; nothing of the upload is left then.
         """
         # A printer may take its time: threads are for all requests.
         limiter = None if wanted.printer is None else self._printers_asked
@@ -139,7 +153,7 @@ class Intake:
                 self._admit, wanted, caller, incoming, limiter=limiter
             )
             upload = await receive_upload(
-                request, incoming, max_bytes=self._settings.max_upload_bytes
+                request, incoming, max_bytes=self._settings.max_upload_bytes, disk=self._disk
             )
             with_print = _with_fields(wanted, upload)
             if with_print != wanted:
@@ -169,6 +183,7 @@ class Intake:
         self._check_targets(wanted)
         pinned = self._pinned(wanted)
         self._check_room(caller)
+        self._disk.check()
         pinned.write(incoming.with_suffix(".machine"))
         return pinned
 
@@ -325,7 +340,7 @@ class Intake:
 
         So is what lies beside it with the suffix ``.machine``.
         """
-        incoming = self._folder / f"{job_id}.upload"
+        incoming = self.folder / f"{job_id}.upload"
         try:
             yield incoming
         finally:

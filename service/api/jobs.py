@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
@@ -17,14 +17,18 @@ from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.problems import Problem, responses
 from service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
+from service.database.engine import DatabaseAway
 from service.deliveries.sender import Sender
 from service.jobs.state import Cancelled, Job, JobState
 from service.jobs.store import BadCursor, JobStore
 from service.security.audit import record
 from service.security.callers import Caller, Scope
 from service.storage.base import Storage, StorageError
+from service.storage.disk import Disk
 
 __all__ = ["router", "upload_body"]
+
+_T = TypeVar("_T")
 
 
 def upload_body(required_form: bool = False) -> dict[str, object]:
@@ -103,7 +107,7 @@ async def list_jobs(
     response_model=JobView,
     responses={
         200: {"model": JobView, "description": "The same job is there already"},
-        **responses(403, 413, 422, 429, 507),
+        **responses(403, 408, 413, 422, 429, 507),
     },
     openapi_extra=upload_body(),
     summary="Hand in a G-code file",
@@ -163,7 +167,7 @@ async def cancel_job(request: Request, job_id: JobId, caller: Submitter) -> JobV
     """Take the job out of the queue, or stop it; it stays in the list as cancelled."""
     store: JobStore = request.app.state.store
     await find(request, job_id, caller)
-    job = await run_in_threadpool(store.apply, job_id, Cancelled(time.time()))
+    job = await _written(request, lambda: store.apply(job_id, Cancelled(time.time())))
     if job is None:  # it was over before
         job = await find(request, job_id, caller)
         if job.state is not JobState.CANCELLED:
@@ -182,13 +186,26 @@ async def delete_job(request: Request, job_id: JobId, caller: Submitter) -> Resp
     store: JobStore = request.app.state.store
     storage: Storage = request.app.state.storage
     await find(request, job_id, caller)
-    if not await run_in_threadpool(store.forget, job_id):
+    if not await _written(request, lambda: store.forget(job_id)):
         raise no_such_job(job_id)
-    await _changed(request, caller, "delete", job_id)
-    # What a worker still puts there, or what cannot be deleted now, is swept up later.
+    # What a worker still puts there, or what cannot be deleted now, is swept up later. On a full
+    # disk this makes the room to write down who did it.
     with suppress(StorageError):
         await run_in_threadpool(storage.delete, f"jobs/{job_id}/")
+    await _changed(request, caller, "delete", job_id)
     return Response(status_code=204)
+
+
+async def _written(request: Request, write: Callable[[], _T]) -> _T:
+    """Return what `write` returns; on a full disk what was held back for it makes room."""
+    disk: Disk = request.app.state.disk
+    try:
+        return await run_in_threadpool(write)
+    except DatabaseAway:
+        if not disk.is_full:
+            raise
+        await run_in_threadpool(disk.give_up)
+        return await run_in_threadpool(write)
 
 
 async def _changed(request: Request, caller: Caller, action: str, job_id: str) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from starlette.exceptions import HTTPException
 
+from service.api.patience import PATIENCE, Patience
 from service.api.problems import Problem
 
 if TYPE_CHECKING:
@@ -62,7 +63,8 @@ class Limits:
         self._lock = threading.Lock()
         # What is left, and when that was; a bucket that nobody remembers is full.
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-        self._uploading: dict[str, int] = {}
+        # Only touched within the event loop.
+        self._uploading: dict[str, list[Patience | None]] = {}
 
     def take(self, who: str) -> None:
         """Count one request.
@@ -96,33 +98,42 @@ class Limits:
             )
 
     @contextmanager
-    def uploading(self, caller: Caller) -> Iterator[None]:
-        """Hold one of the caller's places for uploads.
+    def uploading(self, caller: Caller, patience: Patience | None = None) -> Iterator[None]:
+        """Hold one of the caller's places for uploads; within the event loop.
+
+        If all are taken, one whose sender has fallen silent is freed for this one.
+
+        Parameters
+        ----------
+        caller : Caller
+        patience : Patience, optional
+            With the sender of this upload.
 
         Raises
         ------
         Problem
             429, if all are taken.
         """
-        who = name_of(caller)
-        with self._lock:
-            running = self._uploading.get(who, 0)
-            if running < self._uploads:
-                self._uploading[who] = running + 1
-        if running >= self._uploads:
-            raise Problem(
-                429,
-                "Too many uploads at once",
-                f"{running} uploads of yours are on their way, the limit. Wait for one to end.",
-                headers={"Retry-After": "1", "Connection": "close"},
-            )
+        places = self._uploading.setdefault(name_of(caller), [])
+        if len(places) >= self._uploads:
+            silent = max((one for one in places if one), key=lambda one: one.quiet_s, default=None)
+            if silent is None or not silent.yield_place():
+                raise Problem(
+                    429,
+                    "Too many uploads at once",
+                    f"{len(places)} uploads of yours are on their way, the limit. Wait for one to "
+                    "end.",
+                    headers={"Retry-After": "5", "Connection": "close"},
+                )
+            places.remove(silent)
+        places.append(patience)
         try:
             yield
         finally:
-            with self._lock:
-                self._uploading[who] -= 1
-                if not self._uploading[who]:
-                    del self._uploading[who]
+            if patience in places:
+                places.remove(patience)
+            if not places and self._uploading.get(name_of(caller)) is places:
+                del self._uploading[name_of(caller)]
 
 
 def name_of(caller: Caller) -> str:
@@ -152,15 +163,16 @@ def too_long(scope: Scope) -> Problem | None:
 
 
 def limited_receive(scope: Scope, receive: Receive) -> Receive:
-    """Return `receive` with a limit, for routes that read their body as one document.
+    """Return `receive` with limits of time, and of size for bodies that are read as one document.
 
-    A route that streams its body sets `COUNTED` in the scope, and has limits of its own.
+    A route that streams its body sets `COUNTED` in the scope, and has a limit of size of its own.
     """
     size_bytes = 0
+    patience = scope[PATIENCE] = Patience(receive)
 
     async def received() -> Message:
         nonlocal size_bytes
-        message = await receive()
+        message = await patience.receive()
         if message["type"] == "http.request" and not scope.get(COUNTED):
             size_bytes += len(message.get("body", b""))
             if size_bytes > _LARGEST_DOCUMENT_BYTES:

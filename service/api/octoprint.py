@@ -112,7 +112,7 @@ async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersi
 
 _UPLOAD: dict[str, Any] = {
     "status_code": 201,
-    "responses": responses(401, 403, 413, 422, 429, 507),
+    "responses": responses(401, 403, 408, 413, 422, 429, 507),
     "openapi_extra": upload_body(required_form=True),
     "summary": "Hand in a file as to OctoPrint",
 }

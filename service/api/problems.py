@@ -20,6 +20,7 @@ from models.complaints import complaint
 from service.database.engine import DatabaseAway
 from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from service.storage.base import StorageError
+from service.storage.disk import NoRoom
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
 
@@ -152,6 +153,8 @@ def _away(request: Request, title: str, error: Exception) -> Response:
 def _full(request: Request, error: OSError) -> Response:
     structlog.get_logger("api").error("disk full", path=request.url.path, reason=str(error))
     detail = "The disk of the service is full. Delete old jobs, or make room on it."
+    if isinstance(error, NoRoom):
+        detail = f"{error.message[0].upper()}{error.message[1:]}."
     return problem_response(problem(507, "No space left", detail), {"Connection": "close"})
 
 
@@ -182,6 +185,7 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
         problem(401, "No key", "No key came with the request. Send one as X-Api-Key."),
         problem(403, "Not allowed", "This needs a key with scope 'admin'."),
         problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
+        problem(408, "Request Timeout", "Within 30 s less than 1024 bytes of the body came."),
         problem(409, "Not done yet", "The job is running. Ask again when its state is done."),
         problem(412, "Precondition failed", "Machine 'mine' is at \"3f6a\" (revision 4)."),
         problem(413, "File too large", "The upload is larger than 1073741824 bytes."),

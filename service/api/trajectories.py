@@ -8,83 +8,27 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import anyio
-from anyio import to_process
 from fastapi import APIRouter, Query, Request
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse
 
-from gcode.errors import GcodeError
 from service.api.access import Reader
+from service.api.computing import computed
 from service.api.finding import JobId, find_done
 from service.api.problems import Problem, responses
 from service.jobs.state import Job
+from service.security.callers import Caller
 
 if TYPE_CHECKING:
-    from service.settings import Settings
     from service.storage.base import Storage
 
-__all__ = ["Trajectories", "router"]
+__all__ = ["router"]
 
 _LONGEST_S = 600.0
-_WAITING = 4
-"""How many may wait for their turn."""
 _MEDIA = {"csv": "text/csv", "npz": "application/octet-stream"}
 
 router = APIRouter(prefix="/v1/jobs", tags=["results"])
-
-
-class Trajectories:
-    """Computes one at a time, in a process of its own: the road takes memory and CPU.
-
-    Parameters
-    ----------
-    settings : Settings
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
-        self._turn = anyio.CapacityLimiter(1)
-
-    async def write(self, storage: Storage, job: Job, target: Path, **chosen: Any) -> None:
-        """Write the trajectories of a job to a file.
-
-        Raises
-        ------
-        GcodeError
-        FileNotFoundError
-            If the job's files are gone.
-        Problem
-            429 if too many wait already.
-        """
-        if self._turn.statistics().tasks_waiting >= _WAITING:
-            raise Problem(
-                429,
-                "Too many wait",
-                f"{_WAITING} others wait for trajectories; ask again later.",
-                headers={"Retry-After": "60"},
-            )
-        async with self._turn:
-            with ExitStack() as files:
-                source, machine = [
-                    await run_in_threadpool(files.enter_context, storage.local(key))
-                    for key in (
-                        f"jobs/{job.id}/source/{job.source_name}",
-                        f"jobs/{job.id}/machine.json",
-                    )
-                ]
-                await to_process.run_sync(
-                    _write,
-                    source,
-                    machine,
-                    job.machine,
-                    job.options,
-                    target,
-                    self._settings.data_dir / "cache",
-                    chosen,
-                    cancellable=True,
-                )
 
 
 @router.get(
@@ -131,16 +75,9 @@ async def read_trajectories(
     job = await find_done(request, job_id, caller)
     folder = Path(await run_in_threadpool(tempfile.mkdtemp, prefix="stillpath-trajectories-"))
     target = folder / f"trajectories.{format}"
+    chosen = {"format": format, "start_s": start_s, "stop_s": stop_s}
     try:
-        await request.app.state.trajectories.write(
-            request.app.state.storage, job, target, format=format, start_s=start_s, stop_s=stop_s
-        )
-    except GcodeError as error:
-        await run_in_threadpool(_remove, folder)
-        raise Problem(422, "No trajectories", str(error)) from None
-    except FileNotFoundError:
-        await run_in_threadpool(_remove, folder)
-        raise Problem(404, "The file is gone", "The job's upload is no longer there.") from None
+        await _write(request, caller, job, target, chosen)
     except BaseException:
         _remove(folder)
         raise
@@ -152,35 +89,39 @@ async def read_trajectories(
     )
 
 
-def _write(
-    source: Path,
-    machine_file: Path,
-    machine: str,
-    options: dict[str, Any],
-    target: Path,
-    cache_dir: Path,
-    chosen: dict[str, Any],
+async def _write(
+    request: Request, caller: Caller, job: Job, target: Path, chosen: dict[str, Any]
 ) -> None:
-    """Do the work, in the process for it."""
-    from service.environment import prepare_environment
-
-    prepare_environment()
-
-    from service.machines.resolve import PinnedMachine
-    from service.pipeline.options import Options
-    from service.pipeline.trajectories import write_trajectories
-
-    settings = Options.model_validate(options)
-    write_trajectories(
-        source,
-        target,
-        PinnedMachine.read(machine_file, machine).machine,
-        settings,
-        dialect=settings.dialect,
-        plate=settings.plate,
-        cache_dir=cache_dir,
-        **chosen,
-    )
+    state = request.app.state
+    storage: Storage = state.storage
+    with ExitStack() as files:
+        try:
+            source, machine = [
+                await run_in_threadpool(files.enter_context, storage.local(key))
+                for key in (
+                    f"jobs/{job.id}/source/{job.source_name}",
+                    f"jobs/{job.id}/machine.json",
+                )
+            ]
+        except FileNotFoundError:
+            raise Problem(404, "The file is gone", "The job's upload is no longer there.") from None
+        await computed(
+            request,
+            state.trajectory_room,
+            caller,
+            "trajectories",
+            {
+                "source": str(source),
+                "machine_file": str(machine),
+                "machine": job.machine,
+                "options": job.options,
+                "target": str(target),
+                "cache": str(state.settings.data_dir / "cache"),
+                "chosen": chosen,
+            },
+            refused="No trajectories",
+            remedy="Ask for an earlier part of the print, or have the limit raised.",
+        )
 
 
 def _remove(folder: Path) -> None:

@@ -6,28 +6,30 @@ import hashlib
 import os
 import re
 from collections.abc import AsyncGenerator, Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from anyio import to_thread
 from fastapi import Request
-from python_multipart.exceptions import FormParserError
-from python_multipart.multipart import MultipartParser, parse_options_header
 
+from service.api.forms import broken_form, is_form, read_form
 from service.api.limits import COUNTED
 from service.api.problems import Problem
+from service.storage.disk import Disk
 
-if TYPE_CHECKING:
-    from python_multipart.multipart import MultipartCallbacks
-
-__all__ = ["Upload", "limited_body", "receive_document", "receive_upload", "safe_name"]
+__all__ = [
+    "Upload",
+    "limited_body",
+    "receive_document",
+    "receive_files",
+    "receive_upload",
+    "safe_name",
+]
 
 _WRITE_BYTES = 1 << 20
 _DEFAULT_NAME = "upload.gcode"
-_MOST_FIELDS = 32
-_LONGEST_FIELD_BYTES = 4096
 _LONGEST_NAME_BYTES = 180
 """Of a file's name; with what a result's name has more it stays below the usual 255."""
 _SUFFIX = re.compile(r"(\.gcode)?\.[A-Za-z0-9]{1,10}$", re.IGNORECASE)
@@ -53,7 +55,7 @@ class Upload:
     fields: Mapping[str, str]
 
 
-async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> Upload:
+async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk: Disk) -> Upload:
     """Write the body of a request, raw or multipart/form-data, to `target`.
 
     Parameters
@@ -65,22 +67,31 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
         what stores the file for good does that.
     max_bytes : int
         Largest body.
+    disk : Disk
+        That `target` is on.
 
     Raises
     ------
     Problem
-        413 if the body is too large, 422 if it is empty or broken.
+        408 if its sender falls silent, 413 if the body is too large, 422 if it is empty or broken.
+    NoRoom
     """
-    declared = request.headers.get("content-length", "")
-    if declared.isdecimal() and int(declared) > max_bytes:
-        raise _too_large(max_bytes)
-    kind, parameters = parse_options_header(request.headers.get("content-type"))
+    _check_declared(request, max_bytes, disk)
     fields: dict[str, str] = {}
     with target.open("wb") as file:
-        sink = _Sink(file)
-        if kind == b"multipart/form-data":
-            form = await _receive_form(request, sink, parameters.get(b"boundary"), max_bytes)
-            name, fields = form.name or "", form.fields
+        sink = _Sink(file, disk)
+        if is_form(request):
+            names: list[str] = []
+
+            def begin(name: str) -> Callable[[bytes], None] | None:
+                names.append(name)
+                return sink.take if len(names) == 1 else None
+
+            body = limited_body(request, max_bytes)
+            fields = await read_form(request, body, begin, sink.drain)
+            if not names:
+                raise broken_form("no part has a file name")
+            name = names[0]
         else:
             name = request.query_params.get("name", "")
             async for chunk in limited_body(request, max_bytes):
@@ -94,6 +105,51 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int) -> U
             "request (curl --data-binary @part.gcode), or a form's file.",
         )
     return Upload(safe_name(name), sink.size_bytes, sink.digest.hexdigest(), fields)
+
+
+async def receive_files(
+    request: Request, folder: Path, *, max_bytes: int, max_files: int, disk: Disk
+) -> list[tuple[str, Path]]:
+    """Write the files of a form into a folder; return what each was called and where it is.
+
+    Parameters
+    ----------
+    request : Request
+    folder : Path
+        Is left as it is when an error is raised; the caller deletes it.
+    max_bytes : int
+        Of all together.
+    max_files : int
+    disk : Disk
+        That `folder` is on.
+
+    Raises
+    ------
+    Problem
+        408 if its sender falls silent, 413 if the body is too large, 422 if it is broken.
+    NoRoom
+    """
+    _check_declared(request, max_bytes, disk)
+    found: list[tuple[str, Path]] = []
+    sinks: list[_Sink] = []
+    with ExitStack() as files:
+
+        def begin(name: str) -> Callable[[bytes], None]:
+            if len(found) >= max_files:
+                raise broken_form(f"it has more than {max_files} files, the limit")
+            path = folder / f"{len(found)}"
+            found.append((name, path))
+            sinks.append(_Sink(files.enter_context(path.open("wb")), disk))
+            return sinks[-1].take
+
+        async def drain() -> None:
+            for sink in sinks[-1:]:
+                await sink.drain()
+
+        await read_form(request, limited_body(request, max_bytes), begin, drain)
+        for sink in sinks:
+            await sink.flush()
+    return found
 
 
 async def receive_document(request: Request, *, max_bytes: int) -> bytes:
@@ -123,6 +179,7 @@ class _Sink:
     """Collects small chunks; hashes and writes large ones, in a thread: the disk may be slow."""
 
     file: BinaryIO
+    disk: Disk
     size_bytes: int = 0
     digest: hashlib._Hash = field(default_factory=hashlib.sha256)
     _chunks: list[bytes] = field(default_factory=list)
@@ -146,6 +203,8 @@ class _Sink:
 
     def _flush(self) -> None:
         collected = b"".join(self._chunks)
+        # Others write as well since the upload began.
+        self.disk.check(len(collected))
         self._chunks.clear()
         self._waiting_bytes = 0
         self.digest.update(collected)
@@ -170,92 +229,13 @@ async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes
         yield chunk
 
 
-async def _receive_form(
-    request: Request, sink: _Sink, boundary: bytes | None, max_bytes: int
-) -> _Form:
-    if not boundary:
-        raise _broken_form("the Content-Type names no boundary")
-    form = _Form(sink.take)
-    try:
-        parser = MultipartParser(boundary, form.callbacks())
-        async for chunk in limited_body(request, max_bytes):
-            parser.write(chunk)
-            await sink.drain()
-        parser.finalize()
-    except FormParserError as error:
-        raise _broken_form(str(error)) from error
-    if not form.is_whole:
-        raise _broken_form("it ends before its last boundary")
-    if form.name is None:
-        raise _broken_form("no part has a file name")
-    return form
-
-
-class _Form:
-    """Callbacks of the multipart parser: passes the first file's data on, keeps short fields."""
-
-    def __init__(self, take: Callable[[bytes], None]) -> None:
-        self.name: str | None = None
-        self.fields: dict[str, str] = {}
-        self.is_whole = False
-        self._take = take
-        self._in_file = False
-        self._headers: dict[bytes, bytes] = {}
-        self._field = b""
-        self._value = b""
-        self._text_name: str | None = None
-        self._text = b""
-
-    def callbacks(self) -> MultipartCallbacks:
-        return {
-            "on_part_begin": self._part_begin,
-            "on_header_field": self._header_field,
-            "on_header_value": self._header_value,
-            "on_header_end": self._header_end,
-            "on_headers_finished": self._headers_finished,
-            "on_part_data": self._part_data,
-            "on_part_end": self._part_end,
-            "on_end": self._end,
-        }
-
-    def _part_begin(self) -> None:
-        self._headers = {}
-
-    def _header_field(self, data: bytes, start: int, end: int) -> None:
-        self._field += data[start:end]
-
-    def _header_value(self, data: bytes, start: int, end: int) -> None:
-        self._value += data[start:end]
-
-    def _header_end(self) -> None:
-        self._headers[self._field.lower()] = self._value
-        self._field = self._value = b""
-
-    def _headers_finished(self) -> None:
-        _, parameters = parse_options_header(self._headers.get(b"content-disposition"))
-        name = parameters.get(b"filename")
-        self._in_file = name is not None and self.name is None
-        if self._in_file and name is not None:
-            self.name = name.decode("utf-8", "replace")
-        elif name is None and len(self.fields) < _MOST_FIELDS:
-            self._text_name = parameters.get(b"name", b"").decode("utf-8", "replace")
-
-    def _part_data(self, data: bytes, start: int, end: int) -> None:
-        if self._in_file:
-            self._take(data[start:end])
-        elif self._text_name is not None:
-            self._text += data[start:end]
-            if len(self._text) > _LONGEST_FIELD_BYTES:
-                raise _broken_form(f"a field is longer than {_LONGEST_FIELD_BYTES} bytes")
-
-    def _part_end(self) -> None:
-        if self._text_name is not None:
-            self.fields[self._text_name] = self._text.decode("utf-8", "replace")
-        self._in_file = False
-        self._text_name, self._text = None, b""
-
-    def _end(self) -> None:
-        self.is_whole = True
+def _check_declared(request: Request, max_bytes: int, disk: Disk) -> None:
+    """Refuse by what the headers say, before anything is read."""
+    declared = request.headers.get("content-length", "")
+    size = int(declared) if declared.isdecimal() else 0
+    if size > max_bytes:
+        raise _too_large(max_bytes)
+    disk.check(size)
 
 
 def _too_large(max_bytes: int) -> Problem:
@@ -266,7 +246,3 @@ def _too_large(max_bytes: int) -> Problem:
         "STILLPATH_MAX_UPLOAD_BYTES).",
         headers={"Connection": "close"},
     )
-
-
-def _broken_form(why: str) -> Problem:
-    return Problem(422, "Broken form", f"The multipart/form-data body cannot be read: {why}.")

@@ -22,6 +22,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
 from service.database.migrations import LATEST
+from service.private import private_file, private_folder
 
 if TYPE_CHECKING:
     from sqlalchemy import Table
@@ -111,7 +112,7 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     """
     url = database_url(settings)
     if url.get_backend_name() == "sqlite" and url.database:
-        Path(url.database).parent.mkdir(parents=True, exist_ok=True)
+        _make_private(Path(url.database))
     engine = make_engine(url, pooled=pooled)
     try:
         migrate(engine)
@@ -180,6 +181,17 @@ def migrate(engine: Engine) -> None:
             )
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+
+
+def _make_private(file: Path) -> None:
+    """Make the file of a database, readable by its owner only; SQLite gives its log the same mode.
+
+    A folder that is there may be open to others: the command line keeps machines in it.
+    """
+    if not file.parent.exists():
+        private_folder(file.parent)
+    if not file.name.startswith(":"):
+        private_file(file)
 
 
 def _lock_schema(connection: Connection) -> None:

@@ -18,7 +18,17 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-__all__ = ["audit", "deliveries", "documents", "jobs", "keys", "leases", "metadata", "submissions"]
+__all__ = [
+    "audit",
+    "deliveries",
+    "documents",
+    "jobs",
+    "keys",
+    "leases",
+    "metadata",
+    "seen_time",
+    "submissions",
+]
 
 metadata = MetaData(
     naming_convention={
@@ -66,6 +76,8 @@ jobs = Table(
     Column("webhook", Text),
     Column("printer", String(64)),
     Column("print_after", Boolean, nullable=False, default=False),
+    # By `seen_time`: since when the job is known to be over.
+    Column("kept_from_s", Float),
     Index("jobs_by_state", "state", "priority", "created_at"),
     Index("jobs_by_owner", "owner", "created_at"),
     Index("jobs_by_age", "created_at"),
@@ -81,6 +93,8 @@ submissions = Table(
     Column("fingerprint", String(64), nullable=False),
     Column("job_id", String(32), nullable=False),
     Column("created_at", Float, nullable=False),
+    # By `seen_time`.
+    Column("kept_from_s", Float),
 )
 """Which job the request with an Idempotency-Key led to."""
 
@@ -138,6 +152,14 @@ leases = Table(
     Column("expires_at", Float, nullable=False),
 )
 """Which process does what only one may do at a time."""
+
+seen_time = Table(
+    "seen_time",
+    metadata,
+    Column("name", String(32), primary_key=True),
+    Column("seconds", Float, nullable=False),
+)
+"""How long the service has been running, in all: clocks are not to be trusted."""
 
 documents = Table(
     "documents",

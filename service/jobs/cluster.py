@@ -27,7 +27,7 @@ import structlog
 from service.jobs.preload import quiet_dask
 from service.jobs.state import Job
 from service.jobs.worker import Runner, run_job
-from service.processes import METHOD, loaded_context
+from service.processes import METHOD, OF_THE_SERVICE, loaded_context
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -211,7 +211,7 @@ def prepare_dask() -> None:
     from distributed.utils import get_mp_context  # its import sets up logs
 
     get_mp_context()  # it chooses once what is loaded beforehand; what is chosen last counts
-    loaded_context("distributed", "service.jobs.worker")
+    loaded_context(*OF_THE_SERVICE)
     quiet_dask()
 
 

@@ -16,11 +16,12 @@ import structlog
 
 from service.database.engine import DatabaseAway
 from service.jobs.cluster import Cluster, ClusterAway
-from service.jobs.state import Job, JobState, Lost
+from service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
 from service.jobs.store import JobStore
-from service.jobs.sweep import forget_expired, sweep_files, sweep_incoming
+from service.jobs.sweep import Sweep
 from service.settings import Settings
 from service.storage import Storage, StorageError
+from service.storage.disk import Disk
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -31,13 +32,12 @@ _LEASE, _LEASE_S, _RENEW_S = "reconciler", 5.0, 2.0
 """A lease is renewed when it is older: every write waits for the disk, as uploads do."""
 _TICK_S = 0.5
 _SWEEP_EVERY_S = 60.0
-_ORPHAN_S = 3600.0
-"""Files without a row are of an upload, as long as they are younger."""
+_MOST_REMEMBERED = 10_000
 _GIVE_BACK_S = 1.5
 """How long a worker that closes may take to give its job back; it looks twice a second."""
-_UPLOAD_S = 86400.0
-"""Uploads that have not grown for so long were broken off."""
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
+_NO_ROOM_S = 30.0
+"""How long a job whose files had no room is left alone: others may need less."""
 _CLOCK_SET_S = 1.0
 """Between two looks, a clock that was set differs by more."""
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
@@ -75,6 +75,10 @@ class Reconciler:
         self._thread = threading.Thread(target=self._run, name="reconciler", daemon=True)
         self._sweeper = threading.Thread(target=self._run_sweeps, name="sweeper", daemon=True)
         self._log = structlog.get_logger("reconciler")
+        self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
+        self._has_room = True
+        # Which attempt of a job had no room, and when to try again.
+        self._no_room: dict[str, tuple[int, float]] = {}
         self._in_flight: dict[str, tuple[Job, Future]] = {}
         self._broken_since: dict[str, float] = {}
         self._has_lease = False
@@ -82,7 +86,7 @@ class Reconciler:
         # Places without a job after the last look; None while one is under way.
         self._free: int | None = None
         self._took_over = False
-        self._started_at = time.time()
+        self._sweep = Sweep(settings, store, storage)
         self._trouble: str | None = None
         self._trouble_since = 0.0
         # Since when the database and the workers answer, without a break.
@@ -91,7 +95,6 @@ class Reconciler:
 
     def start(self) -> None:
         """Start the threads."""
-        self._started_at = time.time()
         self._trouble, self._trouble_since = "no worker has started yet", time.monotonic()
         self._thread.start()
         self._sweeper.start()
@@ -139,6 +142,8 @@ class Reconciler:
                 self._tick()
             except (DatabaseAway, ClusterAway) as error:
                 self._say(str(error))
+                if isinstance(error, DatabaseAway) and self._disk.is_full:
+                    self._disk.give_up()  # jobs wait; what became of them can be written down
                 self.slots = 0
                 if isinstance(error, ClusterAway):
                     self._in_flight.clear()
@@ -244,11 +249,37 @@ class Reconciler:
         """
         running = {job.id for job in self._store.in_state(JobState.RUNNING)}
         free = self.slots - len(running | set(self._in_flight))
-        if free > 0:
-            for job in self._store.next_queued(free, exclude=list(self._in_flight)):
+        if free > 0 and self._is_room():
+            now = time.monotonic()
+            left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
+            for job in self._store.next_queued(free, exclude=[*self._in_flight, *left_alone]):
+                if job.stage == WAITING_FOR_ROOM and not self._may_try_again(job, now):
+                    continue
                 self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
                 free -= 1
         self._free = max(free, 0)
+
+    def _is_room(self) -> bool:
+        """Return whether jobs may begin; the workers of other computers look for themselves."""
+        has_room = not self._cluster.is_own or self._disk.lets_jobs_begin
+        if has_room != self._has_room:
+            self._has_room = has_room
+            free_mib = self._disk.free_bytes() >> 20
+            if has_room:
+                self._log.info("the disk has room again", free_mib=free_mib)
+            else:
+                self._log.warning("jobs wait for room on the disk", free_mib=free_mib)
+        return has_room
+
+    def _may_try_again(self, job: Job, now: float) -> bool:
+        """Return whether a job whose files had no room has been left alone for long enough."""
+        attempt, until = self._no_room.get(job.id, (-1, 0.0))
+        if attempt == job.attempt:
+            return until <= now
+        if len(self._no_room) > _MOST_REMEMBERED:
+            self._no_room.clear()
+        self._no_room[job.id] = (job.attempt, now + _NO_ROOM_S)
+        return False
 
     def _give_back(self, job_id: str, attempt: int, reason: str, *, blame: bool = True) -> None:
         event = Lost(attempt, time.time(), reason, self._settings.max_attempts, blame)
@@ -272,27 +303,17 @@ class Reconciler:
         while True:
             if self._has_lease:
                 try:
-                    self._sweep()
+                    self._sweep.run()
                 except (DatabaseAway, StorageError) as error:
                     self._log.warning("sweep broken off", reason=str(error))
                 except Exception:
                     self._log.exception("sweep broke")
                 pause = _SWEEP_EVERY_S
             else:
+                self._sweep.pause()
                 pause = _TICK_S
             if self._stopping.wait(pause):
                 return
-
-    def _sweep(self) -> None:
-        before = time.time() - _ORPHAN_S
-        if self._cluster.is_own and self._settings.storage_url is None:
-            # Nobody else uploads here: what is older than this process is of no upload.
-            before = max(before, self._started_at)
-        # A slow sender may be quiet for long.
-        broken_off = time.time() - _UPLOAD_S
-        sweep_incoming([self._settings.data_dir / "incoming"], before=broken_off)
-        forget_expired(self._store, self._storage, keep_days=self._settings.keep_days)
-        sweep_files(self._store, self._storage, before=before)
 
 
 def _reason(future: Future) -> str:

@@ -5,7 +5,8 @@
                 claimed                finished
     QUEUED ------------------> RUNNING ---------> DONE
      | ^                       | |  |
-     | |  lost, attempts left  | |  |  failed, or lost once too often
+     | |  lost, attempts left; | |  |  failed, or lost once too often
+     | |  no room on the disk  | |  |
      | +-----------------------+ |  +-------------------------------> FAILED
      |                           |
      +---------------------------+----------------------------------> CANCELLED
@@ -22,6 +23,7 @@ from enum import StrEnum
 from typing import Any
 
 __all__ = [
+    "WAITING_FOR_ROOM",
     "Cancelled",
     "Claimed",
     "Event",
@@ -30,10 +32,14 @@ __all__ = [
     "Job",
     "JobState",
     "Lost",
+    "NoRoom",
     "Progressed",
     "Stale",
     "advance",
 ]
+
+WAITING_FOR_ROOM = "waiting for room on the disk"
+"""Stage of a job that went back to the queue because its files had no room."""
 
 
 class JobState(StrEnum):
@@ -188,13 +194,21 @@ class Lost:
 
 
 @dataclass(frozen=True, slots=True)
+class NoRoom:
+    """The disk is full, or nearly: the job waits until there is room again."""
+
+    attempt: int
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
 class Cancelled:
     """Somebody wants the job no more, whichever attempt it is in."""
 
     at: float
 
 
-Event = Claimed | Progressed | Finished | Failed | Lost | Cancelled
+Event = Claimed | Progressed | Finished | Failed | Lost | NoRoom | Cancelled
 
 
 class Stale(Exception):
@@ -252,6 +266,8 @@ def advance(job: Job, event: Event) -> Job:
             )
         case Failed():
             return _failed(job, event.problem, event.at)
+        case NoRoom():
+            return replace(_waiting(job), stage=WAITING_FOR_ROOM)
         case Lost():
             if not event.blame:
                 return _waiting(job)

@@ -400,17 +400,6 @@ class JobStore:
         """
         return self._count(delete(tables.jobs).where(_JOBS.id == job_id)) > 0
 
-    def forget_submissions(self, before: float) -> int:
-        """Drop the idempotency keys that came before a time; return how many."""
-        return self._count(
-            delete(tables.submissions).where(tables.submissions.c.created_at < before)
-        )
-
-    def expired(self, before: float) -> list[Job]:
-        """Return the jobs that were over before a time, oldest first."""
-        query = select(tables.jobs).where(_JOBS.state.in_(_OVER), _JOBS.finished_at < before)
-        return self._jobs(query.order_by(_JOBS.finished_at))
-
     # Leases
 
     def lease(self, name: str, holder: str, seconds: float, now: float) -> bool:
@@ -474,6 +463,7 @@ def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Jo
         "fingerprint": fingerprint,
         "job_id": job.id,
         "created_at": job.created_at,
+        "kept_from_s": None,
     }
     # If somebody else is about to insert the same key, this waits for that transaction.
     statement = insert(connection, tables.submissions).values(row).on_conflict_do_nothing()

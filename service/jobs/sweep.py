@@ -3,26 +3,122 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import time
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
 
+from service.database.engine import DatabaseAway
+from service.jobs.expiry import Expiry
 from service.jobs.state import Job, JobState
 from service.jobs.store import JobStore
+from service.settings import Settings
 from service.storage import Stat, Storage
+from service.storage.disk import Disk
 
-__all__ = ["forget_expired", "sweep_files", "sweep_incoming"]
+__all__ = ["Sweep", "sweep_files"]
 
 _JOBS = "jobs/"
 _AT_ONCE = 500
 """Ids in one question to the database."""
-_SUBMISSIONS_KEPT_S = 86400.0
+_DAY_S = 86400.0
+_SUBMISSIONS_KEPT_S = _DAY_S
+_ORPHAN_S = 3600.0
+"""Files without a row are of an upload, until they have been seen without one for so long."""
+_UPLOAD_S = _DAY_S
+"""Uploads that have not grown for so long were broken off: a slow sender may be quiet for long."""
 
 
-def sweep_files(store: JobStore, storage: Storage, *, before: float) -> int:
+class Sweep:
+    """Sweeps again and again, and remembers what it saw: no clock is asked how old a file is.
+
+    Parameters
+    ----------
+    settings : Settings
+    store : JobStore
+    storage : Storage
+    clock : callable
+        Seconds from anywhere, which only grow.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        store: JobStore,
+        storage: Storage,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._settings = settings
+        self._store = store
+        self._storage = storage
+        self._clock = clock
+        self._expiry = Expiry(store.engine)
+        self._disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
+        self._counted_at: float | None = None
+        self._orphans: dict[str, float] = {}
+        self._uploads: dict[tuple[str, int, float], float] = {}
+
+    def run(self) -> None:
+        """Sweep once.
+
+        Raises
+        ------
+        DatabaseAway, StorageError
+        """
+        self._sweep_incoming()
+        try:
+            self._forget_expired()
+        except DatabaseAway:
+            if self._disk.is_full:  # then the next time there is room to delete
+                self._disk.give_up()
+            raise
+        self._sweep_orphans()
+        self._disk.hold()
+
+    def pause(self) -> None:
+        """Say that somebody else sweeps meanwhile, and counts the time."""
+        self._counted_at = None
+
+    def _forget_expired(self) -> None:
+        """Delete jobs that were over long ago, and idempotency keys."""
+        at, before = self._clock(), self._counted_at
+        now = self._expiry.passed(0.0 if before is None else at - before)
+        self._counted_at = at
+        for job_id in self._expiry.old_jobs(now - self._settings.keep_days * _DAY_S):
+            # The row first: no job whose files are gone is ever shown.
+            if self._store.forget(job_id):
+                self._storage.delete(f"{_JOBS}{job_id}/")
+        self._expiry.forget_submissions(now - _SUBMISSIONS_KEPT_S)
+
+    def _sweep_orphans(self) -> None:
+        now, before = self._clock(), self._orphans
+        self._orphans = {}
+
+        def is_old(job_id: str) -> bool:
+            self._orphans[job_id] = before.get(job_id, now)
+            return now - self._orphans[job_id] > _ORPHAN_S
+
+        sweep_files(self._store, self._storage, is_old=is_old)
+
+    def _sweep_incoming(self) -> None:
+        """Delete uploads that were broken off, as those of a killed service are."""
+        now, before = self._clock(), self._uploads
+        self._uploads = {}
+        with contextlib.suppress(FileNotFoundError):
+            for upload in (self._settings.data_dir / "incoming").iterdir():
+                with contextlib.suppress(FileNotFoundError):
+                    status = upload.stat()
+                    key = (upload.name, status.st_size, status.st_mtime)
+                    self._uploads[key] = before.get(key, now)
+                    if now - self._uploads[key] > _UPLOAD_S:
+                        _delete(upload)
+
+
+def sweep_files(store: JobStore, storage: Storage, *, is_old: Callable[[str], bool]) -> int:
     """Delete files of jobs that are gone and of attempts that do not count.
 
     The files are listed first and the rows read then, so a row is never older than what is judged
@@ -30,8 +126,8 @@ def sweep_files(store: JobStore, storage: Storage, *, before: float) -> int:
 
     Parameters
     ----------
-    before : float
-        Files without a row are younger than this: of uploads whose row is about to be written.
+    is_old : callable
+        Whether files of an id without a row are not of an upload whose row is about to be written.
 
     Returns
     -------
@@ -50,7 +146,7 @@ def sweep_files(store: JobStore, storage: Storage, *, before: float) -> int:
             job = jobs.get(job_id)
             if job is not None:
                 doomed = _dead_attempts(job, found[job_id])
-            elif all(stat.modified_at < before for stat in found[job_id]):
+            elif is_old(job_id):
                 doomed = {f"{_JOBS}{job_id}/"}
             else:
                 doomed = set()
@@ -62,26 +158,11 @@ def sweep_files(store: JobStore, storage: Storage, *, before: float) -> int:
     return deleted
 
 
-def sweep_incoming(folders: Iterable[Path], *, before: float) -> None:
-    """Delete files that have not grown since `before`: of uploads that were broken off."""
-    for folder in folders:
-        with contextlib.suppress(FileNotFoundError):
-            for leftover in folder.iterdir():
-                with contextlib.suppress(FileNotFoundError):
-                    if leftover.is_file() and leftover.stat().st_mtime < before:
-                        leftover.unlink()
-
-
-def forget_expired(store: JobStore, storage: Storage, *, keep_days: float) -> int:
-    """Delete jobs that were over long ago, and idempotency keys; return how many jobs."""
-    now = time.time()
-    old = store.expired(now - keep_days * 86400.0)
-    for job in old:
-        # The row first: no job whose files are gone is ever shown.
-        if store.forget(job.id):
-            storage.delete(f"{_JOBS}{job.id}/")
-    store.forget_submissions(now - _SUBMISSIONS_KEPT_S)
-    return len(old)
+def _delete(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink()
 
 
 def _dead_attempts(job: Job, files: list[Stat]) -> set[str]:

@@ -18,11 +18,11 @@ import structlog
 
 from service.database.engine import DatabaseAway
 from service.jobs.problems import problem
-from service.jobs.state import Event, Failed, Job, Lost
+from service.jobs.state import Event, Failed, Job, Lost, NoRoom
 from service.jobs.store import JobStore
 from service.pipeline.progress import Cancelled, Progress
 
-__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch"]
+__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "too_large"]
 
 STUCK_EXIT_CODE = 70
 _BEAT_S = 0.5
@@ -49,6 +49,8 @@ class Watch:
     limits : Limits
     interrupted : callable
         Says why this worker has to give its job back, or None.
+    has_room : callable
+        Whether the disk has room for more; the rest of it belongs to the database.
     end : callable
         Ends this process with an exit code.
 
@@ -65,12 +67,14 @@ class Watch:
         limits: Limits,
         *,
         interrupted: Callable[[], str | None],
+        has_room: Callable[[], bool] = lambda: True,
         end: Callable[[int], object],
     ) -> None:
         self._store = store
         self._job = job
         self._limits = limits
         self._interrupted = interrupted
+        self._has_room = has_room
         self._end = end
         self._began = time.monotonic()
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)
@@ -148,6 +152,8 @@ class Watch:
             self._decide(Lost(attempt, now, reason, 0, blame=False))
         elif (found := self._limit_reached()) is not None:
             self._decide(Failed(attempt, now, found))
+        elif not self._has_room():
+            self._decide(NoRoom(attempt, now))
         else:
             at = self._latest
             if not self._store.beat(self._job.id, attempt, now, at.stage, at.fraction, at.eta_s):
@@ -173,11 +179,15 @@ class Watch:
         size = psutil.Process().memory_info().rss
         if size > self._limits.max_job_bytes:
             self.outgrown = True
-            return problem(
-                422,
-                "The job needs too much memory",
-                f"Its process grew to {size // _MIB} MiB; the limit is "
-                f"{self._limits.max_job_bytes // _MIB} MiB (STILLPATH_MAX_JOB_BYTES). Cut the "
-                "print into several files, or have the limit raised.",
-            )
+            return too_large(f"Its process grew to {size // _MIB} MiB", self._limits.max_job_bytes)
         return None
+
+
+def too_large(what: str, max_job_bytes: int) -> dict[str, object]:
+    """Return the problem of a job that needs too much memory; `what` happened."""
+    return problem(
+        422,
+        "The job needs too much memory",
+        f"{what}; the limit is {max_job_bytes // _MIB} MiB (STILLPATH_MAX_JOB_BYTES). Cut the "
+        "print into several files, or have the limit raised.",
+    )

@@ -8,6 +8,7 @@ names the prefix of the one that counts.
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import hashlib
 import json
@@ -26,13 +27,15 @@ import structlog
 from service.database.engine import DatabaseAway, StoreError, open_database
 from service.environment import prepare_environment
 from service.jobs.problems import DISK_FULL, problem_of
-from service.jobs.state import Event, Failed, Finished, Job, Lost
+from service.jobs.state import Event, Failed, Finished, Job, Lost, NoRoom
 from service.jobs.store import JobStore
-from service.jobs.watch import Limits, Watch
+from service.jobs.watch import Limits, Watch, too_large
 from service.logs import configure_logging
 from service.pipeline.progress import Cancelled, Progress
+from service.processes import limit_memory
 from service.settings import Settings
 from service.storage import Storage, StorageError
+from service.storage.disk import Disk
 from service.storage.opened import open_storage
 
 __all__ = ["Runner", "Task", "Workplace", "execute", "run_job", "run_task"]
@@ -40,6 +43,8 @@ __all__ = ["Runner", "Task", "Workplace", "execute", "run_job", "run_task"]
 _PATIENCE_S = 60.0
 """How long storage and database may be away before an attempt is given up."""
 _LONGEST_PAUSE_S = 4.0
+_KEPT_BYTES = 256 << 20
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 _Given = TypeVar("_Given")
 
@@ -139,7 +144,15 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
     log = structlog.get_logger("worker")
     settings = workplace.settings
     limits = Limits(settings.max_job_s, settings.max_job_bytes, settings.cancel_grace_s)
-    watch = Watch(store, job, limits, interrupted=workplace.interrupted, end=workplace.end)
+    disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
+    watch = Watch(
+        store,
+        job,
+        limits,
+        interrupted=workplace.interrupted,
+        has_room=lambda: disk.lets_jobs_go_on,
+        end=workplace.end,
+    )
     with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
         log.info("job started", worker=workplace.name)
         with watch:
@@ -186,15 +199,24 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]
 
 
 def _attempt(job: Job, workplace: Workplace, runner: Runner, watch: Watch) -> Event | None:
-    """Return how the attempt ended; None if it was stopped from outside."""
+    """Return how the attempt ended; None if it was stopped from outside.
+
+    A full disk is nobody's fault: the job waits for room.
+    """
     try:
         with _folder(workplace.scratch / f"{job.id}-{job.attempt}") as folder:
             return _work(job, workplace, runner, watch, folder)
     except Cancelled:
         return None
-    except StorageError as error:
-        if error.errno not in DISK_FULL:
-            _log_crash()
+    except MemoryError:
+        what = "The system refused its process more memory"
+        return Failed(job.attempt, time.time(), too_large(what, workplace.settings.max_job_bytes))
+    except OSError as error:
+        if error.errno in _NO_ROOM:
+            structlog.get_logger("worker").warning("no room for the job", reason=str(error))
+            return NoRoom(job.attempt, time.time())
+        _log_crash()
+        if isinstance(error, StorageError):
             # Perhaps it answers another worker, or later.
             return Lost(job.attempt, time.time(), str(error), workplace.settings.max_attempts)
         return Failed(job.attempt, time.time(), problem_of(error))
@@ -304,6 +326,8 @@ def _opened(given: str | None) -> tuple[Settings, JobStore, Storage]:
     prepare_environment()
     configure_logging()
     settings = Settings() if given is None else Settings.model_validate_json(given)
+    # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
+    limit_memory(settings.max_job_bytes + max(settings.max_job_bytes // 4, _KEPT_BYTES))
     engine = _patiently(lambda: open_database(settings), StoreError, time.sleep)
     return settings, JobStore(engine), open_storage(settings)
 

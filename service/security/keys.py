@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from pydantic import SecretStr
 from sqlalchemy import Engine, RowMapping, insert, select, update
@@ -16,6 +17,7 @@ from sqlalchemy.exc import IntegrityError
 
 from service.database.engine import reading, writing
 from service.database.tables import keys
+from service.private import private_file
 from service.security.callers import Caller, Scope
 from service.settings import Settings, is_loopback
 
@@ -34,6 +36,7 @@ KEY_PREFIX = "sp_"
 OWNER_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
 _FORM = re.compile(rf"{KEY_PREFIX}[A-Za-z0-9_-]{{32,128}}")
 _FIRST = "first"
+_FILE = "first-key"
 # Of a key's last use no more is kept than this, so that reading does not become writing.
 _USE_SECONDS = 60.0
 
@@ -238,19 +241,39 @@ def keys_needed(settings: Settings, host: str) -> bool:
     return settings.keys
 
 
-def announce_first_key(store: KeyStore, given: SecretStr | None) -> None:
-    """Make the first key if there is none, and print it on stdout unless it was given.
+def announce_first_key(store: KeyStore, given: SecretStr | None, folder: Path) -> None:
+    """Make the first key if there is none; unless it was given, put it into a file and say where.
+
+    Parameters
+    ----------
+    store : KeyStore
+    given : SecretStr, optional
+    folder : Path
+        For the file ``first-key``, which only its owner reads.
 
     Raises
     ------
     KeyRefused
         If the given one does not look like a key.
     """
-    made = store.create_first(None if given is None else given.get_secret_value())
-    if made is not None and given is None:
-        # Straight to whoever started the service: a log would keep it.
-        sys.stdout.write(f"stillpath: first key, with all scopes, shown this once: {made}\n")
-        sys.stdout.flush()
+    if given is not None:
+        store.create_first(given.get_secret_value())
+        return
+    if store.list():
+        return
+    # The file first, so that no key is lost: whoever starts a service beside us has one of his own.
+    fresh, file = folder / f".{_FILE}-{secrets.token_hex(4)}", folder / _FILE
+    private_file(fresh)
+    try:
+        secret = KEY_PREFIX + secrets.token_urlsafe(24)
+        fresh.write_text(f"{secret}\n")
+        if store.create_first(secret) is not None:
+            fresh.replace(file)
+            # Not the key itself: standard output is what logs keep.
+            sys.stdout.write(f"stillpath: first key, with all scopes: {file.resolve()}\n")
+            sys.stdout.flush()
+    finally:
+        fresh.unlink(missing_ok=True)
 
 
 def _check_form(secret: str) -> None:

@@ -14,6 +14,7 @@ from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
 from gcode.slicers.facts import facts_in
 from tests.fuzz.checks import read_through, through_the_road, walk
+from tests.fuzz.grammar import written
 from tests.fuzz.hostile import HOSTILE, pieces
 from tests.fuzz.machines import KINDS, machine_of
 from tests.fuzz.mutations import excerpts
@@ -36,6 +37,20 @@ def test_damaged_files_are_read_and_planned_or_refused(kind: str) -> None:
     files = [path.read_bytes() for path in EXAMPLES]
     for data in excerpts(files, 24_000, random.Random(KINDS.index(kind)), size=3000):
         read_through(data, machine)
+
+
+def test_a_grammar_s_files_are_the_seed_s() -> None:
+    made = [written(random.Random(seed), 50) for seed in (1, 1, 2)]
+    assert made[0] == made[1]
+    assert made[0] != made[2]
+    assert made[0].count(b"\n") >= 50
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_files_of_a_grammar_are_read_and_planned(kind: str) -> None:
+    dice = random.Random(KINDS.index(kind))
+    for _ in range(5):
+        read_through(written(dice, 60), machine_of(kind))
 
 
 @pytest.mark.parametrize("kind", KINDS)

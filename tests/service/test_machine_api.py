@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from datetime import date
@@ -121,6 +122,10 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
         assert client.get(where, headers={"If-None-Match": '"x"'}).status_code == 200
 
 
+TINY = re.sub(r'("max_accel_mm_s2":)[^,}]+', r"\g<1>5e-324", make_machine().model_dump_json())
+SLOW = re.sub(r'("f_hz":)[^,}]+', r"\g<1>1e-300", make_machine().model_dump_json())
+
+
 @pytest.mark.parametrize(
     ("where", "body", "status", "words"),
     [
@@ -132,6 +137,8 @@ def test_what_has_not_changed_is_not_sent_again(client: TestClient):
         (MINE, b'{"title": "\\ud800"}', 422, ["not JSON"]),
         (MINE, b'{"title": "\xff"}', 422, ["not JSON"]),
         (MINE, make_machine().model_dump_json().replace("My", "\\u001b["), 422, ["title"]),
+        (MINE, TINY, 422, ["5e-324", "no size of anything"]),
+        (MINE, SLOW, 422, ["1e-300", "no size of anything"]),
         ("/v1/machines/yours", None, 422, ["'mine', not 'yours'"]),
         ("/v1/machines/ender3", None, 409, ["built-in", "another name"]),
         ("/v1/machines/Mine", None, 422, ["cannot be a machine's name"]),

@@ -14,7 +14,7 @@ from models.identification.readers.checks import (
     check_steady,
 )
 from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import Table
+from models.identification.readers.tables import MOST_ROWS, Table
 from models.identification.types import AccelerationLog
 
 __all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
@@ -55,7 +55,7 @@ def read_klipper_log(table: Table, axis: str | None, settings: ReadSettings) -> 
         lost = _OVERFLOWS.search(comment)
         if lost and int(lost[1]) > 0:
             raise _overflowed(table, int(lost[1]))
-    check_long(table, _LEAST_SAMPLES, "samples")
+    check_long(table, _LEAST_SAMPLES, "samples", MOST_ROWS)
     values = table.numbers(("time", *_KLIPPER))
     check_steady(values[:, 0], table)
     accel = values[:, 1:] * _UNITS[settings.acceleration_unit or "mm/s^2"]
@@ -77,7 +77,7 @@ def read_m956(table: Table, axis: str | None, settings: ReadSettings) -> Acceler
     """
     rate_hz = _rate_hz(table)
     table = table.without_last("")
-    check_long(table, _LEAST_SAMPLES, "samples")
+    check_long(table, _LEAST_SAMPLES, "samples", MOST_ROWS)
     extra = [n for n in table.names[1:] if n not in "xyz"]
     if extra:
         raise ModelError(f"{table.source}: column {extra[0]!r} is not one of X, Y, Z")

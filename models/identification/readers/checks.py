@@ -13,6 +13,7 @@ __all__ = ["check_alive", "check_long", "check_range", "check_rising", "check_st
 Array = NDArray[np.float64]
 
 _RATES_HZ = (10.0, 1e6)
+_LONGEST_S = 3600.0
 _NEXT, _FINE, _OFTEN = 0.02, 3, 20
 """Share of the range that is looked at beside an extreme, the steps of the sensor that it must
 hold, and the samples that an extreme may have."""
@@ -24,8 +25,8 @@ def check_long(table: Table, least: int, what: str, most: int | None = None) -> 
     """Raise ModelError if the table has fewer than `least` rows, or more than `most`."""
     if most is not None and len(table.rows) > most:
         raise ModelError(
-            f"{table.source}: {len(table.rows)} {what}, at most {most} are read: a test has some "
-            "hundred; give the file as the firmware wrote it"
+            f"{table.source}: {len(table.rows)} {what}, at most {most} are read; give the file as "
+            "it was written, or fewer"
         )
     if len(table.rows) < least:
         raise ModelError(
@@ -47,7 +48,7 @@ def check_rising(values: Array, table: Table, name: str) -> None:
 
 
 def check_steady(time_s: Array, table: Table) -> None:
-    """Raise ModelError for a time that is not in s, and at the first gap of over two samples."""
+    """Raise ModelError for a time not in s, a recording of hours, a gap of over two samples."""
     check_rising(time_s, table, "time")
     steps = np.diff(time_s)
     period = float(np.median(steps))
@@ -55,6 +56,12 @@ def check_steady(time_s: Array, table: Table) -> None:
         raise ModelError(
             f"{table.source}: the samples are {period:.4g} s apart by its time, which is not "
             f"between {1 / _RATES_HZ[1]:g} and {1 / _RATES_HZ[0]:g} s: time must be in seconds"
+        )
+    lasted_s = float(time_s[-1] - time_s[0])
+    if lasted_s > _LONGEST_S:
+        raise ModelError(
+            f"{table.source}: it lasts {lasted_s:.0f} s, at most {_LONGEST_S:.0f} s are read; a "
+            "resonance test takes some minutes: cut the file to it"
         )
     gaps = np.flatnonzero(steps > _GAP_SAMPLES * period)
     if len(gaps):

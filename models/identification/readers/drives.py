@@ -7,12 +7,13 @@ import numpy as np
 from models.errors import ModelError
 from models.identification.readers.checks import check_long, check_steady
 from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import Table
+from models.identification.readers.tables import MOST_ROWS, Table
 from models.identification.types import DrivenLog
 
 __all__ = ["is_drive", "read_drives"]
 
 _LEAST_SAMPLES = 64
+_MOST_AXES = 16
 _COLUMNS = ("time_s", "cmd_acc", "meas_acc")
 
 
@@ -44,6 +45,11 @@ def read_drives(table: Table, axis: str | None, settings: ReadSettings) -> tuple
     if axis_column is None:
         return (_log(table, np.arange(len(values)), values, axis),)
     axes = [text.lower() for text in table.texts(axis_column)]
+    if len(set(axes)) > _MOST_AXES:
+        raise ModelError(
+            f"{table.source}: column {axis_column!r} has {len(set(axes))} values, at most "
+            f"{_MOST_AXES} axes are read; choose another axis_column"
+        )
     listed = np.array(axes)
     return tuple(
         _log(table, np.flatnonzero(listed == name), values, name) for name in dict.fromkeys(axes)
@@ -53,7 +59,9 @@ def read_drives(table: Table, axis: str | None, settings: ReadSettings) -> tuple
 def _log(table: Table, chosen: np.ndarray, values: np.ndarray, axis: str | None) -> DrivenLog:
     part = table.picked(chosen)
     time_s, command, measured = values[chosen].T
-    check_long(part, _LEAST_SAMPLES, "samples" if axis is None else f"samples of axis {axis}")
+    check_long(
+        part, _LEAST_SAMPLES, "samples" if axis is None else f"samples of axis {axis}", MOST_ROWS
+    )
     check_steady(time_s, part)
     for name, column in (("command", command), ("measured", measured)):
         if np.ptp(column) == 0.0:

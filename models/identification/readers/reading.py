@@ -19,12 +19,13 @@ from models.identification.readers.model_files import read_json_models, read_mat
 from models.identification.readers.responses import is_response, read_responses
 from models.identification.readers.settings import ReadSettings, direction_of
 from models.identification.readers.spectra import is_spectrum, read_spectrum
-from models.identification.readers.tables import Table, as_table
+from models.identification.readers.tables import Table, as_table, check_size
 from models.identification.types import Measurement
 
 __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 
 LARGEST_BYTES = 200_000_000
+_LARGEST_MODEL_BYTES = 16_000_000
 
 _DIRECTION = r"-?\d+\.\d+,-?\d+\.\d+(?:,-?\d+\.\d+)?"
 _KLIPPER_NAME = re.compile(
@@ -91,10 +92,17 @@ def read_content(
 def _from_content(
     content: bytes, name: str, axis: str | None, settings: ReadSettings
 ) -> tuple[Measurement, ...]:
+    is_json = content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"[")
+    if (is_json or is_matlab(content)) and len(content) > _LARGEST_MODEL_BYTES:
+        raise ModelError(
+            f"{name}: {len(content)} bytes, at most {_LARGEST_MODEL_BYTES} are read of a model; "
+            "give the model alone, without what it was made from"
+        )
     if is_matlab(content):
         return read_matlab_models(content, name, axis, settings)
-    if content.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] in (b"{", b"["):
+    if is_json:
         return read_json_models(content, name, axis, settings)
+    check_size(content, name)
     table = as_table(content.decode("utf-8-sig", errors="replace"), name)
     return _from_table(table, axis, settings)
 

@@ -13,7 +13,7 @@ from models.identification.types import FrequencyResponse
 
 __all__ = ["is_response", "read_responses"]
 
-_LEAST_POINTS = 8
+_LEAST_POINTS, _MOST_POINTS, _MOST_RESPONSES = 8, 50_000, 200
 _FREQUENCY = ("freq_hz", "f_hz", "frequency_hz", "frequency", "freq", "f")
 _MAGNITUDE = ("mag", "mag_abs", "magnitude", "gain")
 _DECIBEL = ("mag_db", "magnitude_db", "gain_db")
@@ -44,7 +44,7 @@ def read_responses(
         For a column that is missing, frequencies that do not rise, or a magnitude that must
         be in dB although nobody says so.
     """
-    check_long(table, _LEAST_POINTS, "frequencies")
+    check_long(table, _LEAST_POINTS, "frequencies", _MOST_POINTS)
     frequency = _needed(table, _FREQUENCY)
     f_hz = table.numbers([frequency])[:, 0]
     response = _response(table, settings)
@@ -57,7 +57,13 @@ def read_responses(
             )
     labels, axes = _texts(table, _LABEL), _texts(table, ("axis",))
     results = []
-    for label, own in dict.fromkeys(zip(labels, axes, strict=True)):
+    different = dict.fromkeys(zip(labels, axes, strict=True))
+    if len(different) > _MOST_RESPONSES:
+        raise ModelError(
+            f"{table.source}: {len(different)} labels and axes, at most {_MOST_RESPONSES} are "
+            "read; split the file"
+        )
+    for label, own in different:
         chosen = np.array([pair == (label, own) for pair in zip(labels, axes, strict=True)])
         part = table.picked(np.flatnonzero(chosen))
         check_long(part, _LEAST_POINTS, f"frequencies of {label or own or 'the response'}")

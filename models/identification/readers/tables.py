@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from models.errors import ModelError
 
-__all__ = ["Table", "as_table"]
+__all__ = ["MOST_ROWS", "Table", "as_table", "check_size"]
 
 Array = NDArray[np.float64]
 
+MOST_ROWS = 1_000_000
+"""A test of 135 s with a sensor of 6.6 kHz has 900 000 samples; most have half as many."""
+_MOST_COMMENTS = 1000
+_LONGEST_LINE = 20_000
 _LARGEST = 1e30
 """Nothing measured is larger; beyond it, squares and sums would overflow."""
 
@@ -134,6 +138,29 @@ class Table:
         return ModelError(f"{self.source}: the rows cannot be read as numbers")
 
 
+def check_size(content: bytes, source: str) -> None:
+    """Raise ModelError if a text has more lines than anything measured, or longer ones.
+
+    What is refused here costs nothing; what is read takes memory and time in proportion.
+    """
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    if lines > MOST_ROWS + _MOST_COMMENTS:
+        raise ModelError(
+            f"{source}: {lines} lines, at most {MOST_ROWS} samples are read: a resonance test of "
+            "135 s has 432000 at 3200 Hz; cut the file to the test, or record with a lower rate"
+        )
+    at = 0
+    while at + _LONGEST_LINE < len(content):
+        end = max(content.rfind(mark, at, at + _LONGEST_LINE) for mark in (b"\n", b"\r"))
+        if end < 0:
+            line = content.count(b"\n", 0, at) + 1
+            raise ModelError(
+                f"{source}, line {line}: longer than {_LONGEST_LINE} characters, the limit; export "
+                "the file again, a row for each sample"
+            )
+        at = end + 1
+
+
 def as_table(text: str, source: str) -> Table:
     """Find delimiter, header and rows of a text.
 
@@ -142,23 +169,28 @@ def as_table(text: str, source: str) -> Table:
     writing is left out, with a note.
     """
     listed = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    filled = [(i + 1, line) for i, line in enumerate(listed) if line and not line.isspace()]
-    comments = [line for _, line in filled if line.startswith("#")]
-    rows = [(i, line) for i, line in filled if not line.startswith("#")]
+    # Of a million lines every list counts: only the places of rows, and the rows.
+    lines = [
+        i for i, line in enumerate(listed, 1) if line and line[0] != "#" and not line.isspace()
+    ]
+    rows = [listed[i - 1] for i in lines]
+    comments = [line for line in listed if line.startswith("#")]
+    first = next((line for line in listed if line and not line.isspace()), "")
     header = ""
-    if rows and not _numeric_start(rows[0][1]):
-        header = rows.pop(0)[1]
-    delimiter = _delimiter(rows[0][1] if rows else header)
+    if rows and not _numeric_start(rows[0]):
+        header = rows.pop(0)
+        lines.pop(0)
+    delimiter = _delimiter(rows[0] if rows else header)
     if not header and rows:
-        header = _commented_header(comments, delimiter, len(rows[0][1].split(delimiter)))
+        header = _commented_header(comments, delimiter, len(rows[0].split(delimiter)))
     table = Table(
         source=source,
         names=_names(header, delimiter),
-        rows=[line for _, line in rows],
-        lines=[i for i, _ in rows],
+        rows=rows,
+        lines=lines,
         delimiter=delimiter,
         comments=tuple(line for line in comments if line != header),
-        first_line=filled[0][1] if filled else "",
+        first_line=first,
     )
     return table if not listed[-1] else _without_cut_line(table)
 

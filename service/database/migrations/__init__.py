@@ -6,5 +6,5 @@ compares the two.
 
 __all__ = ["LATEST"]
 
-LATEST = "0001"
+LATEST = "0002"
 """Revision that `service.database.tables` describes."""

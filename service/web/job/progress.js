@@ -19,7 +19,7 @@ export function progressPanel() {
   const update = (/** @type {any} */ job) => {
     if (job.state === "queued") {
       bar.removeAttribute("value");
-      fill(stage, "Waiting");
+      fill(stage, capital(job.stage)); // for its turn, or for room on the disk
       fill(share);
       fill(left, job.queue_position ? `${counted(job.queue_position, "job")} before it` : "Next in the queue");
       return;

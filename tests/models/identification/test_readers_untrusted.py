@@ -135,3 +135,40 @@ def test_byte_order_mark_and_line_ends() -> None:
     for other in (b"\xef\xbb\xbf" + text, text.replace(b"\n", b"\r\n"), text + b"\n\n"):
         (same,) = read_content(other, "resonances_x_1.csv")
         np.testing.assert_array_equal(same.psd["xyz"], plain.psd["xyz"])  # type: ignore[union-attr]
+
+
+LOG = "#time,accel_x,accel_y,accel_z\n"
+
+
+def rows(count: int, row: str) -> bytes:
+    return (row * count).encode()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (LOG.encode() + rows(1_002_000, "1,2,3,4\n"), "1002001 lines, at most 1000000 samples"),
+        (LOG.encode() + rows(1_002_000, "1,2,3,4\r"), "1002000 lines, at most 1000000 samples"),
+        (b"freq,psd_x\n" + rows(100, "5,1\n") + b"1" * 30_000, "line 102: longer than 20000"),
+        (b'{"num": [' + b"1," * 8_000_000 + b"1]}", "at most 16000000 are read of a model"),
+        (
+            b"freq_hz,real,imag\n" + rows(50_001, "5,1,1\n"),
+            "50001 frequencies, at most 50000 are read",
+        ),
+        (
+            b"freq_hz,real,imag,label\n" + b"".join(b"5,1,1,%d\n" % n for n in range(300)),
+            "300 labels and axes, at most 200 are read",
+        ),
+        (
+            b"time_s,cmd_acc,meas_acc,axis\n" + b"".join(b"5,1,1,%d\n" % n for n in range(300)),
+            "'axis' has 300 values, at most 16 axes",
+        ),
+        (
+            LOG.encode() + b"".join(b"%g,%d,1,2\n" % (0.09 * n, n % 7) for n in range(50_000)),
+            "it lasts 4500 s, at most 3600 s are read",
+        ),
+    ],
+)
+def test_more_than_can_be_measured_is_refused(content: bytes, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        read_content(content, "raw_data_x.csv")

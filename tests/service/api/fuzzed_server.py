@@ -20,6 +20,6 @@ if __name__ == "__main__":
     from service.settings import Settings
     from tests.service.runners import light
 
-    design = design_report(load_machine("ender3"), "x")
-    with mock.patch.object(designs, "_made", return_value=design):
+    design = design_report(load_machine("ender3"), "x").model_dump(mode="json")
+    with mock.patch.object(designs, "computed", mock.AsyncMock(return_value=design)):
         serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=light)

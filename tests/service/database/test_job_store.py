@@ -13,6 +13,7 @@ from sqlalchemy import Engine, select, text
 
 from service.database.engine import reading, writing
 from service.database.tables import deliveries
+from service.jobs.expiry import Expiry
 from service.jobs.state import (
     Cancelled,
     Event,
@@ -166,9 +167,20 @@ def test_a_request_whose_job_was_deleted_counts_anew(store: JobStore):
     second = store.add(make_job(created_at=2000.0), idempotency=("key", "print"))
     assert second.id != first.id
     assert store.submitted("anna", "key") == ("print", second)
-    assert store.forget_submissions(2000.0) == 0
-    assert store.forget_submissions(2001.0) == 1
-    assert store.submitted("anna", "key") is None
+
+
+def test_idempotency_keys_are_kept_by_time_that_passed(store: JobStore):
+    expiry = Expiry(store.engine)
+    for name in ("old", "young"):
+        store.add(make_job(), idempotency=(name, "print"))
+        now = expiry.passed(100.0)
+    assert expiry.forget_submissions(now - 50.0) == 1
+    assert store.submitted("anna", "old") is None
+    assert store.submitted("anna", "young") is not None
+    store.forget(store.submitted("anna", "young")[1].id)
+    store.add(make_job(), idempotency=("young", "print"))
+    assert expiry.passed(100.0) == now + 100.0
+    assert expiry.forget_submissions(now + 50.0) == 0  # it counted anew
 
 
 def test_a_quota_of_jobs(store: JobStore):
@@ -299,9 +311,13 @@ def test_counting(store: JobStore):
 
 def test_what_has_been_kept_long_enough(store: JobStore):
     jobs = [store.add(make_job()) for _ in range(4)]
-    for job, at in zip(jobs[:3], (3000.0, 2000.0, 4000.0), strict=True):
+    expiry = Expiry(store.engine)
+    for job, at in zip(jobs[:3], (3000.0, 2000.0, 4e9), strict=True):  # clocks say what they like
         store.apply(job.id, Cancelled(at))
-    assert [job.id for job in store.expired(4000.0)] == [jobs[1].id, jobs[0].id]
+        now = expiry.passed(10.0)
+    assert now == 30.0
+    assert expiry.old_jobs(30.0) == [jobs[0].id, jobs[1].id]
+    assert expiry.old_jobs(10.0) == []
 
 
 # The queue

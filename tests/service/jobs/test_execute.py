@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from service.jobs import worker
-from service.jobs.state import Cancelled, Job, JobState, Lost
+from service.jobs.state import WAITING_FOR_ROOM, Cancelled, Job, JobState, Lost
 from service.jobs.watch import STUCK_EXIT_CODE
 from service.jobs.worker import Workplace, execute
 from service.pipeline.progress import Progress
@@ -222,11 +223,19 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     assert "away" in job.problem["detail"]
 
 
-def test_a_full_disk_is_not_waited_for(site: Site):
+def test_a_job_without_room_waits_in_the_queue(site: Site):
     broken = _Broken(site.storage, StorageError(28, "No space left", "/"), 1)
     job = Bench(site).run(site.submit("G1"), storage=broken)
-    assert (job.state, job.problem["status"]) == (JobState.FAILED, 507)
+    assert (job.state, job.stage, job.losses) == (JobState.QUEUED, WAITING_FOR_ROOM, 0)
+    assert Bench(site).run(job.id).state is JobState.DONE
     site.check_files()
+
+
+def test_what_is_left_of_the_disk_belongs_to_the_database(site: Site):
+    everything = shutil.disk_usage(site.data_dir).free * 8
+    bench = Bench(site, limits={"disk_reserve_bytes": everything})
+    job = bench.run(site.submit("slow"))
+    assert (job.state, job.stage) == (JobState.QUEUED, WAITING_FOR_ROOM)
 
 
 def test_a_cancel_of_a_job_that_is_over_is_too_late(site: Site):

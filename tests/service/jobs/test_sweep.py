@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from service.jobs.state import Cancelled
-from service.jobs.sweep import forget_expired, sweep_files, sweep_incoming
+from service.jobs.sweep import Sweep, sweep_files
 from tests.service.database.examples import finished
 from tests.service.jobs.site import Site
 
@@ -43,16 +42,16 @@ def test_attempts_that_do_not_count_go(site: Site):
     site.store.apply(done, finished(job))
     site.store.claim(running, 1.0, "w")
     site.store.apply(cancelled, Cancelled(1.0))
-    sweep_files(site.store, site.storage, before=time.time() - 3600)
+    sweep_files(site.store, site.storage, is_old=lambda _: False)
     kept = {f"jobs/{job_id}/source/part.gcode" for job_id in ids}
     assert keys(site) == kept | {f"jobs/{done}/1/result/a", f"jobs/{running}/1/result/a"}
 
 
 def test_files_without_a_row_go_when_they_are_old(site: Site):
     put(site, "jobs/nobody/source/a")
-    sweep_files(site.store, site.storage, before=time.time() - 3600)
+    sweep_files(site.store, site.storage, is_old=lambda _: False)
     assert keys(site)
-    sweep_files(site.store, site.storage, before=time.time() + 1)
+    sweep_files(site.store, site.storage, is_old=lambda _: True)
     assert not keys(site)
 
 
@@ -63,24 +62,99 @@ def test_results_of_the_first_version_stay(site: Site):
     site.store.apply(job_id, replace(event, output=f"jobs/{job_id}"))
     put(site, f"jobs/{job_id}/result/a")
     before = keys(site)
-    sweep_files(site.store, site.storage, before=time.time() + 1)
+    sweep_files(site.store, site.storage, is_old=lambda _: True)
     assert keys(site) == before
 
 
-def test_old_jobs_are_forgotten_with_their_files(site: Site):
+class Clock:
+    """Counts seconds as the test says."""
+
+    def __init__(self) -> None:
+        self.now_s = 5000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def sweep(self, sweep: Sweep, hours: float) -> None:
+        """Sweep every minute, as the service does, for so long; not that often, to be quick."""
+        for _ in range(10):
+            self.now_s += 360.0 * hours
+            sweep.run()
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def sweep(site: Site, clock: Clock) -> Sweep:
+    settings = site.settings.model_copy(update={"keep_days": 1.0})
+    return Sweep(settings, site.store, site.storage, clock=clock)
+
+
+def test_old_jobs_are_forgotten_with_their_files(site: Site, sweep: Sweep, clock: Clock):
     old, young = site.submit("G1"), site.submit("G1")
-    site.store.apply(old, Cancelled(time.time() - 2 * 86400))
+    site.store.apply(old, Cancelled(time.time()))
+    sweep.run()
+    clock.sweep(sweep, 23)
     site.store.apply(young, Cancelled(time.time()))
-    assert forget_expired(site.store, site.storage, keep_days=1.0) == 1
+    assert site.store.get(old) is not None
+    clock.sweep(sweep, 2)
     assert site.store.get(old) is None
     assert keys(site) == {f"jobs/{young}/source/part.gcode"}
 
 
-def test_uploads_that_were_broken_off_go(site: Site):
+@pytest.mark.parametrize("days", [32, -1, 400])
+def test_a_clock_that_jumps_deletes_nothing(
+    site: Site, sweep: Sweep, clock: Clock, monkeypatch: pytest.MonkeyPatch, days: int
+):
+    done, waiting = site.submit("G1"), site.submit("G1")
+    site.store.apply(done, Cancelled(time.time()))
+    put(site, "jobs/nobody/source/a")
+    (site.data_dir / "incoming").mkdir()
+    (site.data_dir / "incoming" / "upload").write_text("x")
+    before = keys(site)
+    sweep.run()
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + days * 86400)
+    clock.sweep(sweep, 0.5)
+    again = Sweep(sweep._settings, site.store, site.storage, clock=clock)  # as after a start
+    clock.now_s -= 4000
+    again.run()
+    assert keys(site) == before
+    assert (site.data_dir / "incoming" / "upload").exists()
+    assert site.store.get(done) is not None
+    assert site.store.get(waiting) is not None
+    clock.sweep(again, 25)
+    assert site.store.get(done) is None
+    assert site.store.get(waiting) is not None
+
+
+def test_time_that_somebody_else_counts_is_not_counted_twice(
+    site: Site, sweep: Sweep, clock: Clock
+):
+    job_id = site.submit("G1")
+    site.store.apply(job_id, Cancelled(time.time()))
+    sweep.run()
+    for _ in range(10):
+        sweep.pause()
+        clock.now_s += 86400.0
+        sweep.run()
+    assert site.store.get(job_id) is not None
+
+
+def test_files_that_are_seen_without_a_row_for_long_go(site: Site, sweep: Sweep, clock: Clock):
+    put(site, "jobs/nobody/source/a")
     folder = site.data_dir / "incoming"
-    folder.mkdir()
-    for name, age_s in (("old", 7200), ("young", 0)):
+    (folder / "measurements-1").mkdir(parents=True)
+    for name in ("broken-off", "grows"):
         (folder / name).write_text("x")
-        os.utime(folder / name, (time.time() - age_s,) * 2)
-    sweep_incoming([folder, site.data_dir / "none"], before=time.time() - 3600)
-    assert [file.name for file in folder.iterdir()] == ["young"]
+    sweep.run()
+    clock.sweep(sweep, 0.9)
+    assert keys(site)
+    clock.sweep(sweep, 0.2)
+    assert not keys(site)
+    (folder / "grows").write_text("xx")
+    clock.sweep(sweep, 23)
+    assert [file.name for file in folder.iterdir()] == ["grows"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,30 +111,38 @@ def test_what_cannot_be_is_refused(store: KeyStore, change: dict, words: str):
     assert store.list() == []
 
 
-def test_the_first_key_is_printed_once(store: KeyStore, capsys: pytest.CaptureFixture[str]):
-    announce_first_key(store, None)
-    announce_first_key(store, None)
+def test_the_first_key_is_in_a_file_of_its_owner(
+    store: KeyStore, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    announce_first_key(store, None, tmp_path)
+    (file,) = tmp_path.glob("*first-key*")
+    assert os.name != "posix" or file.stat().st_mode & 0o777 == 0o600
     printed = capsys.readouterr().out.splitlines()
-    assert len(printed) == 1
-    found = store.find(printed[0].split()[-1])
+    assert printed == [f"stillpath: first key, with all scopes: {file}"]
+    found = store.find(file.read_text().strip())
     assert found is not None
     assert found.scopes == frozenset(Scope)
+    file.unlink()
+    announce_first_key(store, None, tmp_path)
+    assert not list(tmp_path.glob("*first-key*"))
+    assert capsys.readouterr().out == ""
 
 
 def test_the_first_key_can_be_given_and_is_not_printed(
-    store: KeyStore, capsys: pytest.CaptureFixture[str]
+    store: KeyStore, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     given = "sp_" + "g" * 32
-    announce_first_key(store, SecretStr(given))
-    announce_first_key(store, SecretStr("sp_" + "h" * 32))  # only the first one counts
+    announce_first_key(store, SecretStr(given), tmp_path)
+    announce_first_key(store, SecretStr("sp_" + "h" * 32), tmp_path)  # only the first one counts
     assert capsys.readouterr().out == ""
+    assert not list(tmp_path.glob("*first-key*"))
     assert [store.find(given) is not None, len(store.list())] == [True, 1]
 
 
 @pytest.mark.parametrize("given", ["", "admin", "sp_short", "x" * 40, "sp_" + "ä" * 40])
-def test_a_weak_first_key_is_refused(store: KeyStore, given: str):
+def test_a_weak_first_key_is_refused(store: KeyStore, tmp_path: Path, given: str):
     with pytest.raises(KeyRefused, match="FIRST_KEY") as caught:
-        announce_first_key(store, SecretStr(given))
+        announce_first_key(store, SecretStr(given), tmp_path)
     assert not given or given not in str(caught.value)
 
 

@@ -1,0 +1,21 @@
+"""The time that the service was seen to run, and since when, by it, what is over has been kept."""
+
+import sqlalchemy as sa
+from alembic import op
+
+__all__ = ["down_revision", "revision", "upgrade"]
+
+revision = "0002"
+down_revision = "0001"
+
+
+def upgrade() -> None:
+    """Add a table and two columns; what is over already is kept from now on."""
+    op.create_table(
+        "seen_time",
+        sa.Column("name", sa.String(length=32), nullable=False),
+        sa.Column("seconds", sa.Float(), nullable=False),
+        sa.PrimaryKeyConstraint("name", name=op.f("seen_time_pkey")),
+    )
+    op.add_column("jobs", sa.Column("kept_from_s", sa.Float(), nullable=True))
+    op.add_column("submissions", sa.Column("kept_from_s", sa.Float(), nullable=True))

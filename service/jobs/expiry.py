@@ -1,0 +1,75 @@
+"""What has been kept for long enough, by time that was seen to pass.
+
+Clocks are set, stand still and jump: a computer without a battery begins in 1970. So how long
+something has been kept is counted by the sweep itself, with a clock that only runs (the system's
+monotonic one), and the sum is kept in the database. Time while no service runs does not count: what
+expires, expires late rather than early.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import CursorResult, Engine, delete, select, update
+
+from service.database import tables
+from service.database.engine import insert, reading, writing
+from service.jobs.state import JobState
+
+__all__ = ["Expiry"]
+
+_NAME = "sweep"
+_OVER = tuple(state.value for state in JobState if state.is_final)
+
+
+class Expiry:
+    """The age of jobs that are over, and of idempotency keys.
+
+    Parameters
+    ----------
+    engine : sqlalchemy.Engine
+
+    Notes
+    -----
+    Every method raises `service.database.engine.DatabaseAway` if the database does not answer.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+
+    def passed(self, seconds: float) -> float:
+        """Count time that has passed; return all that ever did. What is new is kept from now on."""
+        seen, jobs, submissions = tables.seen_time, tables.jobs, tables.submissions
+        with writing(self._engine) as connection:
+            statement = insert(connection, seen).values(name=_NAME, seconds=seconds)
+            added = statement.on_conflict_do_update(
+                index_elements=["name"], set_={"seconds": seen.c.seconds + seconds}
+            ).returning(seen.c.seconds)
+            now = float(connection.execute(added).scalar_one())
+            connection.execute(
+                update(jobs)
+                .where(jobs.c.state.in_(_OVER), jobs.c.kept_from_s.is_(None))
+                .values(kept_from_s=now)
+            )
+            connection.execute(
+                update(submissions)
+                .where(submissions.c.kept_from_s.is_(None))
+                .values(kept_from_s=now)
+            )
+        return now
+
+    def old_jobs(self, before: float) -> list[str]:
+        """Return ids of the jobs that were over by a time, as `passed` counts it; oldest first."""
+        row = tables.jobs.c
+        query = select(row.id).where(row.state.in_(_OVER), row.kept_from_s < before)
+        with reading(self._engine) as connection:
+            return list(connection.execute(query.order_by(row.kept_from_s, row.id)).scalars())
+
+    def forget_submissions(self, before: float) -> int:
+        """Drop the idempotency keys that were there by a time; return how many."""
+        row = tables.submissions.c
+        with writing(self._engine) as connection:
+            result: CursorResult[Any] = connection.execute(
+                delete(tables.submissions).where(row.kept_from_s < before)
+            )
+            return result.rowcount

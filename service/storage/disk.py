@@ -1,0 +1,113 @@
+"""How much room a disk has: some stays free, so that what was accepted can be done and deleted."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+from pathlib import Path
+
+import structlog
+
+from service.private import private_folder
+
+__all__ = ["Disk", "NoRoom"]
+
+_MIB = 1 << 20
+_BALLAST = "disk-reserve"
+_BALLAST_BYTES = 8 * _MIB
+_CHUNK = bytes(_MIB)
+
+
+class NoRoom(OSError):
+    """The disk has too little room left; the message says how much, and what to do."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(errno.ENOSPC, message)
+        self.message = message
+
+
+class Disk:
+    """The disk of the data directory.
+
+    Of the reserve, uploads use nothing; jobs are begun while half of it is free, and go back to the
+    queue when a quarter is left. What the database needs to delete is held by a file of its own,
+    which makes room when there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        Anywhere on the disk; made if need be.
+    reserve_bytes : int
+        0: the disk is not looked at.
+    """
+
+    def __init__(self, folder: Path, reserve_bytes: int) -> None:
+        self._folder = folder
+        self._reserve_bytes = reserve_bytes
+
+    def free_bytes(self) -> int:
+        """Return how much may still be written."""
+        try:
+            return shutil.disk_usage(self._folder).free
+        except FileNotFoundError:
+            private_folder(self._folder)
+            return shutil.disk_usage(self._folder).free
+
+    def refusal(self, more_bytes: int = 0) -> str | None:
+        """Return why the service takes no upload of so many bytes, or None."""
+        if not self._reserve_bytes:
+            return None
+        left = self.free_bytes() - more_bytes
+        if left >= self._reserve_bytes:
+            return None
+        size = f" after {more_bytes // _MIB} MiB more" if more_bytes else ""
+        return (
+            f"the disk of the service has {max(left, 0) // _MIB} MiB left{size}; "
+            f"{self._reserve_bytes // _MIB} MiB stay free for the jobs that were accepted "
+            "(STILLPATH_DISK_RESERVE_BYTES). Delete jobs that are over, or make room on it"
+        )
+
+    def check(self, more_bytes: int = 0) -> None:
+        """Raise `NoRoom` if an upload of so many bytes is too much."""
+        why = self.refusal(more_bytes)
+        if why is not None:
+            raise NoRoom(why)
+
+    @property
+    def lets_jobs_begin(self) -> bool:
+        """Whether there is room for a job's files."""
+        return not self._reserve_bytes or self.free_bytes() >= self._reserve_bytes // 2
+
+    @property
+    def lets_jobs_go_on(self) -> bool:
+        """Whether a job that runs may write more."""
+        return not self._reserve_bytes or self.free_bytes() >= self._reserve_bytes // 4
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a database can hardly write any more."""
+        return bool(self._reserve_bytes) and self.free_bytes() < _BALLAST_BYTES
+
+    def hold(self) -> None:
+        """Hold some room for `give_up`, if the disk has plenty of it."""
+        if not self._reserve_bytes or self.free_bytes() < self._reserve_bytes // 2:
+            return
+        size = min(_BALLAST_BYTES, self._reserve_bytes // 4)
+        path = self._folder / _BALLAST
+        with contextlib.suppress(OSError):
+            if path.exists() and path.stat().st_size == size:
+                return
+            # Written, not only promised: some file systems promise more than they have.
+            with path.open("wb") as file:
+                for start in range(0, size, len(_CHUNK)):
+                    file.write(_CHUNK[: size - start])
+                file.flush()
+                os.fsync(file.fileno())
+
+    def give_up(self) -> None:
+        """Let go of what `hold` has put aside: something must be written on a full disk."""
+        with contextlib.suppress(OSError):
+            (self._folder / _BALLAST).unlink()
+            structlog.get_logger("disk").warning("the disk is full; the reserve was given up")

@@ -1,0 +1,122 @@
+"""A disk that is really full: what was accepted is done, deleting works, the service says so."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from service.storage.disk import Disk, NoRoom
+from tests.service.test_server import PRETEND, server, until
+
+MIB = 1 << 20
+SIZE_MIB, RESERVE_MIB = 60, 16
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """Mount a file system in memory, which takes root."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MIB}m", "none", str(folder)]
+    if sys.platform != "linux" or os.geteuid() != 0 or subprocess.run(command).returncode != 0:
+        pytest.skip("no small disk: to mount one takes root")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def fill(file: Path) -> None:
+    with file.open("wb", buffering=0) as opened:
+        for size in (MIB, 4096, 1):
+            with contextlib.suppress(OSError):
+                while opened.write(b"x" * size) == size:
+                    pass
+
+
+def jobs_of(client: httpx2.Client) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = client.get("/v1/jobs?limit=200").json()["jobs"]
+    return found
+
+
+def test_what_the_reserve_is_for(small_disk: Path) -> None:
+    disk = Disk(small_disk, RESERVE_MIB * MIB)
+    disk.hold()
+    assert disk.refusal() is None
+    free = disk.free_bytes()
+    assert SIZE_MIB * MIB - free == 4 * MIB
+    with pytest.raises(NoRoom, match=r"15 MiB left after 41 MiB more; 16 MiB stay free .*Delete"):
+        disk.check(41 * MIB)
+    fill(small_disk / "foreign")
+    assert (disk.lets_jobs_begin, disk.lets_jobs_go_on, disk.is_full) == (False, False, True)
+    disk.hold()  # changes nothing now
+    assert disk.free_bytes() == 0
+    disk.give_up()
+    assert disk.free_bytes() == 4 * MIB
+    assert Disk(small_disk, 0).refusal(1 << 40) is None
+    foreign = small_disk / "foreign"
+    foreign.unlink()
+    assert Disk(small_disk / "new" / "data", RESERVE_MIB * MIB).lets_jobs_go_on
+
+
+@pytest.mark.slow
+def test_a_full_disk_loses_no_job(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STILLPATH_DISK_RESERVE_BYTES", str(RESERVE_MIB * MIB))
+    monkeypatch.setenv("STILLPATH_WORKERS", "2")
+    data = small_disk / "data"
+    data.mkdir()
+    foreign = small_disk / "foreign"
+    with server(PRETEND, data) as (client, _):
+
+        def post(number: int) -> httpx2.Response:
+            content = f"nap 0.2 {number}\n".encode().ljust(MIB, b";")
+            while True:
+                # Who is refused before he has sent all may not hear why.
+                with contextlib.suppress(httpx2.WriteError, httpx2.ReadError):
+                    return client.post("/v1/jobs?machine=ender3", content=content)
+
+        answers = [post(number) for number in range(50)]
+        accepted = [a.headers["location"] for a in answers if a.status_code == 202]
+        refused = [a for a in answers if a.status_code != 202]
+        assert len(accepted) > 10
+        assert refused
+        for answer in refused:
+            assert answer.status_code == 507
+            assert "16 MiB stay free" in answer.json()["detail"]
+            assert "Delete jobs" in answer.json()["detail"]
+
+        assert until(lambda: client.get("/readyz").json().get("part") == "disk", 60)
+        fill(foreign)
+        until(lambda: all(job["state"] != "running" for job in jobs_of(client)), 60)
+        states = {job["id"]: job["state"] for job in jobs_of(client)}
+        assert set(states.values()) <= {"queued", "done"}
+        assert "queued" in states.values()
+
+        first, second, *others = accepted
+        assert client.delete(first).status_code == 204
+        assert client.delete(second).status_code == 204
+        assert client.get(first).status_code == 404
+
+        foreign.unlink()
+
+        def fetch_and_delete() -> bool:
+            for job in jobs_of(client):
+                assert job["state"] in ("queued", "running", "done")
+                if job["state"] == "done":
+                    where = job["links"]["self"]
+                    assert client.get(f"{where}/result").status_code == 200
+                    assert client.delete(where).status_code == 204
+                    others.remove(where)
+            return not others
+
+        assert until(fetch_and_delete, 120)
+        assert until(lambda: client.get("/readyz").status_code == 200, 60)
+        assert post(99).status_code == 202
