@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcode.firmware.klipper.kit import KlipperKit
+from gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
 from models.store import load_machine
 from tests.integrations.klipper import SETTINGS, CommandError, ConfigError, Klipper, macros_of
 
@@ -55,7 +56,7 @@ def in_stretch(*files: Path | str, **more) -> Klipper:
     voice = firmware.voice()
     printer.run(voice.limits(firmware.stream_limits(firmware.initial_limits())).decode())
     printer.run(voice.shaper_off.decode())
-    assert printer.toolhead["max_accel"] >= 100_000
+    assert printer.toolhead["max_accel"] == 20_000
     printer.state = "printing"
     printer.sent.clear()
     return printer
@@ -171,8 +172,14 @@ def test_ones_own_moves_never_run_under_raised_limits(commands: list[str]):
     """And what a pause found is in force again when the print goes on."""
     printer = Klipper(_MACROS, extra={"virtual_sdcard": {"file_position": 0}})
     lines = {
-        "stretch": "SET_VELOCITY_LIMIT ACCEL=300000\nSET_INPUT_SHAPER SHAPER_FREQ_X=0",
-        "end of stretch": "SET_VELOCITY_LIMIT ACCEL=2000\nSET_INPUT_SHAPER SHAPER_FREQ_X=57.8",
+        "stretch": (
+            "SET_VELOCITY_LIMIT ACCEL=20000 SQUARE_CORNER_VELOCITY="
+            f"{14.83 + IN_STREAM_MARK_MM_S:.10g}\nSET_INPUT_SHAPER SHAPER_FREQ_X=0"
+        ),
+        "end of stretch": (
+            "SET_VELOCITY_LIMIT ACCEL=2000 SQUARE_CORNER_VELOCITY=5\n"
+            "SET_INPUT_SHAPER SHAPER_FREQ_X=57.8"
+        ),
         "file": "SET_VELOCITY_LIMIT ACCEL=2500",
     }
     found = limits(printer)

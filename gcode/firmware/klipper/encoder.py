@@ -28,6 +28,7 @@ from gcode.firmware.klipper._encoder_kernels import assign_speeds, expected_brak
 from gcode.firmware.klipper._motion_kernels import move_limits
 from gcode.firmware.klipper.limits import KlipperLimits
 from gcode.firmware.klipper.planner import Planner
+from gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
 from gcode.pieces import Piece
 from gcode.segments import Segments
 from gcode.timeline import Group, Timeline
@@ -67,7 +68,7 @@ def stream_limits(
     return KlipperLimits(
         velocity_mm_s=velocity_mm_s,
         accel_mm_s2=accel,
-        square_corner_velocity_mm_s=square_corner_mm_s(command),
+        square_corner_velocity_mm_s=round(square_corner_mm_s(command), 2) + IN_STREAM_MARK_MM_S,
         minimum_cruise_ratio=0.0,
     )
 

@@ -12,7 +12,7 @@ from models.firmware import Klipper
 __all__ = ["IN_STREAM_MARK_MM_S", "KlipperVoice"]
 
 IN_STREAM_MARK_MM_S = 5e-7
-"""Added to the square corner velocity while the file's own moves run inside a stream: it tells
+"""Added to the square corner velocity of a stream, and of the file's own moves inside one: it tells
 stillpath.cfg that a PAUSE here is in mid stream, with the shaper off."""
 
 
@@ -20,8 +20,8 @@ class KlipperVoice:
     """Lines that Klipper understands; see `gcode.firmware.base.Voice`."""
 
     notes = (
-        "between 'stream on' and 'stream off' the acceleration limit is raised",
-        "and every move is timed: leave the speed slider at 100 %. PAUSE and",
+        "between 'stream on' and 'stream off' limits are the machine's own and",
+        "every move is timed: leave the speed slider at 100 %. PAUSE and",
         "CANCEL_PRINT must restore the limits first: see stillpath.cfg.",
     )
     stand_still = b"G4 P0 ; stand still\n"

@@ -1,0 +1,80 @@
+"""A stream that breaks off at any line: the firmware brakes, stands, and goes on behind it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcode.firmware.encoding import as_moves, limits_in_force
+from gcode.firmware.planning import plan_moves
+from gcode.pieces import Piece
+from gcode.sampler import sample_phases
+from gcode.types import Limits, Moves, rows_of
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.compensating import CompensatedPiece, PieceCompensator
+from service.pipeline.options import Options
+from tests.gcode.cutting import HEAD, pieces_of
+
+SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
+BODY = (
+    "G1 X90 Y60 E1 F9000\nG1 X20 Y20 E2\nG1 X21 Y60 E1\nG1 X90 Y21 E2\nG1 E-.8 F2100\n"
+    "G1 X20 Y90 F12000\nG1 E.8 F2100\nG1 X90 Y20 E3 F6000\nG1 X20 Y20 E1\n"
+)
+_SAMPLE_S = 5e-5
+_AROUND = 60
+"""Moves that are looked at before and behind a break."""
+
+
+def machine_of(kind: str) -> Machine:
+    document = load_machine("ender3").model_dump(mode="json")
+    if kind != "klipper":
+        document["firmware"] = json.loads((SECTIONS / f"{kind}.json").read_text())
+    return Machine.model_validate(document)
+
+
+def stream_of(machine: Machine) -> tuple[Piece, CompensatedPiece]:
+    work = PieceCompensator(machine, Options())
+    piece = pieces_of(HEAD + BODY, machine)[1]
+    assert isinstance(piece, Piece)
+    work.compensator.reset(piece.moves.start_mm[0, :2])
+    return piece, work.compensate(piece)
+
+
+def written(piece: Piece, made: CompensatedPiece, factor: float) -> tuple[Moves, list[Limits]]:
+    """The moves as written, at a speed factor (M220), and their limits."""
+    encoded = made.encoded
+    places = np.vstack([encoded.begin, encoded.position]) * 1e-6
+    ours = encoded.row < 0
+    own = np.where(ours, 1.0, piece.moves.speed_mm_s[encoded.row])
+    speed = factor * np.where(ours, encoded.feedrate_mm_min / 60.0, own)
+    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits)
+    return as_moves(places[:-1], places[1:], speed, limits_id), limits
+
+
+def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
+    """Largest change of velocity of X and Y within a ms when moves go from rest to rest, mm/s."""
+    phases = plan_moves(moves, limits, machine)
+    last = phases.t_s[-1] + phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
+    count = int((last - phases.t_s[0]) / _SAMPLE_S) + 41
+    place, _ = sample_phases(phases, (float(phases.t_s[0]) - 20 * _SAMPLE_S, _SAMPLE_S, count))
+    velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
+    reach = round(1e-3 / _SAMPLE_S)
+    return float(np.max(np.hypot(*(velocity[:, reach:] - velocity[:, :-reach])), initial=0.0))
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("kind", ["klipper", "marlin", "reprapfirmware"])
+def test_no_break_asks_for_more_than_the_motors_bear(kind: str, factor: float) -> None:
+    """By each firmware's own rules; a step of Marlin's motors is no step of speed."""
+    machine = machine_of(kind)
+    moves, limits = written(*stream_of(machine), factor)
+    stream = np.flatnonzero(moves.limits_id == 0)
+    worst = 0.0
+    for k in stream[5::7]:
+        for rows in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
+            worst = max(worst, velocity_step(rows_of(moves, rows), limits, machine))
+    assert worst <= machine.command.speed_step_mm_s, worst
