@@ -42,6 +42,7 @@ from readback import (
 from scipy.signal import ss2zpk
 
 from models.errors import ModelError
+from models.friction import DryFriction
 from models.identification.identify import Measured, identify
 from models.identification.readers import ReadSettings, read_content
 from models.identification.shaper_choice import choose_shaper_of
@@ -342,7 +343,8 @@ def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> floa
         path, extruding = part.path(0, n)
         path, extruding = path[:, ::step].copy(), extruding[::step]
         at = np.flatnonzero(extruding[::10]) * 10
-        answer = response(pair, part.command(0, n)[:, ::step])
+        received = DryFriction(machine.friction_mm).received_mm(part.command(0, n)[:, ::step])
+        answer = response(pair, received)
         errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
     return errors.rms_um
 

@@ -22,6 +22,7 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
     """Make the compensator `name` for a machine, at the sampling time `dt_s`.
 
     ``NAME+ripple``, and ``none+ripple``, undo the machine's ripple as well (`compensation.ripple`).
+    Of ``fbf`` dry friction is made up for, where a machine has any (`compensation.friction`).
     For a machine with schedules it follows the plants (`compensation.scheduled`).
 
     Raises
@@ -36,6 +37,11 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         plain = within == "none"
         inner = PassThrough() if plain else compensator(within, machine, dt_s, **settings)
         return RippleCompensator(inner, machine, dt_s)
+    if name == "fbf" and any(machine.friction_mm):
+        from compensation.friction import FrictionCompensator
+
+        inner = compensator(name, machine.without_friction(), dt_s, **settings)
+        return FrictionCompensator(inner, machine, dt_s)
     if machine.schedules:
         from compensation.scheduled import ScheduledCompensator
 

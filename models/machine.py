@@ -108,6 +108,8 @@ class Machine(Document):
                 # Machines from before there were such fields keep their revision.
                 del content[added]
         for axis in content["axes"].values():
+            if axis["friction_mm"] is None:
+                del axis["friction_mm"]
             about = axis["provenance"] or {}
             for added in ADDED:
                 if about.get(added, ...) is None:
@@ -116,6 +118,16 @@ class Machine(Document):
             del content["firmware"]["ft_motion"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
+
+    @property
+    def friction_mm(self) -> tuple[float, float]:
+        """How far dry friction holds X and Y back."""
+        return self.axes["x"].friction_mm or 0.0, self.axes["y"].friction_mm or 0.0
+
+    def without_friction(self) -> Machine:
+        """Return the machine with guides that do not rub."""
+        axes = {k: v.model_copy(update={"friction_mm": None}) for k, v in self.axes.items()}
+        return self.model_copy(update={"axes": axes})
 
     def _check_schedules(self) -> None:
         densities = set()

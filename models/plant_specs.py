@@ -19,6 +19,7 @@ from models.provenance import Provenance
 from models.roots import Roots, check_stable, dc_gain, normalise_dc, scaled_roots
 
 __all__ = [
+    "MOST_FRICTION_MM",
     "FirSpec",
     "Mode",
     "ModesSpec",
@@ -39,6 +40,9 @@ Damping = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 SamplingTime = Annotated[float, Field(gt=1e-6, le=1.0, allow_inf_nan=False)]
 Complex = tuple[Finite, Finite]
 """Real and imaginary part."""
+
+MOST_FRICTION_MM = 0.02
+"""Guides that hold an axis back by more are to be mended, not compensated."""
 
 
 class _Plant(Document):
@@ -344,12 +348,15 @@ class PlantSetSpec(Document):
         Where the model was measured; it is a guess outside.
     provenance : Provenance, optional
         How the plants were found.
+    friction_mm : float, optional
+        How far dry friction holds the axis back, force over stiffness (`models.friction`).
     """
 
     nominal: PlantSpec
     members: tuple[WeightedMember, ...] | ParametricMembers = ()
     band_hz: tuple[Positive, Positive] | None = None
     provenance: Provenance | None = None
+    friction_mm: Annotated[float, Field(ge=0, le=MOST_FRICTION_MM)] | None = None
 
     @model_validator(mode="after")
     def _members_usable(self) -> Self:

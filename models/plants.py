@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from models.errors import ModelError
 from models.plant_specs import (
+    MOST_FRICTION_MM,
     FirSpec,
     Mode,
     ModesSpec,
@@ -35,6 +36,7 @@ from models.realisation import balanced, cascade, transmission_zeros
 from models.roots import Roots, frequency_and_damping
 
 __all__ = [
+    "MOST_FRICTION_MM",
     "ContinuousPlant",
     "DiscretePlant",
     "FirSpec",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from models.friction import DryFriction
 from models.machine import Machine
 from models.operating import OperatingGrid, machine_at
 from models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
@@ -27,7 +28,8 @@ REMEMBERED_S = 4.0
 class MachineStream:
     """Answer of X and Y of a machine to a command that arrives in blocks.
 
-    The nominal plants answer, to a command with the machine's ripple; the machine stands still at
+    The nominal plants answer, to a command with the machine's ripple and less what dry friction
+    holds back; the machine stands still at
     the first sample pushed. Plants that depend on x and y answer all, and count with the weights
     of the planned position.
 
@@ -52,6 +54,7 @@ class MachineStream:
         self._machine, self._dt_s = machine, dt_s
         self._member = member
         self._ripple = MachineRipple(machine.kinematics, machine.ripple)
+        self._friction = DryFriction(machine.friction_mm)
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
         self._past = np.zeros((2, 0))
@@ -62,6 +65,7 @@ class MachineStream:
     def stand(self) -> None:
         """Stand still from here on: the next sample pushed is the first one again."""
         self._past = self._past[:, :0]
+        self._friction.stand()
         for stream in self._streams:
             stream.stand()
 
@@ -90,7 +94,7 @@ class MachineStream:
         out : ndarray, shape (2, n), optional
             Where the answer is written to.
         """
-        received = self._ripple.received_mm(u_mm)
+        received = self._friction.received_mm(self._ripple.received_mm(u_mm))
         if self._remembered:
             past = np.concatenate([self._past, received], axis=1)
             self._past = past[:, -self._remembered :].copy()

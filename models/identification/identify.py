@@ -13,12 +13,19 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from models.errors import ModelError
-from models.identification.alignment import check_pair
+from models.identification.alignment import AlignedLog, align, check_pair
 from models.identification.averaging import mean_response, mean_spectrum
 from models.identification.conditioned import scheduled, special, usual
 from models.identification.conditions import Condition
-from models.identification.estimation import estimate_driven, estimate_response, plateau_gain
+from models.identification.estimation import (
+    estimate_aligned,
+    estimate_driven,
+    estimate_response,
+    plateau_gain,
+)
+from models.identification.friction import dry_friction, freed
 from models.identification.modal_fit import refit
+from models.identification.nozzle import Frame, frame_of
 from models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -154,6 +161,8 @@ class _AxisWork:
     ) -> None:
         self._axis, self._settings, self._steps = axis, settings, steps
         self._max_order = max_order
+        self._aligned: list[AlignedLog] = []
+        """Of the raw logs that are used."""
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
         self._used = [m for m in measured if isinstance(m.measurement, kind)]
         self._left_out = [m for m in measured if not isinstance(m.measurement, kind)]
@@ -203,13 +212,22 @@ class _AxisWork:
     def _from_responses(self) -> AxisIdentification:
         responses = [(self._response(m), m.condition) for m in self._used]
         common = usual([c for _, c in responses], self._axis)
+        friction_mm = self._friction_mm([(r, c in common) for r, c in responses])
+        if friction_mm:
+            responses = [(self._freed(k, r, friction_mm), c) for k, (r, c) in enumerate(responses)]
         chosen = [r for r, c in responses if c in common]
+        # A schedule counts the modes of the plant as it was fitted.
+        frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
+        frame = None
+        if self._kind == "raw log" and not frame_firm:
+            frame = frame_of(mean_response(chosen))
+        if frame is not None:
+            chosen = [frame.over_bed(response) for response in chosen]
         found = response_set(
             chosen,
             axis=self._axis,
             kind=self._kind,
-            # A schedule counts the modes of the plant as it was fitted.
-            frame_firm=self._settings.frame_firm or bool(special([c for _, c in responses])),
+            frame_firm=frame_firm or frame is not None,
             max_order=self._max_order,
             sources=self._sources,
             measured_on=self._date,
@@ -225,11 +243,12 @@ class _AxisWork:
         notes: list[str] = []
         if self._kind == "raw log":
             warnings = _level_warnings(chosen, nominal)
-            notes = self._mounting_notes(chosen)
+            notes = [*self._mounting_notes(chosen), *_body_notes(friction_mm, frame)]
         else:
             warnings = _scale_warnings(chosen, nominal)
         found = replace(
             found,
+            plants=found.plants.model_copy(update={"friction_mm": friction_mm or None}),
             measured=(*found.measured, *others),
             warnings=(*found.warnings, *warnings),
             notes=tuple(notes),
@@ -280,11 +299,13 @@ class _AxisWork:
         if isinstance(measurement, AccelerationLog):
             test = excitation_for(measurement, self._settings)
             sensor = self._settings.sensor_axis
+            mounted = None if sensor is None else _SENSOR_AXES[sensor]
             try:
+                aligned = align(measurement, test, sensor_direction=mounted)
                 response = estimate_response(
                     measurement,
                     test,
-                    sensor_direction=None if sensor is None else _SENSOR_AXES[sensor],
+                    aligned=aligned,
                     # Tests of different strength are different operating points.
                     label=label or f"{test.accel_per_hz_mm_s:g} mm/s",
                     progress=lambda stage, part: self._steps.within(f"{what}, {stage}")(part),
@@ -294,6 +315,7 @@ class _AxisWork:
                 raise ModelError("; ".join([str(error), *measurement.notes])) from None
             notes = excitation_notes(measurement, self._settings)
             response = replace(response, notes=(*response.notes, *notes))
+            self._aligned.append(aligned)
         elif isinstance(measurement, DrivenLog):
             response = estimate_driven(measurement, label=label)
         else:
@@ -301,6 +323,24 @@ class _AxisWork:
             response = replace(measurement, label=label or measurement.label)
         self._steps.stepped(what)
         return response
+
+    def _friction_mm(self, responses: Sequence[tuple[FrequencyResponse, bool]]) -> float:
+        """Return how far dry friction holds the axis back, from the usual logs."""
+        if self._kind != "raw log":
+            return 0.0
+        logs = zip(self._aligned, responses, strict=True)
+        return dry_friction([(aligned, r) for aligned, (r, usual) in logs if usual])
+
+    def _freed(
+        self, number: int, response: FrequencyResponse, friction_mm: float
+    ) -> FrequencyResponse:
+        """Return the response of a log without what dry friction did."""
+        log = self._used[number].measurement
+        assert isinstance(log, AccelerationLog)
+        aligned = freed(self._aligned[number], response, friction_mm)
+        test = excitation_for(log, self._settings)
+        again = estimate_aligned(log, aligned, test, label=response.label)
+        return replace(again, notes=response.notes)
 
     def _mounting_notes(self, responses: Sequence[FrequencyResponse]) -> list[str]:
         """Say how the sensor sits, where its axes are not the machine's: many are mounted so."""
@@ -345,6 +385,23 @@ def _by_file(told: Iterable[tuple[str, str]]) -> list[str]:
     for source, text in dict.fromkeys(told):
         sources.setdefault(text, []).append(source)
     return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
+
+
+def _body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
+    """Say what else than the axis was seen."""
+    notes = []
+    if friction_mm:
+        notes.append(
+            f"dry friction holds the axis {1e3 * friction_mm:.1f} um behind its command: the "
+            "response is freed of it, and commands make up for it"
+        )
+    if frame is not None:
+        notes.append(
+            f"the frame shakes on its feet at {frame.f_hz:.1f} Hz (what moves is "
+            f"{frame.mass_ratio:.0%} of its mass): the sensor feels it, the nozzle over the bed "
+            "does not, so the response is freed of it (frame_firm leaves it in)"
+        )
+    return notes
 
 
 def _parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

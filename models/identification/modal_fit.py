@@ -31,7 +31,7 @@ from models.identification.response_data import ResponseData, response_data
 from models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
 from models.plants import PairsSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["alternatives", "fit_modes", "refit"]
+__all__ = ["alternatives", "fit_modes", "of_poles", "refit"]
 
 Array = NDArray[np.float64]
 Modal: TypeAlias = Candidate[ModalStructure]
@@ -113,7 +113,7 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
     if len(modes) > 1:
         weakest = min(modes, key=lambda m: abs(m.share) / m.zeta)
         kept = [m for m in modes if m is not weakest]
-        starts.append(_of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
+        starts.append(of_poles(data, [(m.f_hz, m.zeta) for m in kept]))
     tried = [_calm(data, _polished(data, s)) for s in starts if s is not None]
     return tuple(_as_fit(data, t) for t in tried if t.nrmse <= enough and _all_ring(t))
 
@@ -151,16 +151,16 @@ def _starts(
     """Yield starts: the modes of the pairs, and those of one order less with one more."""
     highest = sorted(pairs.modes, key=lambda m: -m.peak)[:order]
     if len(highest) == order:
-        yield _of_poles(data, [(m.f_hz, m.zeta) for m in highest])
+        yield of_poles(data, [(m.f_hz, m.zeta) for m in highest])
     if order == 1:
         peak = float(data.f_hz[np.argmax(np.abs(data.response))])
-        yield _of_poles(data, [(peak, _START_ZETA)])
+        yield of_poles(data, [(peak, _START_ZETA)])
     elif found:
         smaller = found[-1]
         plant = smaller.structure.spec(smaller.theta)
         yield _grown(data, plant, smaller.delay_s)
         poles = [(m.f_hz, m.zeta) for m in plant.modes]
-        yield _of_poles(data, [*poles, (_BEYOND * float(data.f_hz[-1]), _START_ZETA)])
+        yield of_poles(data, [*poles, (_BEYOND * float(data.f_hz[-1]), _START_ZETA)])
 
 
 def _grown(data: ResponseData, plant: RelativeModesSpec, delay_s: float) -> Modal | None:
@@ -169,10 +169,10 @@ def _grown(data: ResponseData, plant: RelativeModesSpec, delay_s: float) -> Moda
     gain = np.vdot(seen, data.response).real / np.vdot(seen, seen).real
     error = np.abs(data.weight * (gain * seen - data.response))
     at = float(data.f_hz[np.argmax(np.convolve(error, np.ones(5) / 5, mode="same"))])
-    return _of_poles(data, [*((m.f_hz, m.zeta) for m in plant.modes), (at, _START_ZETA)])
+    return of_poles(data, [*((m.f_hz, m.zeta) for m in plant.modes), (at, _START_ZETA)])
 
 
-def _of_poles(data: ResponseData, poles: Sequence[tuple[float, float]]) -> Modal | None:
+def of_poles(data: ResponseData, poles: Sequence[tuple[float, float]]) -> Modal | None:
     """Return the best shares, gain and delay for given modes; they are linear but for the delay."""
     structure = ModalStructure(len(poles), data.unit_hz, grounded=True)
     f_hz, zeta = np.array(poles).T

@@ -1,0 +1,134 @@
+"""Compensation of dry friction, laid over a compensator of vibration.
+
+What the axes shall receive is w; with the command w + c s(w) they do (`models.friction`). The turns
+of s are rounded, symmetrically: what a motor cannot follow is not asked of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compensation.base import Compensator
+from compensation.holds import stand_still
+from models.friction import bend_of
+from models.machine import Machine
+from models.schedule import OperatingPoint
+
+__all__ = ["FrictionCompensator", "against_friction"]
+
+Array = NDArray[np.float64]
+
+_ROUNDED_S = (4e-3, 8e-3, 16e-3)
+"""Lengths of the window that rounds turns; the first is taken that keeps the machine's limits."""
+_BLEND_S = 0.01
+
+
+def against_friction(
+    wanted_mm: Array,
+    held_mm: Sequence[float],
+    rests: NDArray[np.int64],
+    dt_s: float,
+    rounded_s: float = _ROUNDED_S[0],
+) -> Array:
+    """Return the command with which axes receive `wanted_mm`, shape (2, n).
+
+    Parameters
+    ----------
+    held_mm : (float, float)
+        How far friction holds X and Y back.
+    rests : ndarray of int64, shape (k, 2)
+        Sample ranges [a, b) in which nothing is added.
+    rounded_s : float
+        Length of the window that rounds turns.
+    """
+    window = _window(rounded_s, dt_s)
+    bends = np.stack([_rounded(bend_of(row), window) for row in wanted_mm])
+    added = np.array(held_mm)[:, None] * bends
+    blend = max(2, round(_BLEND_S / dt_s))
+    return wanted_mm + stand_still(added, np.zeros_like(added), rests, blend)
+
+
+class FrictionCompensator:
+    """Make up for dry friction under another compensator.
+
+    In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
+    after, what friction needs fades in and out.
+
+    Parameters
+    ----------
+    inner : Compensator
+        What undoes the vibration: its command is what the axes shall receive.
+    machine : Machine
+        With friction in its axes.
+    dt_s : float
+    """
+
+    def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
+        self.name = inner.name
+        self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
+        self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
+        self._held_mm = machine.friction_mm
+        self._travel = [machine.travel[axis] for axis in ("x", "y")]
+
+    def reset(self, position_mm: Array) -> None:
+        """See `compensation.base.Compensator.reset`."""
+        self._inner.reset(position_mm)
+
+    def observe(self, command_mm: Array) -> None:
+        """See `compensation.base.Compensator.observe`."""
+        self._inner.observe(command_mm)
+
+    def commit(self) -> None:
+        """See `compensation.base.Compensator.commit`: the axes receive what inner asked for."""
+        self._inner.commit()
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """See `compensation.base.Compensator.operate_at`."""
+        self._inner.operate_at(point)
+
+    def ease(self, accel_share: float) -> bool:
+        """See `compensation.base.Compensator.ease`."""
+        return self._inner.ease(accel_share)
+
+    def compensate(
+        self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
+    ) -> Array:
+        """See `compensation.base.Compensator.compensate`."""
+        wanted = self._inner.compensate(y_d_mm, extruding, rests)
+        own = self._peaks(wanted)
+        # What the inner compensator asks for is its own business; friction must not add to it.
+        speed = max(own[0], self._limits.velocity_mm_s)
+        accel = max(own[1], self._limits.accel_mm_s2)
+        for rounded_s in _ROUNDED_S:
+            u = against_friction(wanted, self._held_mm, rests, self._dt_s, rounded_s)
+            u = self._within_travel(wanted, u)
+            needs = self._peaks(u)
+            if needs[0] <= speed and needs[1] <= accel:
+                return u
+        return wanted
+
+    def _within_travel(self, wanted: Array, u: Array) -> Array:
+        for row, inner, travel in zip(u, wanted, self._travel, strict=True):
+            low, high = min(travel.min_mm, inner.min()), max(travel.max_mm, inner.max())
+            np.clip(row, low, high, out=row)
+        return u
+
+    def _peaks(self, u: Array) -> tuple[float, float]:
+        """Largest speed and acceleration of an axis."""
+        speed = float(np.abs(np.diff(u)).max(initial=0.0)) / self._dt_s
+        return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
+
+
+def _window(length_s: float, dt_s: float) -> Array:
+    """Return a symmetric window of odd length that sums to 1."""
+    half = max(1, round(0.5 * length_s / dt_s))
+    window = np.hanning(2 * half + 3)[1:-1]
+    return np.asarray(window / window.sum())
+
+
+def _rounded(row: Array, window: Array) -> Array:
+    half = len(window) // 2
+    return np.convolve(np.pad(row, half, mode="edge"), window, mode="valid")

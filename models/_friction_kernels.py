@@ -1,0 +1,50 @@
+"""Loops of dry friction; `models.friction` gives them names."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.jit import kernel
+
+__all__ = ["bent", "received"]
+
+Array = NDArray[np.float64]
+
+_ROUNDS = 3
+
+
+@kernel(allocates=False)
+def bent(way: Array, bend: float, out: Array) -> None:
+    """Fill what a way from rest bends the guides by, -1 to 1 (Dahl 1968), exact between samples."""
+    now = 0.0
+    out[0] = now
+    for k in range(1, len(way)):
+        step = way[k] - way[k - 1]
+        if step != 0.0:
+            towards = 1.0 if step > 0.0 else -1.0
+            now = towards + (now - towards) * np.exp(-abs(step) / bend)
+        out[k] = now
+
+
+@kernel(allocates=False)
+def received(command: Array, held: float, bend: float, state: Array, out: Array) -> None:
+    """Fill w with w + held bent(w) = command; `state` is (command, w, bent) of the last sample."""
+    before, w, now = state[0], state[1], state[2]
+    for k in range(len(command)):
+        step = command[k] - before
+        before = command[k]
+        if step != 0.0:
+            towards = 1.0 if step > 0.0 else -1.0
+            asked, way = abs(step), 0.0
+            # way + room (1 - exp(-way / bend)) = asked: concave, Newton from 0 stays below.
+            room = held * (1.0 - towards * now)
+            for _ in range(_ROUNDS):
+                left = np.exp(-way / bend)
+                way += (asked - way - room * (1.0 - left)) / (1.0 + room * left / bend)
+            w += towards * way
+            now = towards + (now - towards) * np.exp(-way / bend)
+            # What three rounds leave is not lost.
+            w = command[k] - held * now
+        out[k] = w
+    state[0], state[1], state[2] = before, w, now

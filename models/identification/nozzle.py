@@ -1,0 +1,162 @@
+"""What the nozzle does over the bed, from what a sensor feels against the ground.
+
+What moves drives the frame on its feet by reaction: the frame's motion is -R times what is felt,
+
+    R(s) = mu s^2 / (s^2 + 2 z w s + w^2),
+
+mu the mass that moves over that of the frame, w and z of the frame on its feet. With P what the
+axis does on a frame that is held, modes on relative speed (`modal_structure`), the sensor feels
+H = P / (1 + R P), and the nozzle does G = (1 + R) H over the bed. P and R are fitted together, and
+the measured response is multiplied by 1 + R: that neither delays slow motion, nor is it left to
+later fits to tell the frame from a mode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import find_peaks
+
+from models.identification.modal_fit import of_poles
+from models.identification.modal_structure import ModalStructure
+from models.identification.response_data import ResponseData, response_data
+from models.identification.types import FrequencyResponse
+
+__all__ = ["Frame", "frame_of"]
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_POINTS = 160
+_STARTS_HZ = (9.0, 13.0, 18.0, 25.0)
+_START = (0.15, 0.08)
+"""Damping of the feet and mass ratio."""
+_F_HZ, _ZETA, _MU = (6.0, 35.0), (0.03, 0.5), (0.0, 0.5)
+_ZETA_SPREAD = 0.4
+"""Of feet, in the logarithm: a response may hardly tell."""
+_MODES_ZETA, _MODES_SHARE, _MODES_BAND = (5e-3, 0.8), (-2.0, 2.5), (0.9, 1.6)
+_LATE_S = 10e-3
+_MODES_START, _BEYOND, _PROMINENCE = 0.06, 1.3, 0.2
+_BELOW = 0.8
+"""A frame's frequency against that of the main mode."""
+_LEAST_MU, _CLEARLY = 0.01, 0.9
+"""A frame is there if it is this heavy and this much less is left with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame on its feet.
+
+    Attributes
+    ----------
+    f_hz, zeta : float
+        On its feet, what moves held.
+    mass_ratio : float
+        What moves, against the frame.
+    level : float
+        Of what was measured against what was commanded, at rest.
+    """
+
+    f_hz: float
+    zeta: float
+    mass_ratio: float
+    level: float = 1.0
+
+    def reaction(self, f_hz: Array) -> ComplexArray:
+        """Return R."""
+        s = 1j * f_hz / self.f_hz
+        return np.asarray(self.mass_ratio * s * s / (s * s + 2 * self.zeta * s + 1))
+
+    def over_bed(self, measured: FrequencyResponse) -> FrequencyResponse:
+        """Return the response of the nozzle over the bed."""
+        more = 1 + self.reaction(measured.f_hz)
+        return replace(measured, response=measured.response * more, sd=measured.sd * np.abs(more))
+
+
+def frame_of(measured: FrequencyResponse) -> Frame | None:
+    """Return the frame that a response shows; None if there is none that is clear."""
+    data = response_data(measured).thinned(_POINTS)
+    firm = _best(data, [_start(data, None)])
+    found = _best(data, [_start(data, f_hz) for f_hz in _STARTS_HZ])
+    frame = found.frame
+    main_hz = float(data.f_hz[np.argmax(np.abs(data.response))])
+    seen = frame is not None and frame.mass_ratio > _LEAST_MU and frame.f_hz < _BELOW * main_hz
+    return frame if seen and found.cost < _CLEARLY**2 * firm.cost else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Found:
+    """Parameters [log gain, delay (s), (log f, log zeta, mu of the frame), modes ...]."""
+
+    vector: Array
+    structure: ModalStructure
+    shaken: bool
+    cost: float = np.inf
+
+    @property
+    def frame(self) -> Frame | None:
+        if not self.shaken:
+            return None
+        (f, zeta), mu = np.exp(self.vector[2:4]), self.vector[4]
+        return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
+
+    def model(self, f_hz: Array) -> ComplexArray:
+        first = 5 if self.shaken else 2
+        late = np.exp(self.vector[0] - 2j * np.pi * f_hz * self.vector[1])
+        held = self.structure.response(self.vector[first:], f_hz)
+        frame = self.frame
+        felt = held if frame is None else held / (1 + frame.reaction(f_hz) * held)
+        return np.asarray(late * felt)
+
+
+def _start(data: ResponseData, frame_hz: float | None) -> _Found:
+    """Start from the highest peak, the next one above it, and a mode beyond the band."""
+    size, top_hz = np.abs(data.response), float(data.f_hz[-1])
+    main = int(np.argmax(size))
+    peaks = find_peaks(np.log(size), prominence=_PROMINENCE)[0]
+    others = [i for i in peaks if i != main and data.f_hz[i] > _BELOW * data.f_hz[main]]
+    main_hz = float(data.f_hz[main])
+    next_hz = float(data.f_hz[max(others, key=lambda i: size[i])]) if others else 0.0
+    poles_hz = [main_hz, next_hz or math.sqrt(main_hz * top_hz), _BEYOND * top_hz]
+    known = of_poles(data, [(float(f_hz), _MODES_START) for f_hz in poles_hz])
+    structure = ModalStructure(len(poles_hz), data.unit_hz)
+    if known is None:
+        share = np.eye(len(poles_hz))[0]
+        theta = structure.parameters(np.array(poles_hz), np.full(len(share), _MODES_START), share)
+        level, delay_s = float(np.log(np.median(size[:9]))), data.delay_s
+    else:
+        # The last of its parameters is what acts against the frame.
+        theta, level, delay_s = known.theta[:-1], float(known.vector[0]), known.delay_s
+    frame = [] if frame_hz is None else [np.log(frame_hz), np.log(_START[0]), _START[1]]
+    vector = np.concatenate([[level, delay_s], frame, theta])
+    return _Found(vector, structure, frame_hz is not None)
+
+
+def _best(data: ResponseData, starts: list[_Found]) -> _Found:
+    return min((_polished(data, start) for start in starts), key=lambda found: found.cost)
+
+
+def _polished(data: ResponseData, start: _Found) -> _Found:
+    band_hz = (_MODES_BAND[0] * float(data.f_hz[0]), _MODES_BAND[1] * float(data.f_hz[-1]))
+    low, high = start.structure.bounds(band_hz, _MODES_ZETA, _MODES_SHARE)
+    frame = np.array([np.log(_F_HZ), np.log(_ZETA), _MU]) if start.shaken else np.zeros((0, 2))
+    level, late_s = start.vector[:2]
+    ends = np.array([[level - 1.0, level + 1.0], [late_s - _LATE_S, late_s + _LATE_S]])
+    low = np.concatenate([ends[:, 0], frame[:, 0], low])
+    high = np.concatenate([ends[:, 1], frame[:, 1], high])
+
+    def residual(vector: Array) -> Array:
+        error = replace(start, vector=vector).model(data.f_hz) - data.response
+        unusual = (vector[3:4] - np.log(_START[0])) / _ZETA_SPREAD if start.shaken else vector[:0]
+        return np.concatenate([data.weight * error.real, data.weight * error.imag, unusual])
+
+    margin = 1e-6 * (high - low)
+    inside = np.clip(start.vector, low + margin, high - margin)
+    solution = least_squares(
+        residual, inside, bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=80
+    )
+    return replace(start, vector=np.asarray(solution.x, np.float64), cost=float(solution.cost))

@@ -1,0 +1,84 @@
+"""Making up for dry friction."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from compensation.friction import FrictionCompensator, against_friction
+from compensation.registry import compensator
+from models.friction import DryFriction
+from models.machine import Machine
+from models.reference_motion import reference_motion
+from models.store import load_machine
+from simulation.measures import contour_error
+from simulation.scheduled import MachineStream
+
+DT_S = 1e-3
+RESTS = np.array([[900, 1000], [2400, 2450]], np.int64)
+
+
+def rubbing(x_mm: float, y_mm: float) -> Machine:
+    plain = load_machine("generic-corexy")
+    held = {"x": x_mm, "y": y_mm}
+    axes = {k: v.model_copy(update={"friction_mm": held[k]}) for k, v in plain.axes.items()}
+    return plain.model_copy(update={"axes": axes})
+
+
+MACHINE = rubbing(0.003, 0.006)
+
+
+def motion() -> tuple[np.ndarray, np.ndarray]:
+    path, extruding = reference_motion(DT_S)
+    return path[:, :8000] + 60.0, extruding[:8000]
+
+
+def test_machines_without_friction_are_compensated_as_before() -> None:
+    assert not isinstance(compensator("fbf", rubbing(0.0, 0.0), DT_S), FrictionCompensator)
+    assert isinstance(compensator("fbf", MACHINE, DT_S), FrictionCompensator)
+
+
+def test_the_print_is_better_for_it() -> None:
+    path, extruding = motion()
+    rms = {}
+    for name, one in (
+        ("with", compensator("fbf", MACHINE, DT_S)),
+        ("without", compensator("fbf", MACHINE.without_friction(), DT_S)),
+    ):
+        one.reset(path[:, 0])
+        command = one.compensate(path, extruding, np.zeros((0, 2), np.int64))
+        answer = MachineStream(MACHINE, DT_S).push(command, path)
+        rms[name] = float(np.sqrt(np.mean(contour_error(path, answer)[extruding] ** 2)))
+    assert rms["with"] < 0.35 * rms["without"]
+
+
+def test_nothing_is_added_in_rests_and_at_the_ends() -> None:
+    path, _ = motion()
+    for a, b in RESTS:
+        path[:, a - 1 : b] = path[:, a - 1, None]
+    added = against_friction(path, MACHINE.friction_mm, RESTS, DT_S) - path
+    for a, b in RESTS:
+        np.testing.assert_array_equal(added[:, a:b], 0.0)
+    np.testing.assert_array_equal(added[:, [0, -1]], 0.0)
+    assert np.abs(added).max(axis=1) == pytest.approx(MACHINE.friction_mm, rel=1e-3)
+
+
+def test_what_is_added_is_smooth_and_arrives() -> None:
+    path, _ = motion()
+    none = np.zeros((0, 2), np.int64)
+    command = against_friction(path, MACHINE.friction_mm, none, DT_S)
+    bends = np.abs(np.diff(command - path, 2)).max() / DT_S**2
+    assert bends < 5000.0
+    received = DryFriction(MACHINE.friction_mm).received_mm(command)
+    assert np.sqrt(np.mean((received - path)[:, 50:-50] ** 2)) < 0.1 * max(MACHINE.friction_mm)
+
+
+def test_it_stays_on_the_bed() -> None:
+    path, extruding = motion()
+    edge = path - path.min(axis=1, keepdims=True)
+    edge += np.array([[MACHINE.travel["x"].min_mm], [MACHINE.travel["y"].min_mm]])
+    one = compensator("fbf", MACHINE, DT_S)
+    one.reset(edge[:, 0])
+    command = one.compensate(edge, extruding, np.zeros((0, 2), np.int64))
+    assert command[0].min() >= MACHINE.travel["x"].min_mm
+    assert command[1].min() >= MACHINE.travel["y"].min_mm

@@ -1,0 +1,59 @@
+"""Dry friction in logs of virtual printers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.identification.alignment import align
+from models.identification.averaging import mean_response
+from models.identification.estimation import estimate_aligned, estimate_response
+from models.identification.friction import dry_friction, freed
+from models.identification.types import AccelerationLog, Excitation
+from simulation.printers.drawing import draw
+from simulation.printers.machines import Printer
+from simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
+
+
+def held_mm(printer: Printer, number: int) -> float:
+    """Force over stiffness, solved at rest."""
+    bodies = printer.bodies
+    _, _, k, _, _ = bodies.matrices()
+    friction = bodies.frictions[number]
+    along = np.array([friction.along.get(name, 0.0) for name in bodies.names])
+    return float(1e3 * friction.force_n * printer.nozzle[number] @ np.linalg.solve(k, along))
+
+
+def logs(printer: Printer, test: Excitation, runs: int = 2):  # type: ignore[no-untyped-def]
+    rng = np.random.default_rng(4)
+    sensor = drawn_sensor(rng, "lis2dw")
+    out = []
+    for run in range(runs):
+        record = run_test(printer, "x", sensor, rng, test)
+        log = AccelerationLog(record.time_s, record.accel_mm_s2, "x", f"raw_x_{run}.csv")
+        aligned = align(log, test)
+        out.append((log, aligned, estimate_response(log, test, aligned=aligned)))
+    return out
+
+
+@pytest.mark.parametrize("test", [OLD_TEST, NEW_TEST], ids=["old", "new"])
+def test_it_is_told_by_the_log(test: Excitation) -> None:
+    printer = draw("bed slinger", 3)
+    read = logs(printer, test)
+    found = dry_friction([one[1:] for one in read])
+    assert found == pytest.approx(held_mm(printer, 0), rel=0.3)
+    # What is left follows the command better.
+    log, aligned, response = read[0]
+    again = estimate_aligned(log, freed(aligned, response, found), test)
+    low = (response.f_hz > 8) & (response.f_hz < 25)
+    assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
+
+
+def test_guides_that_do_not_rub_have_none() -> None:
+    printer = draw("corexy", 3)
+    smooth = replace(printer, bodies=replace(printer.bodies, frictions=()))
+    read = logs(smooth, OLD_TEST)
+    assert dry_friction([one[1:] for one in read]) < 2e-4
+    assert mean_response([one[2] for one in read]).f_hz[0] < 10

@@ -1,0 +1,63 @@
+"""Two bodies on feet: what is felt, what is printed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from models.identification.nozzle import Frame, frame_of
+from models.identification.types import FrequencyResponse
+
+F_HZ = np.arange(24, 520) * 0.25
+
+
+def two_bodies(frame: Frame, main_hz: float, zeta: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is felt and what is done over the bed, solved as forces of two masses."""
+    s = 2j * np.pi * F_HZ
+    moving, heavy = frame.mass_ratio, 1.0
+    w, w_feet = 2 * np.pi * main_hz, 2 * np.pi * frame.f_hz
+    k, d = moving * w**2, 2 * zeta * moving * w
+    feet = heavy * (s**2 + 2 * frame.zeta * w_feet * s + w_feet**2)
+    # Head a, frame b: m a'' = belt, M b'' + feet b = -belt, belt = (k + d s)(u - (a - b)).
+    belt = k + d * s
+    felt = belt * feet / (moving * s**2 * (feet + belt) + belt * feet)
+    return felt, felt * (1 + moving * s**2 / feet)
+
+
+def measured(response: np.ndarray, seed: int = 0) -> FrequencyResponse:
+    rng = np.random.default_rng(seed)
+    noise = 0.003 * (rng.standard_normal(len(F_HZ)) + 1j * rng.standard_normal(len(F_HZ)))
+    late = 0.93 * np.exp(-2j * np.pi * F_HZ * 2.3e-3)
+    sd = np.full(len(F_HZ), 0.004)
+    return FrequencyResponse(F_HZ, late * response + noise, sd, np.ones(len(F_HZ)))
+
+
+@pytest.mark.parametrize(
+    ("frame", "main_hz", "zeta"),
+    [
+        (Frame(9.0, 0.12, 0.05), 64.0, 0.03),
+        (Frame(14.0, 0.15, 0.11), 34.0, 0.05),
+        (Frame(22.0, 0.10, 0.08), 45.0, 0.08),
+    ],
+)
+def test_a_frame_is_found_and_its_motion_taken_out(
+    frame: Frame, main_hz: float, zeta: float
+) -> None:
+    felt, printed = two_bodies(frame, main_hz, zeta)
+    found = frame_of(measured(felt))
+    assert found is not None
+    assert found.f_hz == pytest.approx(frame.f_hz, rel=0.03)
+    assert found.mass_ratio == pytest.approx(frame.mass_ratio, rel=0.15)
+    over_bed = found.over_bed(measured(felt)).response
+    true = measured(printed).response
+    low = 1.5 * main_hz > F_HZ
+    felt_off = np.linalg.norm((measured(felt).response - true)[low])
+    assert np.linalg.norm((over_bed - true)[low]) < 0.2 * felt_off
+
+
+def test_a_frame_that_stands_firm_is_not_invented() -> None:
+    s = 1j * F_HZ
+    modes = ((50.0, 0.06, 1.3), (95.0, 0.05, -0.3))
+    plain = sum(r * (2 * z * f * s + f * f) / (s * s + 2 * z * f * s + f * f) for f, z, r in modes)
+    found = frame_of(measured(np.asarray(plain)))
+    assert found is None or found.mass_ratio < 0.02

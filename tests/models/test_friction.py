@@ -1,0 +1,70 @@
+"""Dry friction that holds an axis back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from models.friction import BEND_MM, DryFriction, bend_of
+from models.plants import PlantSetSpec
+from models.store import load_machine
+
+HELD_MM = (0.003, 0.012)
+T_S = np.arange(3000) * 1e-3
+WAYS = np.stack([2.0 * np.sin(9.0 * T_S), 5.0 + 0.05 * np.sin(40.0 * T_S) + 3.0 * T_S])
+
+
+def against(ways: np.ndarray) -> np.ndarray:
+    return ways + np.array(HELD_MM)[:, None] * np.stack([bend_of(row) for row in ways])
+
+
+def test_the_bend_follows_the_way_and_turns_over() -> None:
+    way = np.concatenate([np.linspace(0, 1, 200), np.linspace(1, 0.9, 100)])
+    bend = bend_of(way)
+    assert bend[0] == 0.0
+    assert bend[199] == pytest.approx(1.0, abs=1e-9)
+    assert bend[-1] == pytest.approx(-1.0, abs=1e-3)
+    # However it is sampled.
+    assert bend_of(np.array([0.0, BEND_MM]))[-1] == pytest.approx(
+        bend_of(np.linspace(0.0, BEND_MM, 50))[-1], abs=1e-12
+    )
+
+
+def test_a_command_that_makes_up_for_it_arrives() -> None:
+    received = DryFriction(HELD_MM).received_mm(against(WAYS))
+    np.testing.assert_allclose(received, WAYS, atol=2e-6)
+
+
+def test_a_plain_command_is_held_back_by_as_much_as_it_says() -> None:
+    received = DryFriction(HELD_MM).received_mm(WAYS)
+    late = WAYS - received
+    np.testing.assert_allclose(np.abs(late).max(axis=1), HELD_MM, rtol=0.02)
+
+
+def test_blocks_make_no_difference() -> None:
+    whole = DryFriction(HELD_MM).received_mm(WAYS)
+    friction = DryFriction(HELD_MM)
+    parts = [friction.received_mm(WAYS[:, a : a + 700]) for a in range(0, 3000, 700)]
+    np.testing.assert_array_equal(np.hstack(parts), whole)
+    friction.stand()
+    np.testing.assert_array_equal(friction.received_mm(WAYS), whole)
+
+
+def test_without_friction_everything_arrives() -> None:
+    assert DryFriction((0.0, 0.0)).received_mm(WAYS) is WAYS
+
+
+def test_documents_without_friction_are_what_they_were() -> None:
+    machine = load_machine("ender3")
+    assert machine.friction_mm == (0.0, 0.0)
+    axes = {k: v.model_copy(update={"friction_mm": 0.004}) for k, v in machine.axes.items()}
+    rubbing = machine.model_copy(update={"axes": axes})
+    assert rubbing.revision != machine.revision
+    assert rubbing.without_friction().revision == machine.revision
+
+
+def test_more_than_guides_may_rub_is_refused() -> None:
+    plants = load_machine("ender3").axes["x"].model_dump()
+    with pytest.raises(ValidationError):
+        PlantSetSpec.model_validate({**plants, "friction_mm": 0.5})
