@@ -1,0 +1,125 @@
+"""A stream that may break off: what it costs, and what the motors see when it does.
+
+For each file, machine and firmware the written file is read back with its own limits. At some
+hundred of its stream's lines the motion breaks off: the firmware brakes to a stand by its own
+rules, and goes on from there. The table gives the largest change of velocity of X and Y within a
+ms around all breaks, at some speed factors (M220), beside what the machine says its motors bear;
+and the report's contour error of one model (a prediction), print time, segments a second and put
+back pieces, for comparison with streams that ran under other limits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from firmwares import machine_with, without_macros
+from readback import find_input, plain_copy, shared_folder
+
+from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
+from gcode.interpreter import Interpreter
+from gcode.sampler import sample_phases
+from gcode.types import Limits, Moves, rows_of
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.files import default_cache_dir
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+
+FILES = ("cura_ender3_gear24", "klipper_excludeobj_multi")
+MACHINES = ("ender3", "voron-v24-250")
+FIRMWARES = ("klipper", "marlin", "reprapfirmware")
+FACTORS = (0.5, 1.0, 2.0)
+_SAMPLE_S, _REACH = 5e-5, 20
+_AROUND = 60
+"""Moves that are looked at before and behind a break."""
+
+
+def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
+    """Largest change of velocity within a ms when moves go from rest to rest, mm/s."""
+    phases = plan_moves(moves, limits, machine)
+    if not len(phases):
+        return 0.0
+    last = phases.t_s[-1] + phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
+    count = int((last - phases.t_s[0]) / _SAMPLE_S) + 2 * _REACH
+    begin_s = float(phases.t_s[0]) - _REACH * _SAMPLE_S
+    place, _ = sample_phases(phases, (begin_s, _SAMPLE_S, count))
+    velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
+    change = velocity[:, _REACH:] - velocity[:, :-_REACH]
+    return float(np.max(np.hypot(*change), initial=0.0))
+
+
+def worst_steps(written: Path, machine: Machine, breaks: int) -> list[float]:
+    """Largest change of velocity around breaks of a written file, for each of `FACTORS`."""
+    firmware = kit(machine)
+    stream = firmware.stream_limits(firmware.initial_limits()).as_row()
+    rng = np.random.default_rng(20261124)
+    reader = Interpreter(machine)
+    worst = [0.0] * len(FACTORS)
+    with written.open("rb") as file:
+        blocks = [b for data in iter(lambda: file.read(1 << 20), b"") for b in reader.push(data)]
+    blocks += reader.flush()
+    ours = [
+        np.flatnonzero(
+            np.array([limit.as_row()[1] == stream[1] for limit in b.limits])[b.moves.limits_id]
+        )
+        if len(b.moves)
+        else np.zeros(0, int)
+        for b in blocks
+    ]
+    total = max(sum(map(len, ours)), 1)
+    for block, rows in zip(blocks, ours, strict=True):
+        chosen = rows[rng.random(len(rows)) < breaks / total]
+        for k in chosen.tolist():
+            for part in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
+                for i, factor in enumerate(FACTORS):
+                    moves = rows_of(block.moves, part)
+                    moves = replace(moves, speed_mm_s=factor * moves.speed_mm_s)
+                    worst[i] = max(worst[i], velocity_step(moves, list(block.limits), machine))
+    return worst
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What breaks of a stream ask of the motors.")
+    parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
+    parser.add_argument("--machines", nargs="+", default=list(MACHINES))
+    parser.add_argument("--firmwares", nargs="+", default=list(FIRMWARES))
+    parser.add_argument("--breaks", type=int, default=300, help="lines of each file")
+    given = parser.parse_args()
+    head = " ".join(f"{f'{100 * factor:.0f} %':>6}" for factor in FACTORS)
+    print(
+        f"{'file':26}{'machine':15}{'firmware':15}{'bears':>6} {head}  rms um  time s  seg/s back"
+    )
+    with tempfile.TemporaryDirectory(prefix="stillpath-breaks-") as folder:
+        for name in given.files:
+            source = plain_copy(find_input(name, shared_folder()), Path(folder))
+            for machine_name in given.machines:
+                for firmware in given.firmwares:
+                    machine, sliced = load_machine(machine_name), source
+                    if firmware != "klipper":
+                        machine = machine_with(machine_name, firmware, 80.0)
+                        (Path(folder) / firmware).mkdir(exist_ok=True)
+                        sliced = without_macros(source, Path(folder) / firmware)
+                    target = Path(folder) / "out.gcode"
+                    options = Options(robust="off")
+                    result = compensate_file(
+                        sliced, target, machine, options, cache_dir=default_cache_dir()
+                    )
+                    steps = worst_steps(target, machine, given.breaks)
+                    print(
+                        f"{name[:25]:26}{machine_name:15}{firmware:15}"
+                        f"{machine.command.speed_step_mm_s:6.0f} "
+                        + " ".join(f"{step:6.0f}" for step in steps)
+                        + f" {result.channels[1].extruding.contour_rms_um:7.3f}"
+                        f" {result.compensated_s:7.1f} {result.segments_per_s:6.0f}"
+                        f" {len(result.put_back):4d}",
+                        flush=True,
+                    )
+
+
+if __name__ == "__main__":
+    main()
