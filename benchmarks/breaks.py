@@ -44,8 +44,12 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     phases = plan_moves(moves, limits, machine)
     if not len(phases):
         return 0.0
-    last = phases.t_s[-1] + phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1]
-    count = int((last - phases.t_s[0]) / _SAMPLE_S) + 2 * _REACH
+    # RepRapFirmware holds moves back by some hundredths of a ms where they come too fast: late
+    # steps, which this does not count.
+    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    ends_s = phases.t_s[0] + np.cumsum(lasts_s)
+    phases = replace(phases, t_s=ends_s - lasts_s)
+    count = int((ends_s[-1] - ends_s[0] + lasts_s[0]) / _SAMPLE_S) + 2 * _REACH
     begin_s = float(phases.t_s[0]) - _REACH * _SAMPLE_S
     place, _ = sample_phases(phases, (begin_s, _SAMPLE_S, count))
     velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
