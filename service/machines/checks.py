@@ -77,11 +77,7 @@ def check_before_job(
         The printer's configuration as it is now.
     """
     found = [] if config is None else differences(machine, config)
-    return [
-        *age_warnings(machine, now, max_age_days),
-        *envelope_warnings(machine),
-        *(entry.text for entry in found),
-    ]
+    return [*age_warnings(machine, now, max_age_days), *(entry.text for entry in found)]
 
 
 def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:

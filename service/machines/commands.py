@@ -320,7 +320,7 @@ def check(
     ] = None,
 ) -> None:
     """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
-    from service.machines.checks import check_before_job, not_followed
+    from service.machines.checks import check_before_job, envelope_warnings, not_followed
     from service.machines.klipper_config import read_printer_config
 
     resolver = open_machines()
@@ -333,8 +333,8 @@ def check(
         config=config,
     )
     found += _refused(machine)
-    notes = [] if config is None else [f"note: {line}" for line in not_followed(config)]
-    for line in [*found, *notes]:
+    notes = envelope_warnings(machine) + ([] if config is None else not_followed(config))
+    for line in [*found, *(f"note: {line}" for line in notes)]:
         typer.echo(line)
     if found:
         raise typer.Exit(2)

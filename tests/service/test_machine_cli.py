@@ -242,15 +242,16 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
     assert "already" in one_line(capsys)
 
 
-def test_the_command_of_a_fast_printer_has_room(store: MachineStore, config: Path):
+def test_what_the_motors_bear_is_derived_from_their_limits(store: MachineStore, config: Path):
     assert machines("from-config", config, "--name", "slow") == 0
-    assert store.current("slow").machine.command == CommandLimits()
+    slow = CommandLimits(velocity_mm_s=1.2 * 300, accel_mm_s2=1.5 * 4000, speed_step_mm_s=45.0)
+    assert store.current("slow").machine.command == slow
     fast = CONFIG.replace("max_velocity: 300", "max_velocity: 600")
     config.write_text(fast.replace("max_accel = 4000", "max_accel = 30000"))
     assert machines("from-config", config, "--name", "fast") == 0
     command = store.current("fast").machine.command
-    assert command.velocity_mm_s == pytest.approx(1.4 * 600)
-    assert command.accel_mm_s2 == pytest.approx(1.4 * 30_000)
+    assert command.velocity_mm_s == pytest.approx(1.2 * 600)
+    assert command.accel_mm_s2 == pytest.approx(1.5 * 30_000)
 
 
 def test_typed_in_resonances(store: MachineStore, config: Path):
@@ -331,7 +332,10 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     config.write_text(CONFIG)  # what is included was not looked at: said, but no difference
     assert machines("check", "mine", "--printer-cfg", config) == 0
     assert "note: [include mainsail.cfg]" in capsys.readouterr().out
+    capsys.readouterr()
+    # A note for machines whose command is no such multiple, and no difference.
     assert machines("check", "generic-corexy") == 0
+    assert "note: generic-corexy: a command may ask the motors for 20000" in capsys.readouterr().out
     # Somebody else's printer, and years ago.
     assert machines("check", "ender3") == 2
 
