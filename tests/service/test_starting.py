@@ -32,15 +32,16 @@ def start(data_dir: Path, **settings: str) -> subprocess.Popen[str]:
     ("settings", "code", "said"),
     [
         ({"storage_url": "ftp://somewhere"}, 2, "neither s3://bucket/prefix nor"),
-        ({"database_url": "postgresql://nobody@127.0.0.1:9/none"}, 1, "does not answer"),
         ({}, 1, "restore a backup"),
     ],
-    ids=["storage", "database-away", "database-broken"],
+    ids=["storage", "database-broken"],
 )
 def test_a_service_that_cannot_start_says_why_in_one_line(
     tmp_path: Path, settings: dict[str, str], code: int, said: str
 ):
-    (tmp_path / "stillpath.sqlite3").write_text("not a database" * 1000)
+    database = tmp_path / "stillpath.sqlite3"
+    database.write_text("not a database" * 1000)
+    database.chmod(0o600)  # else a line says that it was made private
     process = start(tmp_path, **settings)
     _, errors = process.communicate(timeout=600)
     assert process.returncode == code, errors
