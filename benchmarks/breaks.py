@@ -92,6 +92,7 @@ def main() -> None:
     parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--firmwares", nargs="+", default=list(FIRMWARES))
+    parser.add_argument("--accel-mm-s2", type=float, help="what the motors bear, of all machines")
     parser.add_argument("--breaks", type=int, default=300, help="lines of each file")
     given = parser.parse_args()
     head = " ".join(f"{f'{100 * factor:.0f} %':>6}" for factor in FACTORS)
@@ -108,6 +109,10 @@ def main() -> None:
                         machine = machine_with(machine_name, firmware, 80.0)
                         (Path(folder) / firmware).mkdir(exist_ok=True)
                         sliced = without_macros(source, Path(folder) / firmware)
+                    if given.accel_mm_s2:
+                        bears = {"accel_mm_s2": given.accel_mm_s2}
+                        command = machine.command.model_copy(update=bears)
+                        machine = machine.model_copy(update={"command": command})
                     target = Path(folder) / "out.gcode"
                     options = Options(robust="off")
                     result = compensate_file(

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from compensation.base import Compensator
 from compensation.holds import stand_still
+from compensation.overlay import Overlay
 from models.friction import bend_of
 from models.machine import Machine
-from models.schedule import OperatingPoint
 
 __all__ = ["FrictionCompensator", "against_friction"]
 
@@ -51,7 +51,7 @@ def against_friction(
     return wanted_mm + stand_still(added, np.zeros_like(added), rests, blend)
 
 
-class FrictionCompensator:
+class FrictionCompensator(Overlay):
     """Make up for dry friction under another compensator.
 
     In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
@@ -68,30 +68,9 @@ class FrictionCompensator:
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
         self.name = inner.name
-        self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
-        self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
+        super().__init__(inner, machine, dt_s)
         self._held_mm = machine.friction_mm
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
-
-    def reset(self, position_mm: Array) -> None:
-        """See `compensation.base.Compensator.reset`."""
-        self._inner.reset(position_mm)
-
-    def observe(self, command_mm: Array) -> None:
-        """See `compensation.base.Compensator.observe`."""
-        self._inner.observe(command_mm)
-
-    def commit(self) -> None:
-        """See `compensation.base.Compensator.commit`: the axes receive what inner asked for."""
-        self._inner.commit()
-
-    def operate_at(self, point: OperatingPoint) -> None:
-        """See `compensation.base.Compensator.operate_at`."""
-        self._inner.operate_at(point)
-
-    def ease(self, accel_share: float) -> bool:
-        """See `compensation.base.Compensator.ease`."""
-        return self._inner.ease(accel_share)
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -115,11 +94,6 @@ class FrictionCompensator:
             low, high = min(travel.min_mm, inner.min()), max(travel.max_mm, inner.max())
             np.clip(row, low, high, out=row)
         return u
-
-    def _peaks(self, u: Array) -> tuple[float, float]:
-        """Largest speed and acceleration of an axis."""
-        speed = float(np.abs(np.diff(u)).max(initial=0.0)) / self._dt_s
-        return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
 
 
 def _window(length_s: float, dt_s: float) -> Array:

@@ -26,10 +26,10 @@ from scipy.signal import firwin
 from compensation.base import Compensator, DesignError, Memoryless
 from compensation.holds import stand_still
 from compensation.inversion import Inversion, invert
+from compensation.overlay import Overlay
 from models.machine import Machine
 from models.plants import DiscretePlant, plant_set
 from models.ripple import MachineRipple, RippleTable
-from models.schedule import OperatingPoint
 
 __all__ = [
     "PassThrough",
@@ -158,7 +158,7 @@ class _Output:
     inverse: Inversion
 
 
-class RippleCompensator:
+class RippleCompensator(Overlay):
     """Undo the ripple of a machine under another compensator.
 
     In rests, and at the ends of a piece, the command stands on the plan; `_BLEND_S` before and
@@ -181,8 +181,7 @@ class RippleCompensator:
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
         self.name = f"{inner.name}+ripple"
-        self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
-        self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
+        super().__init__(inner, machine, dt_s)
         _check(machine)
         self._ripple = MachineRipple(machine.kinematics, machine.ripple)
         plants = [("x", machine.axes["x"]), ("y", machine.axes["y"])]
@@ -193,26 +192,6 @@ class RippleCompensator:
         self._blend = max(2, round(_BLEND_S / dt_s))
         self.budget_mm_s2 = machine.command.accel_mm_s2
         """Of the last piece, for the acceleration of a wave; 0: no room, the ripple stays."""
-
-    def reset(self, position_mm: Array) -> None:
-        """See `compensation.base.Compensator.reset`."""
-        self._inner.reset(position_mm)
-
-    def observe(self, command_mm: Array) -> None:
-        """See `compensation.base.Compensator.observe`."""
-        self._inner.observe(command_mm)
-
-    def commit(self) -> None:
-        """See `compensation.base.Compensator.commit`."""
-        self._inner.commit()
-
-    def operate_at(self, point: OperatingPoint) -> None:
-        """See `compensation.base.Compensator.operate_at`."""
-        self._inner.operate_at(point)
-
-    def ease(self, accel_share: float) -> bool:
-        """See `compensation.base.Compensator.ease`."""
-        return self._inner.ease(accel_share)
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
@@ -249,11 +228,6 @@ class RippleCompensator:
                 share = wave_shares(motors[row], table, self._dt_s, self.budget_mm_s2)
                 motors[row] = input_command(motors[row], table, share)
         return np.asarray(np.linalg.solve(self._ripple.to_motors, motors))
-
-    def _peaks(self, u: Array) -> tuple[float, float]:
-        """Largest speed and acceleration of an axis."""
-        speed = float(np.abs(np.diff(u)).max(initial=0.0)) / self._dt_s
-        return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
 
 
 def _check(machine: Machine) -> None:

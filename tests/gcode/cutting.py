@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 from gcode.interpreter import Interpreter
 from gcode.pieces import Passage, Piece, Splitter
 from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.compensating import CompensatedPiece, PieceCompensator
+from service.pipeline.options import Options
 
-__all__ = ["HEAD", "cut", "pieces_of"]
+__all__ = ["HEAD", "compensated", "cut", "ender3_with", "pieces_of"]
+
+_SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 
 HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 F6000\nG4 P10\n"
 """Behind this the machine stands still at 60, 50, 5."""
@@ -35,3 +43,19 @@ def cut(
 def pieces_of(text: str | bytes, machine: Machine) -> list[Piece]:
     data = text.encode() if isinstance(text, str) else text
     return [item for item in cut(data, machine) if isinstance(item, Piece)]
+
+
+def ender3_with(kind: str, mesh_slope: float = 0.0) -> Machine:
+    """The Ender 3 with a firmware of the examples, on a bed that is crooked by so much."""
+    document = load_machine("ender3").model_dump(mode="json") | {"mesh_slope": mesh_slope}
+    if kind != "klipper":
+        document["firmware"] = json.loads((_SECTIONS / f"{kind}.json").read_text())
+    return Machine.model_validate(document)
+
+
+def compensated(text: str, machine: Machine) -> tuple[Piece, CompensatedPiece]:
+    """The piece behind the head, as it came and compensated."""
+    work = PieceCompensator(machine, Options())
+    piece = pieces_of(text, machine)[1]
+    work.compensator.reset(piece.moves.start_mm[0, :2])
+    return piece, work.compensate(piece)

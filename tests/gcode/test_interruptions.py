@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +13,9 @@ from gcode.pieces import Piece
 from gcode.sampler import sample_phases
 from gcode.types import Limits, Moves, rows_of
 from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator
-from service.pipeline.options import Options
-from tests.gcode.cutting import HEAD, pieces_of
+from service.pipeline.compensating import CompensatedPiece
+from tests.gcode.cutting import HEAD, compensated, ender3_with
 
-SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 BODY = (
     "G1 X90 Y60 E1 F9000\nG1 X20 Y20 E2\nG1 X21 Y60 E1\nG1 X90 Y21 E2\nG1 E-.8 F2100\n"
     "G1 X20 Y90 F12000\nG1 E.8 F2100\nG1 X90 Y20 E3 F6000\nG1 X20 Y20 E1\n"
@@ -28,21 +23,6 @@ BODY = (
 _SAMPLE_S = 5e-5
 _AROUND = 60
 """Moves that are looked at before and behind a break."""
-
-
-def machine_of(kind: str) -> Machine:
-    document = load_machine("ender3").model_dump(mode="json")
-    if kind != "klipper":
-        document["firmware"] = json.loads((SECTIONS / f"{kind}.json").read_text())
-    return Machine.model_validate(document)
-
-
-def stream_of(machine: Machine) -> tuple[Piece, CompensatedPiece]:
-    work = PieceCompensator(machine, Options())
-    piece = pieces_of(HEAD + BODY, machine)[1]
-    assert isinstance(piece, Piece)
-    work.compensator.reset(piece.moves.start_mm[0, :2])
-    return piece, work.compensate(piece)
 
 
 def written(piece: Piece, made: CompensatedPiece, factor: float) -> tuple[Moves, list[Limits]]:
@@ -83,8 +63,8 @@ def test_no_break_asks_for_more_than_the_motors_bear(
     kind: str, factor: float, times: float
 ) -> None:
     """By each firmware's own rules; Marlin's ramps are steps of its step rate (docs/safety.md)."""
-    machine = machine_of(kind)
-    moves, limits = written(*stream_of(machine), factor)
+    machine = ender3_with(kind)
+    moves, limits = written(*compensated(HEAD + BODY, machine), factor)
     stream = np.flatnonzero(moves.limits_id == 0)
     worst = 0.0
     for k in stream[5::7]:

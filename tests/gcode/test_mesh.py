@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,11 +12,10 @@ from gcode.pieces import Piece
 from gcode.types import Phases
 from models.errors import ModelError
 from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator, deviation
+from service.pipeline.compensating import CompensatedPiece, deviation
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file
-from tests.gcode.cutting import HEAD, pieces_of
+from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 SLOPE = 0.005
 BODY = (
@@ -29,14 +25,8 @@ BODY = (
 )
 
 
-SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
-
-
 def crooked(slope: float, kind: str = "klipper") -> Machine:
-    document = load_machine("ender3").model_dump(mode="json") | {"mesh_slope": slope}
-    if kind != "klipper":
-        document["firmware"] = json.loads((SECTIONS / f"{kind}.json").read_text())
-    return Machine.model_validate(document)
+    return ender3_with(kind, slope)
 
 
 def on_a_plane(machine: Machine, piece: Piece, made: CompensatedPiece, slope: float) -> Phases:
@@ -53,11 +43,7 @@ def on_a_plane(machine: Machine, piece: Piece, made: CompensatedPiece, slope: fl
 
 
 def made_on(machine: Machine) -> tuple[Piece, CompensatedPiece]:
-    work = PieceCompensator(machine, Options())
-    piece = pieces_of(HEAD + BODY, machine)[1]
-    assert isinstance(piece, Piece)
-    work.compensator.reset(piece.moves.start_mm[0, :2])
-    return piece, work.compensate(piece)
+    return compensated(HEAD + BODY, machine)
 
 
 def seconds(phases: Phases) -> float:
