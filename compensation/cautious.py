@@ -35,12 +35,15 @@ class Caution:
         Of X and Y, 0 (the shaper alone) to 1.
     shaper : str
     fx_hz, fy_hz : float
+    fit_share : float
+        How much of the tolerance a fit to the command may use.
     """
 
     shares: tuple[float, float]
     shaper: str
     fx_hz: float
     fy_hz: float
+    fit_share: float = 1.0
 
 
 class CautiousFbf:

@@ -71,6 +71,8 @@ _PER_PARAMETER = 2.0
 _SAME = 0.03
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
 _WRONG_LEVEL, _CROSS = 0.15, 0.2
+_APART_DB = 2.0
+"""Repeats within a session differ by .3 to 1 dB, tables of one axis weeks apart by up to 1.5 dB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +147,7 @@ def explain_spectra(
     notes = (
         *_level_warning(gain, excitation),
         *_cross_warning(*cross_axis_share(single, name, search.model.band_hz), name),
+        *_apart_warning(spectra, search.repeats),
     )
     fit = Fit(
         spec=population.members[0],
@@ -250,7 +253,7 @@ class _Search:
     ) -> None:
         self.model = model = spectrum_model(single, column, excitation)
         tiny = np.finfo(float).tiny
-        self._repeats = np.array(
+        self.repeats = np.array(
             [
                 np.interp(model.f_hz, s.f_hz, np.log(np.maximum(s.psd[column], tiny)))
                 for s in repeats
@@ -317,8 +320,8 @@ class _Search:
         for _ in range(_DRAWS):
             start = accepted[int(self._rng.choice(len(accepted), p=likely / likely.sum()))]
             # Which of the repeats happen to be there (Bayesian bootstrap, Rubin 1981).
-            weights = self._rng.dirichlet(np.ones(len(self._repeats)))
-            log_psd = weights @ self._repeats + root @ self._rng.standard_normal(len(root))
+            weights = self._rng.dirichlet(np.ones(len(self.repeats)))
+            log_psd = weights @ self.repeats + root @ self._rng.standard_normal(len(root))
             out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
         return out
 
@@ -453,6 +456,25 @@ def _level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
             f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
             f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
             "its sensor reads right (the shape of the model hardly depends on it)"
+        ),
+    )
+
+
+def _apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
+    """Warn of the two tables that differ most in shape, if they are not of one machine."""
+    pairs = [
+        (float(_DB * np.std(logs[i] - logs[j])), spectra[i].source, spectra[j].source)
+        for i in range(len(logs))
+        for j in range(i)
+    ]
+    apart_db, one, other = max(pairs, default=(0.0, "", ""))
+    if apart_db <= _APART_DB:
+        return ()
+    return (
+        (
+            f"{other} and {one} differ by {apart_db:.1f} dB in shape (repeats: below "
+            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, mounting); "
+            "give only tables of the machine as it prints today"
         ),
     )
 

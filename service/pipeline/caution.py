@@ -48,13 +48,16 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 5
+_VERSION = 6
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
 _PRICE = 0.5
 """Of a member that fares worse than with the shaper, by how much it does: members contradict each
 other, and to please the least likely one would mean to leave the others alone."""
+_COARSE_UM, _LEAST_FIT = 4.0, 0.5
+"""Contour error from which on straight segments may take all of their tolerance, and the least
+share of it: on machines that are known well the segments would be the larger error."""
 _FRICTION_UNSURE = 0.25
 """Relative: of what logs say of it, on virtual printers 10 % are missed, 25 % seldom."""
 _STRIDE = 5
@@ -73,6 +76,8 @@ class Choice:
         against the shaper's.
     worst_to_none : float
         Largest against no compensation.
+    rms_um : float
+        Contour error, geometric mean over the members with their weights.
     ranges : dict
         By channel of a report, least and largest contour error of the members (delays and all)
         against the nominal plants' with the same command.
@@ -82,7 +87,13 @@ class Choice:
     worst: float
     mean: float
     worst_to_none: float
+    rms_um: float
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def fit_share(self) -> float:
+        """How much of the tolerance a fit to the command may use."""
+        return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
     def ranged(self, channel: Channel) -> Channel:
         """Return a channel of a report with the range over the members."""
@@ -167,7 +178,10 @@ def choose_caution(
         directory.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:
             temporary.write_text(json.dumps(asdict(choice)), encoding="utf-8")
-    return Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz), choice
+    return (
+        Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz, choice.fit_share),
+        choice,
+    )
 
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
@@ -209,6 +223,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
             float(ratio.max()),
             float(np.exp(weights @ np.log(ratio))),
             float(np.max(ours / np.maximum(none, 1e-12))),
+            float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
         )
 
     most = [_most(machine.axes[axis]) for axis in ("x", "y")]

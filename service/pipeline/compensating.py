@@ -123,7 +123,8 @@ class PieceCompensator:
         elif shaper is not None and vibration == f"shaper:{shaper.type}":
             settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
         self._machine = machine
-        self._tolerance_mm = 1e-3 * options.tolerance_um
+        fit_share = 1.0 if caution is None else caution.fit_share
+        self._tolerance_mm = 1e-3 * options.tolerance_um * fit_share
 
         def design(mode: str | None) -> Compensator:
             chosen = settings if mode is None else {**settings, "robust": mode}

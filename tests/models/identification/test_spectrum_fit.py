@@ -159,6 +159,21 @@ def test_wrong_level_is_told() -> None:
     assert fit.modes[0].zeta == pytest.approx(0.015, rel=0.1)
 
 
+def test_tables_of_a_machine_that_was_changed_between_them_are_told() -> None:
+    first = replace(simulated(NARROW, (0.7, 0.3), LEGACY), source="before.csv")
+    again = replace(simulated(NARROW, (0.7, 0.3), LEGACY, noise=80.0), source="again.csv")
+    tighter = tuple((1.15 * f, zeta) for f, zeta in NARROW)
+    after = replace(simulated(tighter, (0.7, 0.3), LEGACY), source="after.csv")
+
+    def told(*spectra: Spectrum) -> list[str]:
+        fit = explain_spectra(spectra, LEGACY).fit
+        return [note for note in fit.notes if "something was changed between them" in note]
+
+    assert told(first, again) == []
+    (note,) = told(first, again, after)
+    assert note.startswith(("before.csv and after.csv differ by", "again.csv and after.csv differ"))
+
+
 def test_column_that_follows_the_drive() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     assert driven_column(spectrum) == "x"

@@ -60,6 +60,10 @@ def test_a_wide_set_asks_for_more_of_the_shaper(tmp_path: Path) -> None:
         for f in ((45.0, 44.5, 45.5), (45.0, 25.0, 90.0))
     )
     assert min(narrow.shares) > max(wide.shares)
+    # Where the plants leave little error, straight segments must not be the larger one.
+    assert narrow.rms_um < wide.rms_um
+    assert narrow.fit_share == 0.5
+    assert wide.fit_share == 1.0
     assert narrow.mean < wide.mean <= wide.worst
 
 
