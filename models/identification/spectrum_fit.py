@@ -473,8 +473,8 @@ def _apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
     return (
         (
             f"{other} and {one} differ by {apart_db:.1f} dB in shape (repeats: below "
-            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, mounting); "
-            "give only tables of the machine as it prints today"
+            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, "
+            "mounting); give only tables of the machine as it prints today"
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Repeats of one measurement lead to one machine: what it prints hardly depends on which are read."""
+"""Repeats lead to one machine: a file hardly depends on which of them were read."""
 
 from __future__ import annotations
 
