@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from service.deliveries.targets import read_url
-from service.jobs.state import Job, JobState
+from service.jobs.state import Job, JobKind, JobState
 from service.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
@@ -26,6 +26,7 @@ __all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerInd
 
 _EXAMPLE: dict[str, Any] = {
     "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
+    "kind": "compensation",
     "state": "running",
     "stage": "compensating",
     "progress": 0.42,
@@ -213,6 +214,10 @@ class JobView(BaseModel):
     model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     id: str
+    kind: JobKind = Field(
+        default=JobKind.COMPENSATION,
+        description="What is computed; jobs of other kinds than `compensation` have a result only.",
+    )
     state: JobState
     stage: str = Field(description="What is being done, for a person.")
     progress: float = Field(ge=0, le=1)
@@ -255,10 +260,13 @@ class JobView(BaseModel):
         """Return the view of a job."""
         here = f"/v1/jobs/{job.id}"
         done = job.state is JobState.DONE
-        made = ("result", "report", "report.json", "layers", "trajectories")
+        made = ["result"]
+        if job.kind is JobKind.COMPENSATION:
+            made += ["report", "report.json", "layers", "trajectories"]
         links = {name.replace(".", "_"): f"{here}/{name}" for name in made if done}
         return cls(
             id=job.id,
+            kind=job.kind,
             state=job.state,
             stage=job.stage,
             progress=job.progress,

@@ -20,6 +20,7 @@ from service.api.problems import Problem
 from service.storage.disk import Disk
 
 __all__ = [
+    "Received",
     "Upload",
     "limited_body",
     "receive_document",
@@ -53,6 +54,16 @@ class Upload:
     size_bytes: int
     sha256: str
     fields: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A file of a form: what its sender called it, and where it is now."""
+
+    label: str
+    path: Path
+    size_bytes: int
+    sha256: str
 
 
 async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk: Disk) -> Upload:
@@ -109,8 +120,8 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
 
 async def receive_files(
     request: Request, folder: Path, *, max_bytes: int, max_files: int, disk: Disk
-) -> list[tuple[str, Path]]:
-    """Write the files of a form into a folder; return what each was called and where it is.
+) -> list[Received]:
+    """Write the files of a form into a folder.
 
     Parameters
     ----------
@@ -149,7 +160,10 @@ async def receive_files(
         await read_form(request, limited_body(request, max_bytes), begin, drain)
         for sink in sinks:
             await sink.flush()
-    return found
+    return [
+        Received(label, path, sink.size_bytes, sink.digest.hexdigest())
+        for (label, path), sink in zip(found, sinks, strict=True)
+    ]
 
 
 async def receive_document(request: Request, *, max_bytes: int) -> bytes:

@@ -44,6 +44,7 @@ jobs = Table(
     metadata,
     Column("id", String(32), primary_key=True),
     Column("owner", String(64), nullable=False),
+    Column("kind", String(16), nullable=False, server_default="compensation"),
     Column("batch", String(64)),
     Column("machine", String(255), nullable=False),
     Column("machine_revision", String(64), nullable=False),

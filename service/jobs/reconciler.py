@@ -247,17 +247,30 @@ class Reconciler:
 
         No more: one that waits at Dask would not see that a more urgent one has come.
         """
-        running = {job.id for job in self._store.in_state(JobState.RUNNING)}
-        free = self.slots - len(running | set(self._in_flight))
+        busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
+        busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
+        free = self.slots - len(busy)
         if free > 0 and self._is_room():
-            now = time.monotonic()
-            left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
-            for job in self._store.next_queued(free, exclude=[*self._in_flight, *left_alone]):
-                if job.stage == WAITING_FOR_ROOM and not self._may_try_again(job, now):
-                    continue
-                self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
-                free -= 1
+            # Short jobs may have any place; some are kept for them alone.
+            long = sum(not job.kind.is_short for job in busy.values())
+            kept = min(self._settings.computing_processes, self.slots - 1)
+            free -= self._begin(free, short=True)
+            free -= self._begin(min(free, self.slots - kept - long), short=False)
         self._free = max(free, 0)
+
+    def _begin(self, most: int, *, short: bool) -> int:
+        """Hand over up to so many jobs; return how many there were."""
+        if most <= 0:
+            return 0
+        now, begun = time.monotonic(), 0
+        left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
+        exclude = [*self._in_flight, *left_alone]
+        for job in self._store.next_queued(most, short=short, exclude=exclude):
+            if job.stage == WAITING_FOR_ROOM and not self._may_try_again(job, now):
+                continue
+            self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+            begun += 1
+        return begun
 
     def _is_room(self) -> bool:
         """Return whether jobs may begin; the workers of other computers look for themselves."""

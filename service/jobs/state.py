@@ -30,6 +30,7 @@ __all__ = [
     "Failed",
     "Finished",
     "Job",
+    "JobKind",
     "JobState",
     "Lost",
     "NoRoom",
@@ -40,6 +41,22 @@ __all__ = [
 
 WAITING_FOR_ROOM = "waiting for room on the disk"
 """Stage of a job that went back to the queue because its files had no room."""
+
+
+class JobKind(StrEnum):
+    """What is computed."""
+
+    COMPENSATION = "compensation"
+    TRAJECTORIES = "trajectories"
+    IDENTIFICATION = "identification"
+    DESIGN = "design"
+    CONTROLLER = "controller"
+    LOOPS = "loops"
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it is over within minutes: it does not queue behind what takes hours."""
+        return self not in (JobKind.COMPENSATION, JobKind.TRAJECTORIES)
 
 
 class JobState(StrEnum):
@@ -64,6 +81,8 @@ class Job:
     Attributes
     ----------
     id : str
+    kind : JobKind
+        Compensations have a caller's file and a report; of the others only the answer counts.
     owner : str
         Whose job it is.
     batch : str or None
@@ -71,7 +90,7 @@ class Job:
     machine, machine_revision : str
         Name of a machine, and which state of it; the document is kept with the job's files.
     options : dict
-        The fields of `service.pipeline.options.Options`.
+        The fields of `service.pipeline.options.Options`; of other kinds, what was asked.
     dedupe_key : str
         Equal for jobs that must have the same result: of input, machine, options and version.
     priority : int
@@ -115,6 +134,7 @@ class Job:
     source_sha256: str
     result_name: str
     created_at: float
+    kind: JobKind = JobKind.COMPENSATION
     batch: str | None = None
     priority: int = 0
     output: str | None = None
@@ -136,6 +156,32 @@ class Job:
     webhook: str | None = None
     printer: str | None = None
     print_after: bool = False
+
+    @property
+    def sources(self) -> list[str]:
+        """Where its input lies in the storage."""
+        match self.kind:
+            case JobKind.COMPENSATION | JobKind.TRAJECTORIES:
+                return [f"{self._origin}/source/{self.source_name}"]
+            case JobKind.IDENTIFICATION:
+                return [f"{self._origin}/source/{n}" for n in range(len(self.options["files"]))]
+            case _:
+                return []
+
+    @property
+    def machine_file(self) -> str:
+        """Where its machine lies in the storage, if it has one."""
+        return f"{self._origin}/machine.json"
+
+    @property
+    def result(self) -> str:
+        """Where its result lies in the storage, once it is done."""
+        return f"{self.output}/result/{self.result_name}"
+
+    @property
+    def _origin(self) -> str:
+        # Trajectories are those of another job.
+        return f"jobs/{self.options['of'] if self.kind is JobKind.TRAJECTORIES else self.id}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,17 @@
+"""What a job computes: everything that computes is one."""
+
+import sqlalchemy as sa
+from alembic import op
+
+__all__ = ["down_revision", "revision", "upgrade"]
+
+revision = "0003"
+down_revision = "0002"
+
+
+def upgrade() -> None:
+    """Add a column; all jobs so far are compensations."""
+    op.add_column(
+        "jobs",
+        sa.Column("kind", sa.String(length=16), nullable=False, server_default="compensation"),
+    )
