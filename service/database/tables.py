@@ -44,7 +44,6 @@ jobs = Table(
     metadata,
     Column("id", String(32), primary_key=True),
     Column("owner", String(64), nullable=False),
-    Column("kind", String(16), nullable=False, server_default="compensation"),
     Column("batch", String(64)),
     Column("machine", String(255), nullable=False),
     Column("machine_revision", String(64), nullable=False),
@@ -79,6 +78,8 @@ jobs = Table(
     Column("print_after", Boolean, nullable=False, default=False),
     # By `seen_time`: since when the job is known to be over.
     Column("kept_from_s", Float),
+    # What is computed.
+    Column("kind", String(16), nullable=False, server_default="compensation"),
     Index("jobs_by_state", "state", "priority", "created_at"),
     Index("jobs_by_owner", "owner", "created_at"),
     Index("jobs_by_age", "created_at"),
