@@ -19,6 +19,7 @@ from service.jobs.state import (
     Event,
     Failed,
     Job,
+    JobKind,
     JobState,
     Lost,
     Progressed,
