@@ -106,7 +106,10 @@ def create_app(
     state.printers = load_printers(settings.printers)
     state.waiting = Counter()  # of jobs, for how many requests
     state.metrics = metrics.Metrics(
-        lambda: state.store, lambda: state.work.workers, lambda: state.hub.watchers
+        lambda: state.store,
+        lambda: state.work.workers,
+        lambda: state.hub.watchers,
+        lambda: state.disk.free_bytes() if settings.disk_reserve_bytes else None,
     )
     app.add_middleware(
         Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required

@@ -29,6 +29,7 @@ _EXAMPLE: dict[str, Any] = {
     "kind": "compensation",
     "state": "running",
     "stage": "compensating",
+    "room_bytes": None,
     "progress": 0.42,
     "eta_s": 3.1,
     "queue_position": None,
@@ -220,6 +221,10 @@ class JobView(BaseModel):
     )
     state: JobState
     stage: str = Field(description="What is being done, for a person.")
+    room_bytes: int | None = Field(
+        default=None,
+        description="Room on the disk that it needs at least, while it waits for that.",
+    )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(description="Seconds still needed; null while unknown.")
     queue_position: int | None = Field(description="Jobs before this one while it is queued.")
@@ -268,7 +273,8 @@ class JobView(BaseModel):
             id=job.id,
             kind=job.kind,
             state=job.state,
-            stage=job.stage,
+            stage=_stage(job),
+            room_bytes=job.room_bytes if job.waits_for_room else None,
             progress=job.progress,
             eta_s=job.eta_s,
             queue_position=queue_position,
@@ -323,6 +329,12 @@ class Health(BaseModel):
 
     status: str
     version: str
+
+
+def _stage(job: Job) -> str:
+    if job.waits_for_room and job.room_bytes:
+        return f"{job.stage}: more than {job.room_bytes >> 20} MiB are needed"
+    return job.stage
 
 
 def _moment(seconds: float | None) -> datetime | None:

@@ -87,7 +87,8 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
         408 if its sender falls silent, 413 if the body is too large, 422 if it is empty or broken.
     NoRoom
     """
-    _check_declared(request, max_bytes, disk)
+    # Beside the upload lies what is made of it, which is as large at least.
+    disk.check_ever(2 * _check_declared(request, max_bytes, disk))
     fields: dict[str, str] = {}
     with target.open("wb") as file:
         sink = _Sink(file, disk)
@@ -243,13 +244,14 @@ async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes
         yield chunk
 
 
-def _check_declared(request: Request, max_bytes: int, disk: Disk) -> None:
-    """Refuse by what the headers say, before anything is read."""
+def _check_declared(request: Request, max_bytes: int, disk: Disk) -> int:
+    """Refuse by what the headers say, before anything is read; return the declared size."""
     declared = request.headers.get("content-length", "")
     size = int(declared) if declared.isdecimal() else 0
     if size > max_bytes:
         raise _too_large(max_bytes)
     disk.check(size)
+    return size
 
 
 def _too_large(max_bytes: int) -> Problem:

@@ -7,7 +7,14 @@ from typing import Any
 
 from service.jobs.state import JobKind
 
-__all__ = ["DISK_FULL", "PROBLEM_MEDIA_TYPE", "input_gone", "problem", "problem_of"]
+__all__ = [
+    "DISK_FULL",
+    "PROBLEM_MEDIA_TYPE",
+    "input_gone",
+    "never_fits",
+    "problem",
+    "problem_of",
+]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -80,3 +87,14 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
 def input_gone(name: str) -> dict[str, Any]:
     """Return the problem of a job whose input was deleted; `name` of the file."""
     return problem(404, "The file is gone", f"{name} is no longer in the storage.")
+
+
+def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
+    """Return the problem of a job whose files are larger than the disk."""
+    return problem(
+        507,
+        "The job is larger than the disk",
+        f"It had written {room_bytes >> 20} MiB when the disk was full; the disk of the worker has "
+        f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). Cut "
+        "the print into several files, or give the service a larger disk.",
+    )

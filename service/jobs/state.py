@@ -117,6 +117,8 @@ class Job:
         Why the job failed, as a problem document (RFC 9457).
     created_at, started_at, heartbeat_at, finished_at : float or None
         Seconds since the epoch. `heartbeat_at`: when the worker was last heard of.
+    room_bytes : int or None
+        Room on the disk that it needs at least, if there was too little once.
     webhook : str or None
         Address that is told when the job is over.
     printer, print_after : str or None, bool
@@ -153,6 +155,7 @@ class Job:
     started_at: float | None = None
     heartbeat_at: float | None = None
     finished_at: float | None = None
+    room_bytes: int | None = None
     webhook: str | None = None
     printer: str | None = None
     print_after: bool = False
@@ -177,6 +180,11 @@ class Job:
     def result(self) -> str:
         """Where its result lies in the storage, once it is done."""
         return f"{self.output}/result/{self.result_name}"
+
+    @property
+    def waits_for_room(self) -> bool:
+        """Whether it would run if the disk had more room."""
+        return self.state is JobState.QUEUED and self.stage == WAITING_FOR_ROOM
 
     @property
     def _origin(self) -> str:
@@ -241,10 +249,14 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class NoRoom:
-    """The disk is full, or nearly: the job waits until there is room again."""
+    """The disk is full, or nearly: the job waits until there is room again.
+
+    `room_bytes` is what it needs at least: what it had written when it was stopped.
+    """
 
     attempt: int
     at: float
+    room_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +325,8 @@ def advance(job: Job, event: Event) -> Job:
         case Failed():
             return _failed(job, event.problem, event.at)
         case NoRoom():
-            return replace(_waiting(job), stage=WAITING_FOR_ROOM)
+            room_bytes = max(job.room_bytes or 0, event.room_bytes)
+            return replace(_waiting(job), stage=WAITING_FOR_ROOM, room_bytes=room_bytes)
         case Lost():
             if not event.blame:
                 return _waiting(job)

@@ -34,7 +34,16 @@ from sqlalchemy import (
 
 from service.database import tables
 from service.database.engine import insert, reading, write_together, writing
-from service.jobs.state import Claimed, Event, Job, JobKind, JobState, Stale, advance
+from service.jobs.state import (
+    WAITING_FOR_ROOM,
+    Claimed,
+    Event,
+    Job,
+    JobKind,
+    JobState,
+    Stale,
+    advance,
+)
 
 __all__ = [
     "BadCursor",
@@ -319,6 +328,15 @@ class JobStore:
             return connection.execute(
                 select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
             ).scalar()
+
+    def waiting_for_room(self) -> tuple[int, int]:
+        """Return how many jobs wait for room on the disk, and the most that one of them needs."""
+        query = select(func.count(), func.max(_JOBS.room_bytes)).where(
+            _JOBS.state == "queued", _JOBS.stage == WAITING_FOR_ROOM
+        )
+        with reading(self.engine) as connection:
+            jobs, most = connection.execute(query).one()
+        return int(jobs), int(most or 0)
 
     def ended_between(self, after: float, until: float) -> list[Job]:
         """Return the jobs that ended after a time and not later than another."""

@@ -102,6 +102,8 @@ class Watch:
         Whether the disk has room for more; the rest of it belongs to the database.
     end : callable
         Ends this process with an exit code.
+    no_room : callable
+        Says what becomes of the job where it has none.
 
     Attributes
     ----------
@@ -117,6 +119,7 @@ class Watch:
         *,
         interrupted: Callable[[], str | None],
         has_room: Callable[[], bool] = lambda: True,
+        no_room: Callable[[], Event] | None = None,
         end: Callable[[int], object],
     ) -> None:
         self._store = store
@@ -124,6 +127,7 @@ class Watch:
         self._limits = limits
         self._interrupted = interrupted
         self._has_room = has_room
+        self._no_room = no_room or (lambda: NoRoom(job.attempt, time.time()))
         self._end = end
         self._began = time.monotonic()
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)
@@ -202,7 +206,7 @@ class Watch:
         elif (found := self._limit_reached()) is not None:
             self._decide(Failed(attempt, now, found))
         elif not self._has_room():
-            self._decide(NoRoom(attempt, now))
+            self._decide(self._no_room())
         else:
             at = self._latest
             if not self._store.beat(self._job.id, attempt, now, at.stage, at.fraction, at.eta_s):

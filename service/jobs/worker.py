@@ -27,7 +27,7 @@ import structlog
 from service.computing.tasks import answer
 from service.database.engine import DatabaseAway, StoreError, open_database
 from service.environment import prepare_environment
-from service.jobs.problems import DISK_FULL, input_gone, problem_of
+from service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
 from service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
 from service.jobs.store import JobStore
 from service.jobs.task import Runner, Task
@@ -132,6 +132,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         limits,
         interrupted=workplace.interrupted,
         has_room=lambda: disk.lets_jobs_go_on,
+        no_room=lambda: _no_room(job, workplace),
         end=workplace.end,
     )
     with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
@@ -186,8 +187,14 @@ def _attempt(
     A full disk is nobody's fault: the job waits for room.
     """
     try:
-        with _folder(workplace.scratch / f"{job.id}-{job.attempt}") as folder:
-            return _work(job, workplace, runner, watch, folder)
+        with _folder(_place(job, workplace)) as folder:
+            try:
+                return _work(job, workplace, runner, watch, folder)
+            except OSError as error:
+                if error.errno not in _NO_ROOM:
+                    raise
+                structlog.get_logger("worker").warning("no room for the job", reason=str(error))
+                return _no_room(job, workplace)  # while it can be seen what it has written
     except Cancelled:
         return None
     except MemoryError:
@@ -197,8 +204,7 @@ def _attempt(
         return Failed(job.attempt, time.time(), input_gone(str(error)))
     except OSError as error:
         if error.errno in _NO_ROOM:
-            structlog.get_logger("worker").warning("no room for the job", reason=str(error))
-            return NoRoom(job.attempt, time.time())
+            return NoRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
             # Perhaps it answers another worker, or later.
@@ -209,6 +215,22 @@ def _attempt(
         if found["status"] >= 500:
             _log_crash()
         return Failed(job.attempt, time.time(), found)
+
+
+def _no_room(job: Job, workplace: Workplace) -> Event:
+    """Return what becomes of a job that the disk has no room for, by what it has written."""
+    disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
+    written = 0
+    with contextlib.suppress(OSError):  # files come and go meanwhile
+        for path in _place(job, workplace).rglob("*"):
+            written += path.stat().st_size
+    if disk.fits_ever(written + job.source_bytes):
+        return NoRoom(job.attempt, time.time(), written)
+    return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
+
+
+def _place(job: Job, workplace: Workplace) -> Path:
+    return workplace.scratch / f"{job.id}-{job.attempt}"
 
 
 def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: Path) -> Finished:
