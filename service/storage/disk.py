@@ -61,8 +61,12 @@ class Disk:
         return shutil.disk_usage(self._folder).total
 
     def fits_ever(self, more_bytes: int) -> bool:
-        """Return whether a disk with nothing else on it would have room for a job's files."""
-        return not self._reserve_bytes or more_bytes <= self.total_bytes() - self._reserve_bytes
+        """Return whether a disk with nothing else on it would have room for a job's files.
+
+        A reserve that is larger than the disk is no job's fault.
+        """
+        most = self.total_bytes() - self._reserve_bytes
+        return not self._reserve_bytes or most <= 0 or more_bytes <= most
 
     def has_room_for(self, more_bytes: int) -> bool:
         """Return whether a job may begin that needs so much."""

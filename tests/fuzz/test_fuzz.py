@@ -91,8 +91,8 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 FOUND = {
     "an arc may begin with chords of Z alone": (
-        "G28\nM83\nG1 X126 Y120\nG1 X125.518 Y120.144 E.06729\nG4 P1\nG3 X12 Z3 I1 K1\nG1 X124.983 Y119.953 E.08619\n"
-        "G1 X124.525 Y121.057 E.02594\n"
+        "G28\nM83\nG1 X126 Y120\nG1 X125.518 Y120.144 E.06729\nG4 P1\nG3 X12 Z3 I1 K1\n"
+        "G1 X124.983 Y119.953 E.08619\nG1 X124.525 Y121.057 E.02594\n"
     ),
     "an arc that only feeds needs the file's F": (
         "M83\nG1 X252.037 Y148.647 E.00484\nG3 X252.48 Y147.533 I8.433 J2.711 E.0386\n"
