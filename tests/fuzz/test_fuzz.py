@@ -158,6 +158,17 @@ NO_TIME = (
     "G1 X108.526 Y117.369 E5.0076\nG1 E1.5076 F3600\nG1 E.0076 F3600\nG1 F7200\n"
     "G1 X111.498 Y117.81 E1.40752\n"
 )
+AFTER_DUST = (
+    "G1 X137.81 Y108.441 E.31343\nG1 X138.937 Y110.131 E.06728\nG0.006 X10 Y10 R-20\n"
+    "G1 X138.937 Y110.131 E.06728\nG1\n"
+)
+"""The fourth line moves by a rounding error of E, from a place that nobody knows."""
+
+
+@pytest.mark.slow
+def test_what_was_found_on_reprapfirmware(tmp_path: Path, cache: Path) -> None:
+    data = tagged(AFTER_DUST.encode())
+    through_the_road(data, machine_of("reprapfirmware"), tmp_path, "shaper:mzv", cache)
 
 
 @pytest.mark.slow
