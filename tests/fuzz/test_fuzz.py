@@ -190,6 +190,15 @@ def test_what_was_found_once(name: str, method: str, tmp_path: Path, cache: Path
 
 @pytest.mark.shared
 @pytest.mark.slow
+def test_the_file_that_took_its_job_down(tmp_path: Path, cache: Path, shared_dir: Path) -> None:
+    """A piece of moves that round to nothing: ValueError in the encoder, once."""
+    data = tagged((shared_dir / "corpus" / "fuzz" / "crash_klipper_1.gcode").read_bytes())
+    _, put_back, _ = through_the_road(data, machine_of("klipper"), tmp_path, "fbf", cache)
+    assert put_back <= 1
+
+
+@pytest.mark.shared
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_files_down_the_road(
     kind: str, tmp_path: Path, cache: Path, shared_dir: Path
