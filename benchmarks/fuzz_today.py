@@ -1,16 +1,23 @@
-"""Some minutes of fuzzing with a seed of its own every day: damaged files, and files of a grammar.
+"""Fuzzing with a seed of its own every day: damaged excerpts, and files of a grammar.
 
-As `fuzz.py` on each kind of firmware in turn. A failure is shown with the seed; with `--seed` it
-comes again.
+As `fuzz.py` on each kind of firmware in turn, for some minutes or for a number of files. A failure
+is shown with the seed; with `--seed` it comes again. What fails: anything but a refusal, lines or
+states that differ, more CPU than 5 s and a hundredth of the time that the print takes (`M203 X1`
+makes hours of a few lines).
 
     python benchmarks/fuzz_today.py --seconds 110 [--seed 20261124] [--save DIR]
+    python benchmarks/fuzz_today.py --files 20000 --firmware klipper
+
+With `--files` they are short, so that many fit into an hour.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import itertools
 import random
+import statistics
 import sys
 import tempfile
 import time
@@ -29,62 +36,90 @@ _ROOT = Path(__file__).parents[1]
 _WARM = b"G28\nG90\nM83\nG1 X50 Y50 F6000\nG1 X90 E1\nG2 X90 Y50 I5 E1\nG1 Y90 E1\n"
 _KINDS = ("klipper", "marlin", "reprapfirmware")
 _METHODS = ("shaper:mzv", "none", "shaper:ei")
+_MOST_CPU_S, _PRINT_S_PER_CPU_S = 5.0, 100.0
+_TOLD_EVERY = 1000
 
 
 def main() -> int:
     arguments = _arguments()
-    print(f"seed {arguments.seed}")
+    kinds = arguments.firmware or list(_KINDS)
+    print(f"seed {arguments.seed}, {', '.join(kinds)}", flush=True)
     dice = random.Random(arguments.seed)
-    machines = {kind: machine_of(kind) for kind in _KINDS}
-    failures: set[str] = set()
-    slowest = (0.0, 0)
-    good = put_back = number = 0
+    machines = {kind: machine_of(kind) for kind in kinds}
+    failures: dict[str, int] = {}
+    spent_s: list[float] = []
+    long: list[float] = []
+    good = put_back = 0
     with tempfile.TemporaryDirectory() as name:
         cache = Path(name) / "cache"
-        for machine in machines.values():
+        for machine, method in itertools.product(machines.values(), _METHODS):
             with tempfile.TemporaryDirectory() as folder:  # compiles
-                walk(_WARM, machine, Path(folder), _METHODS[0], cache)
+                walk(_WARM, machine, Path(folder), method, cache)
         until = time.monotonic() + arguments.seconds
-        for number, data in enumerate(_files(dice)):
-            if time.monotonic() > until:
+        for number, data in enumerate(_files(dice, short=arguments.files is not None)):
+            if number == arguments.files or time.monotonic() > until:
                 break
-            turn, which = divmod(number, len(_KINDS))
-            kind, method = _KINDS[which], _METHODS[turn % len(_METHODS)]
+            turn, which = divmod(number, len(kinds))
+            kind, method = kinds[which], _METHODS[turn % len(_METHODS)]
             began = time.process_time()
             what, outcome = attempt(data, machines[kind], method, cache)
-            slowest = max(slowest, (time.process_time() - began, number))
+            spent_s.append(time.process_time() - began)
             if outcome is not None:
                 good += outcome.written is not None
                 put_back += outcome.put_back
-            elif what not in failures:
-                failures.add(what)
-                print(f"\nFAILURE in file {number}, {kind}, {method}: {what}", flush=True)
-                if arguments.save:
-                    arguments.save.mkdir(parents=True, exist_ok=True)
-                    path = arguments.save / f"{kind}-{arguments.seed}-{number}.gcode"
-                    path.write_bytes(data)
+                if spent_s[-1] > _MOST_CPU_S:
+                    long.append(outcome.print_s)
+                if spent_s[-1] > _MOST_CPU_S + outcome.print_s / _PRINT_S_PER_CPU_S:
+                    what = f"SLOW: more than {_MOST_CPU_S:g} s of CPU"
+            if what is not None:
+                failures[what] = failures.get(what, 0) + 1
+                if failures[what] == 1:
+                    print(f"\nFAILURE in file {number}, {kind}, {method}: {what}", flush=True)
+                    _save(arguments.save, f"{kind}-{arguments.seed}-{number}.gcode", data)
+            if len(spent_s) % _TOLD_EVERY == 0:
+                print(f"{len(spent_s)} files, {sum(spent_s):.0f} s CPU", flush=True)
     print(
-        f"{number} files, {good} written, {put_back} pieces put back, slowest {slowest[0]:.1f} s "
-        f"CPU (file {slowest[1]}), {len(failures)} kinds of failures"
+        f"{len(spent_s)} files of {', '.join(kinds)}: {good} written, {put_back} pieces put back, "
+        f"{sum(spent_s):.0f} s CPU (mean {statistics.fmean(spent_s):.3f}, most "
+        f"{max(spent_s):.2f} s in file {spent_s.index(max(spent_s))}), "
+        f"{len(failures)} kinds of failures in {sum(failures.values())} files"
     )
+    if long:
+        print(
+            f"{len(long)} files took more than {_MOST_CPU_S:g} s of CPU; the shortest of these "
+            f"prints lasts {min(long):.0f} s, the longest {max(long):.0f} s"
+        )
     return 1 if failures else 0
 
 
-def _files(dice: random.Random) -> Iterator[bytes]:
+def _files(dice: random.Random, *, short: bool) -> Iterator[bytes]:
     texts = [path.read_bytes() for path in sorted((_ROOT / "examples").glob("*.gcode"))]
-    damaged = excerpts(texts, 1 << 40, dice)
+    damaged = excerpts(texts, 1 << 40, dice, size=1500 if short else 20_000)
+    lengths = (8, 16, 30) if short else (20, 60, 200)
     for data in damaged:
         yield data
-        yield written(dice, dice.choice((20, 60, 200)))
+        for _ in range(3 if short else 1):
+            yield written(dice, dice.choice(lengths))
+
+
+def _save(folder: Path | None, name: str, data: bytes) -> None:
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
 
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     today = int(f"{datetime.datetime.now(datetime.UTC):%Y%m%d}")
-    parser.add_argument("--seconds", type=float, default=110.0)
+    parser.add_argument("--seconds", type=float, default=None)
+    parser.add_argument("--files", type=int, help="how many; they are short then")
+    parser.add_argument("--firmware", action="append", choices=_KINDS, help="by default all")
     parser.add_argument("--seed", type=int, default=today, help="by default the date")
     parser.add_argument("--save", type=Path)
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    if arguments.seconds is None:
+        arguments.seconds = 110.0 if arguments.files is None else float("inf")
+    return arguments
 
 
 if __name__ == "__main__":

@@ -153,6 +153,10 @@ class Dialect:
     start_speed_mm_s: float = 25.0
     """Speed of a move before the first F."""
 
+    _tables: dict[str, NDArray[np.int8]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
     def word(self, name: str) -> Word:
         """Return what a command is."""
         found = self.words.get(name)
@@ -161,13 +165,20 @@ class Dialect:
         return self.otherwise(name) if found is None else found
 
     def table(self, letter: str) -> NDArray[np.int8]:
-        """Return the class of letter + 0 to 1023: an `EventKind`, an `Action` or -1 (Python)."""
+        """Return the class of letter + 0 to 1023: an `EventKind`, an `Action` or -1 (Python).
+
+        Made once; only to be read.
+        """
+        known = self._tables.get(letter)
+        if known is not None:
+            return known
         table = np.full(_TABLE_SIZE, -1, np.int8)
         for number in range(_TABLE_SIZE):
             name = f"{letter}{number}"
             word = self.word(name)
             if isinstance(word, EventKind | Action) and name not in self.raw_text:
                 table[number] = word
+        self._tables[letter] = table
         return table
 
     def set_rules(self, i: NDArray[np.int64]) -> None:

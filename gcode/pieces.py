@@ -246,8 +246,10 @@ class Splitter:
         if len(moves):
             # All pieces of an arc share one line and one fate.
             starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
-            spread = np.maximum.reduceat(raw, starts)
-            raw = np.repeat(spread, np.diff(np.append(starts, len(raw)))) & xy
+            ends = np.append(starts[1:], len(raw))
+            # A piece cannot begin or end within a line, nor where X and Y rest.
+            spread = np.maximum.reduceat(raw, starts) | ~xy[starts] | ~xy[ends - 1]
+            raw = np.repeat(spread, ends - starts) & xy
         return np.asarray(raw | ((moves.known & OF_STATE) != 0))
 
     def _cut(self, *, final: bool) -> Iterator[Piece | Passage]:

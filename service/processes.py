@@ -50,7 +50,7 @@ def limit_memory(max_bytes: int) -> None:
     Parameters
     ----------
     max_bytes : int
-        Beside what the process holds already.
+        Beside what the process holds now; a limit set before no longer counts.
     """
     if sys.platform != "linux":
         return
@@ -62,7 +62,7 @@ def limit_memory(max_bytes: int) -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard != resource.RLIM_INFINITY:
         most = min(most, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    resource.setrlimit(resource.RLIMIT_DATA, (most, hard))
 
 
 def quiet_tracker() -> None:

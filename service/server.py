@@ -14,7 +14,8 @@ import uvicorn
 from service.api import create_app
 from service.database.engine import DatabaseAway, database_url, open_database
 from service.exclusive import exclusive
-from service.jobs.worker import Runner, run_task
+from service.jobs.task import Runner
+from service.jobs.worker import run_task
 from service.logs import configure_logging
 from service.machines.settings import EARLIER_DATA_DIR
 from service.private import private_folder

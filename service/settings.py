@@ -71,9 +71,10 @@ class Settings(MachineSettings, BaseSettings):
     max_job_s, max_job_bytes : float, int
         A job that takes longer, or whose process grows larger, fails.
     computing_processes : int
-        Processes that compute for requests: designs, identifications, controllers.
+        Further processes, for jobs that are over within minutes: designs, identifications,
+        controllers. With a scheduler: how many of its places are kept for these.
     max_computing_s, max_computing_bytes : float, int
-        What one of these may take, beside what is loaded at its start.
+        Such a job that takes longer, or whose process grows larger, fails.
     max_upload_bytes : int
         A larger upload is refused with status 413.
     disk_reserve_bytes : int
@@ -116,7 +117,7 @@ class Settings(MachineSettings, BaseSettings):
     cancel_grace_s: Annotated[float, Field(gt=0)] = 10.0
     max_job_s: Annotated[float, Field(gt=0)] = 4 * 3600.0
     max_job_bytes: Annotated[int, Field(gt=0)] = 4 << 30
-    computing_processes: Annotated[int, Field(ge=1, le=64)] = 2
+    computing_processes: Annotated[int, Field(ge=1, le=64)] = 1
     max_computing_s: Annotated[float, Field(gt=0)] = 300.0
     max_computing_bytes: Annotated[int, Field(ge=64 << 20)] = 1 << 30
     max_upload_bytes: Annotated[int, Field(gt=0)] = 1 << 30

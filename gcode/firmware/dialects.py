@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+
 from gcode.dialect import Dialect
 from models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
 
 __all__ = ["dialect_of"]
 
 
+@functools.lru_cache(maxsize=16)
 def dialect_of(firmware: FirmwareFacts) -> Dialect:
-    """Return how the firmware of a machine reads G-code."""
+    """Return how the firmware of a machine reads G-code.
+
+    Its tables take longer to make than a short file to read, so the last ones are kept.
+    """
     if isinstance(firmware, Klipper):
         from gcode.firmware.klipper.dialect import klipper
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 
@@ -28,12 +29,12 @@ from service.api import (
     problems,
     trajectories,
 )
+from service.api.computing import NotYet, not_yet
 from service.api.guard import Guard, hosts_of
 from service.api.hub import Hub
 from service.api.intake import Intake
 from service.api.limits import Limits
 from service.api.proxies import Proxies
-from service.computing.room import Room, RoomLimits
 from service.database.documents import open_documents
 from service.database.engine import open_database
 from service.deliveries.checking import Checker
@@ -41,8 +42,9 @@ from service.deliveries.printers import load_printers
 from service.deliveries.sender import Sender
 from service.identification.archive import Archive
 from service.jobs.store import JobStore
+from service.jobs.task import Runner
 from service.jobs.work import Work
-from service.jobs.worker import Runner, run_task
+from service.jobs.worker import run_task
 from service.machines.resolve import Resolver
 from service.machines.store import MachineStore
 from service.security.audit import AuditLog
@@ -102,10 +104,12 @@ def create_app(
     state.limits = Limits(settings.requests_per_minute)
     state.readiness = health.Readiness()
     state.printers = load_printers(settings.printers)
-    state.designs = designs.Designs()
-    state.loops = None
+    state.waiting = Counter()  # of jobs, for how many requests
     state.metrics = metrics.Metrics(
-        lambda: state.store, lambda: state.work.workers, lambda: state.hub.watchers
+        lambda: state.store,
+        lambda: state.work.workers,
+        lambda: state.hub.watchers,
+        lambda: state.disk.free_bytes() if settings.disk_reserve_bytes else None,
     )
     app.add_middleware(
         Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
@@ -113,6 +117,7 @@ def create_app(
     app.add_middleware(metrics.Measured, metrics=state.metrics)
     app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
+    app.add_exception_handler(NotYet, not_yet)
     app.include_router(health.router)
     app.include_router(pages.router)
     for part in (
@@ -157,22 +162,6 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
         max_age_days=settings.measurement_max_age_days,
     )
     state.identifications = Archive(open_documents(settings, engine, "identifications"))
-    state.room = Room(
-        settings.computing_processes,
-        RoomLimits(settings.max_computing_s, settings.max_computing_bytes),
-    )
-    # They take as long as a job does: others need not wait for that.
-    state.trajectory_room = Room(
-        1,
-        RoomLimits(
-            settings.max_job_s,
-            settings.max_job_bytes,
-            "STILLPATH_MAX_JOB_S",
-            "STILLPATH_MAX_JOB_BYTES",
-        ),
-    )
-    for room in (state.room, state.trajectory_room):
-        stack.callback(room.close)
     state.layers = assets.Layers(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(

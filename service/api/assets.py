@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import OrderedDict
+from pathlib import PurePath
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Request
@@ -16,8 +17,8 @@ from service.api.access import Reader
 from service.api.finding import JobId, find_done
 from service.api.problems import Problem, responses
 from service.api.schemas import LayerIndex
-from service.api.stored import HEADERS, RANGES, stored
-from service.jobs.state import Job
+from service.api.stored import HEADERS, MEDIA, RANGES, stored
+from service.jobs.state import Job, JobKind
 from service.storage.base import Storage
 
 __all__ = ["Layers", "router"]
@@ -87,16 +88,21 @@ def _file(kinds: tuple[str, ...], description: str, *more: int) -> dict[int | st
 )
 @router.head("/result", include_in_schema=False)
 async def read_result(request: Request, job_id: JobId, caller: Reader) -> Response:
-    """Stream the written file: of the kind that was handed in. Obeys `Range`."""
-    job = await find_done(request, job_id, caller)
+    """Stream the written file: of the kind that was handed in. Obeys `Range`.
+
+    Of jobs that compute something else, the answer.
+    """
+    job = await find_done(request, job_id, caller, of_any_kind=True)
     storage: Storage = request.app.state.storage
-    key = f"{job.output}/result/{job.result_name}"
-    kind = await run_in_threadpool(_kind, storage, key)
+    if job.kind is JobKind.COMPENSATION:
+        media_type = (await run_in_threadpool(_kind, storage, job.result)).value
+    else:
+        media_type = MEDIA[PurePath(job.result_name).suffix]
     return await stored(
         request,
         storage,
-        key,
-        media_type=kind.value,
+        job.result,
+        media_type=media_type,
         etag=job.result_sha256,
         filename=job.result_name,
     )

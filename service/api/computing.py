@@ -1,77 +1,231 @@
-"""From a request to the room where things are computed, and back: limits as ordinary problems."""
+"""From a request to a job that computes its answer, and back, while the caller waits for it.
+
+The same question, asked again, is answered by the same job: so who waited in vain asks again.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
+import hashlib
+import json
+import re
+import tempfile
+import time
+import uuid
+from collections.abc import Coroutine, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fastapi import Request
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse, Response
 
+from models.machine import Machine
+from service.api.finding import no_such_job
 from service.api.problems import Problem
-from service.computing.room import Broke, LimitReached, Refused, Room, TooMany, Waited
+from service.api.schemas import JobView
+from service.jobs.problems import problem
+from service.jobs.state import Cancelled, Job, JobKind, JobState
+from service.machines.resolve import PinnedMachine
 from service.security.callers import Caller
+from service.version import __version__
 
-__all__ = ["computed", "while_there"]
+__all__ = ["WAITING", "NotYet", "Question", "answer_of", "answered", "not_yet"]
 
+_LONGEST_WAIT_S = 50.0
+"""What proxies wait for an answer is a minute, as a rule."""
+_LARGEST_ANSWER_BYTES = 64 << 20
+_WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,6})(?:$|[,;\s])")
+_UNKNOWN = problem(500, "The job failed", "Its reason is unknown.")
 _T = TypeVar("_T")
 
+WAITING: dict[int | str, dict[str, Any]] = {
+    202: {
+        "model": JobView,
+        "description": "It takes longer than the caller waits (`Prefer: wait=SECONDS`, at most "
+        "50). The job goes on; the same request, once it is done, is answered at once.",
+    }
+}
+"""OpenAPI entry of routes whose answer is a job's."""
 
-async def computed(
-    request: Request,
-    room: Room,
-    caller: Caller,
-    task: str,
-    given: dict[str, Any],
-    *,
-    refused: str,
-    remedy: str,
-) -> Any:
-    """Return what a task of `service.computing.tasks` returns, while the caller waits for it.
+
+class NotYet(Exception):
+    """The answer takes longer than the caller waits; `job` goes on."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job.id)
+        self.job = job
+
+
+async def not_yet(_: Request, error: Exception) -> Response:
+    """Answer with the job."""
+    assert isinstance(error, NotYet)
+    view = JobView.of(error.job)
+    headers = {"Location": view.links.self, "Retry-After": "1"}
+    return JSONResponse(view.model_dump(mode="json"), 202, headers)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What is to be computed.
+
+    Attributes
+    ----------
+    machine : str
+        Its name.
+    document : Machine, optional
+        The machine, where the job needs it.
+    revision : str
+        What distinguishes machines of the same name.
+    options : mapping
+        What JSON can hold.
+    result_name : str
+        File name of the answer.
+    files : tuple of (Path, str)
+        Input and its SHA-256; moved into the storage.
+    """
+
+    kind: JobKind
+    machine: str
+    options: Mapping[str, Any]
+    result_name: str
+    document: Machine | None = None
+    revision: str = ""
+    source_name: str = ""
+    source_bytes: int = 0
+    files: tuple[tuple[Path, str], ...] = field(default=())
+
+    def job(self, owner: str) -> Job:
+        """Return the job that answers it."""
+        hashes = [sha256 for _, sha256 in self.files]
+        asked = [self.kind, self.machine, self.revision, self.options, hashes, __version__]
+        digest = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+        return Job(
+            id=uuid.uuid4().hex,
+            kind=self.kind,
+            owner=owner,
+            machine=self.machine,
+            machine_revision=self.revision,
+            options=dict(self.options),
+            dedupe_key=digest,
+            source_name=self.source_name,
+            source_bytes=self.source_bytes,
+            source_sha256=hashes[0] if hashes else "",
+            result_name=self.result_name,
+            created_at=time.time(),
+        )
+
+
+async def answered(request: Request, caller: Caller, question: Question) -> Job:
+    """Return the job of a question when it is done.
+
+    A caller who hangs up before ends it, unless it was there before.
 
     Parameters
     ----------
     request : Request
-        Its body must have been read; when its sender hangs up, the computation ends.
-    room : Room
+        Its body must have been read.
     caller : Caller
         Whose turn it is.
-    task : str
-        Name of the function.
-    given : dict
-    refused : str
-        Title of the problem when what was asked cannot be computed.
-    remedy : str
-        What to do when a limit is reached.
+    question : Question
 
     Raises
     ------
+    NotYet
     Problem
-        422 for what is refused and for a limit that is reached, 429 if too many wait, 500.
+        That of the job, if it failed; 429 or 507 if it was not taken.
     """
-    name = f"service.computing.tasks:{task}"
+    state = request.app.state
+    wanted = question.job(caller.owner)
+    job: Job = await run_in_threadpool(_asked, request, question, wanted)
+    if job.id == wanted.id:
+        state.work.notify()
+    if not job.state.is_final:
+        await _wait(request, job, ends_with_caller=job.id == wanted.id)
+        found = await run_in_threadpool(state.store.get, job.id)
+        if found is None:
+            raise no_such_job(job.id)
+        job = found
+    match job.state:
+        case JobState.DONE:
+            return job
+        case JobState.FAILED:
+            raise Problem.of(job.problem or _UNKNOWN)
+        case JobState.CANCELLED:
+            raise Problem(409, "It was cancelled", "The job was cancelled; ask again.")
+        case _:
+            raise NotYet(job)
+
+
+async def answer_of(request: Request, job: Job) -> Any:
+    """Return the answer of a job, which is JSON."""
+    storage = request.app.state.storage
+    size = job.result_bytes or 0
+    if size > _LARGEST_ANSWER_BYTES:
+        raise Problem(
+            422,
+            "The answer is too large",
+            f"It has {size} bytes; fetch /v1/jobs/{job.id}/result.",
+        )
     try:
-        return await while_there(request, room.compute(caller.owner, name, given, remedy=remedy))
-    except Refused as error:
-        extra = {} if error.reason is None else {"reason": error.reason}
-        raise Problem(422, refused, str(error), **extra) from None
-    except LimitReached as error:
-        raise Problem(422, "A limit is reached", str(error)) from None
-    except (TooMany, Waited) as error:
-        raise Problem(
-            429,
-            "Too many wait",
-            f"{error}; ask again later, one after the other.",
-            headers={"Retry-After": "30"},
-        ) from None
-    except Broke:
-        raise Problem(
-            500, "Internal error", "The computation broke; the service's log holds the details."
-        ) from None
+        return await run_in_threadpool(
+            lambda: json.loads(b"".join(storage.read(job.result, 0, size)))
+        )
+    except FileNotFoundError:
+        raise no_such_job(job.id) from None
 
 
-async def while_there(request: Request, work: Coroutine[Any, Any, _T]) -> _T:
+def _asked(request: Request, question: Question, job: Job) -> Job:
+    intake = request.app.state.intake
+    with tempfile.TemporaryDirectory(dir=intake.folder, prefix="question-") as folder:
+        files = dict(zip(job.sources, (path for path, _ in question.files), strict=False))
+        if question.document is not None:
+            machine = Path(folder, "machine.json")
+            PinnedMachine(machine=question.document).write(machine)
+            files[job.machine_file] = machine
+        found: Job = intake.ask(job, files)
+        return found
+
+
+async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
+    """Wait until the job is over, or for as long as the caller does."""
+    state = request.app.state
+    state.waiting[job.id] += 1
+    try:
+        await _while_there(request, _over(request, job.id))
+    except ClientDisconnect:
+        if ends_with_caller and state.waiting[job.id] == 1:
+            await run_in_threadpool(state.store.apply, job.id, Cancelled(time.time()))
+            state.work.notify()
+        raise
+    finally:
+        state.waiting[job.id] -= 1
+        if not state.waiting[job.id]:
+            del state.waiting[job.id]
+
+
+async def _over(request: Request, job_id: str) -> None:
+    try:
+        async with asyncio.timeout(_patience_s(request)):
+            async for snapshot in request.app.state.hub.watch(job_id):
+                if snapshot.is_final:
+                    return
+    except TimeoutError:
+        return
+
+
+def _patience_s(request: Request) -> float:
+    """Return how long the caller waits (RFC 7240)."""
+    preferred = ",".join(request.headers.getlist("prefer")).lower()
+    wait = _WAIT.search(preferred)
+    if wait is not None:
+        return min(float(wait[1]), _LONGEST_WAIT_S)
+    return 0.0 if "respond-async" in preferred else _LONGEST_WAIT_S
+
+
+async def _while_there(request: Request, work: Coroutine[Any, Any, _T]) -> _T:
     """Return what `work` returns; cancel it when the caller hangs up.
 
     Raises

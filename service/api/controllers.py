@@ -9,37 +9,37 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
 from models.loops import builtin_loops
 from service.api.access import Reader
-from service.api.computing import computed
+from service.api.computing import WAITING, Question, answer_of, answered
 from service.api.problems import Problem, responses
 from service.controllers.figures import ControllerReport, LoopFigures
 from service.controllers.options import ControllerOptions
+from service.jobs.state import JobKind
 
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["controllers"])
 
 
-@router.get("/loops", response_model=list[LoopFigures], summary="List the closed-loop machines")
+@router.get(
+    "/loops",
+    response_model=list[LoopFigures],
+    responses=WAITING,
+    summary="List the closed-loop machines",
+)
 async def list_loops(request: Request, caller: Reader) -> Any:
     """Return the built-in closed-loop machines and the methods that fit each."""
-    state = request.app.state
-    if state.loops is None:
-        state.loops = await computed(
-            request,
-            state.room,
-            caller,
-            "list_loops",
-            {},
-            refused="No machines",
-            remedy="Have the limit raised.",
-        )
-    return state.loops
+    question = Question(kind=JobKind.LOOPS, machine="", options={}, result_name="loops.json")
+    return await answer_of(request, await answered(request, caller, question))
 
 
 @router.post(
     "/machines/{name}/controllers",
     response_model=ControllerReport,
-    responses={200: {"content": {"text/html": {}, "text/plain": {}}}, **responses(404, 422)},
+    responses={
+        200: {"content": {"text/html": {}, "text/plain": {}}},
+        **WAITING,
+        **responses(404, 422),
+    },
     summary="Design an add-on controller",
 )
 async def design_controller(
@@ -69,15 +69,13 @@ async def design_controller(
             f"No closed-loop machine is called {name!r}. GET /v1/loops lists them; your own goes "
             "into the body as `loop`.",
         )
-    made = await computed(
-        request,
-        request.app.state.room,
-        caller,
-        "design_controller",
-        {"name": name, "options": options.model_dump(mode="json", exclude_unset=True)},
-        refused="No such controller",
-        remedy="Give the machine fewer states or plants, or have the limit raised.",
+    question = Question(
+        kind=JobKind.CONTROLLER,
+        machine=name,
+        options=options.model_dump(mode="json", exclude_unset=True),
+        result_name="controller.json",
     )
+    made = await answer_of(request, await answered(request, caller, question))
     vary = {"Vary": "Accept"}
     wanted = format or ("html" if _first(accept) == "text/html" else "json")
     if wanted == "html":

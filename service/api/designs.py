@@ -1,59 +1,24 @@
-"""Routes of designs: what `stillpath design` shows, computed once and kept."""
+"""Routes of designs: what `stillpath design` shows, computed by a job and kept with it."""
 
 from __future__ import annotations
 
-import asyncio
-from collections import OrderedDict
-from collections.abc import Awaitable, Callable
 from typing import Annotated, Literal
-from weakref import WeakValueDictionary
 
 from fastapi import APIRouter, Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, Response
 
-from models.machine import Machine
 from service.api.access import Reader
-from service.api.computing import computed
+from service.api.computing import WAITING, Question, answer_of, answered
 from service.api.machines import Name, look_up
 from service.api.problems import responses
 from service.design.figures import DesignReport
+from service.jobs.state import JobKind
 from service.pipeline.options import BasisName, RobustMode
 
-__all__ = ["Designs", "router"]
+__all__ = ["router"]
 
 router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
-
-_Settings = tuple[Literal["x", "y"], BasisName, RobustMode]
-_KEPT = 64
-
-
-class Designs:
-    """The last designs that were made; whoever asks for one that is being made waits for it."""
-
-    def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[str, _Settings], DesignReport] = OrderedDict()
-        self._making: WeakValueDictionary[tuple[str, _Settings], asyncio.Lock] = (
-            WeakValueDictionary()
-        )
-
-    async def get(
-        self,
-        machine: Machine,
-        settings: _Settings,
-        make: Callable[[], Awaitable[DesignReport]],
-    ) -> DesignReport:
-        """Return the design of a machine's axis, made if nobody asked for it before."""
-        key = (machine.revision, settings)
-        if key not in self._kept:
-            making = self._making.setdefault(key, asyncio.Lock())
-            async with making:
-                if key not in self._kept:
-                    self._kept[key] = await make()
-                    if len(self._kept) > _KEPT:
-                        self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
 
 
 async def _asked(
@@ -66,25 +31,19 @@ async def _asked(
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)
 
-    async def make() -> DesignReport:
-        found = await computed(
-            request,
-            request.app.state.room,
-            caller,
-            "design",
-            {
-                "machine": machine.model_dump(mode="json"),
-                "axis": axis,
-                "basis": basis,
-                "robust": robust,
-            },
-            refused="No such design",
-            remedy="Give the machine fewer members or places, or have the limit raised.",
-        )
-        return DesignReport.model_validate(found)
-
-    designs: Designs = request.app.state.designs
-    return await designs.get(machine, (axis, basis, robust), make)
+    job = await answered(
+        request,
+        caller,
+        Question(
+            kind=JobKind.DESIGN,
+            machine=name,
+            document=machine,
+            revision=machine.revision,
+            options={"axis": axis, "basis": basis, "robust": robust},
+            result_name=f"design-{axis}.json",
+        ),
+    )
+    return DesignReport.model_validate(await answer_of(request, job))
 
 
 Asked = Annotated[DesignReport, Depends(_asked)]
@@ -93,7 +52,7 @@ Asked = Annotated[DesignReport, Depends(_asked)]
 @router.get(
     "/design",
     response_model=DesignReport,
-    responses={200: {"content": {"text/html": {}}}, **responses(404, 422)},
+    responses={200: {"content": {"text/html": {}}}, **WAITING, **responses(404, 422)},
     summary="Look at the design for an axis",
 )
 async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") -> Response:
@@ -112,7 +71,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
 @router.get(
     "/design.html",
     response_class=HTMLResponse,
-    responses=responses(404, 422),
+    responses={**WAITING, **responses(404, 422)},
     summary="Look at the design for an axis, as a page",
 )
 async def read_design_page(found: Asked) -> HTMLResponse:

@@ -9,7 +9,7 @@ from fastapi import Path, Request
 from starlette.concurrency import run_in_threadpool
 
 from service.api.problems import Problem
-from service.jobs.state import Job, JobState
+from service.jobs.state import Job, JobKind, JobState
 from service.jobs.store import JobStore
 from service.security.callers import Caller
 
@@ -37,9 +37,18 @@ async def find(request: Request, job_id: str, caller: Caller) -> Job:
     return job
 
 
-async def find_done(request: Request, job_id: str, caller: Caller) -> Job:
-    """Return a job that has a result; raise `Problem` 409 if it has none (yet)."""
+async def find_done(
+    request: Request, job_id: str, caller: Caller, *, of_any_kind: bool = False
+) -> Job:
+    """Return a job that has a result; raise `Problem` 409 if it has none (yet).
+
+    By default a compensation, with a report.
+    """
     job = await find(request, job_id, caller)
+    if not of_any_kind and job.kind is not JobKind.COMPENSATION:
+        raise Problem(
+            404, "No such part", f"Job {job_id} is of the kind {job.kind}; it only has a result."
+        )
     match job.state:
         case JobState.DONE:
             return job

@@ -15,14 +15,15 @@ from models.identification.readers.settings import ReadSettings
 from models.machine import Machine
 from models.store import explain
 from service.api.access import Reader, Uploader
-from service.api.computing import computed
+from service.api.computing import WAITING, Question, answer_of, answered
 from service.api.forms import is_form
 from service.api.machine_views import RevisionView
 from service.api.machines import Author, Message, Name, as_problems, look_up
 from service.api.problems import Problem, responses
-from service.api.uploads import receive_files, safe_name
+from service.api.uploads import Received, receive_files, safe_name
 from service.identification.archive import Archive
 from service.identification.figures import IdentificationReport
+from service.jobs.state import JobKind
 from service.machines.resolve import Resolver
 from service.machines.revision import Revision
 from service.security.audit import record
@@ -103,6 +104,7 @@ def _settings(
     response_model=IdentificationView,
     responses={
         200: {"model": IdentificationView},
+        **WAITING,
         **responses(403, 404, 408, 409, 412, 413, 422, 507),
     },
     openapi_extra=_BODY,
@@ -136,13 +138,12 @@ async def post_measurements(
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
     given = {
-        "start": start.model_dump(mode="json"),
         "settings": settings.model_dump(mode="json", exclude_unset=True),
         "name": name,
         "title": title,
         "order": max_order,
     }
-    machine, report = await _identified(request, caller, given)
+    machine, report = await _identified(request, caller, start, given)
     if trial:
         response.status_code = 200
         return IdentificationView(revision=None, report=report)
@@ -208,25 +209,27 @@ def _kept(request: Request, name: str) -> IdentificationReport:
 
 
 async def _identified(
-    request: Request, caller: Caller, given: dict[str, Any]
+    request: Request, caller: Caller, start: Machine, given: dict[str, Any]
 ) -> tuple[Machine, IdentificationReport]:
-    """Take the files in, on the disk, and have the machine identified from them."""
+    """Take the files in, on the disk, and have the machine `start` identified from them."""
     state = request.app.state
     with tempfile.TemporaryDirectory(dir=state.intake.folder, prefix="measurements-") as folder:
-        files = []
-        for label, path in await _received(request, Path(folder), state.disk):
-            before, _, condition = label.partition("@")
-            files.append((str(path), safe_name(before), condition))
-        found = await computed(
-            request,
-            state.room,
-            caller,
-            "identify",
-            given | {"files": files},
-            refused="The machine cannot be used",
-            remedy="Send the test as the firmware wrote it, fewer files at once, or have the limit "
-            "raised.",
+        received = await _received(request, Path(folder), state.disk)
+        named = [file.label.partition("@") for file in received]
+        files = [[safe_name(before), condition] for before, _, condition in named]
+        question = Question(
+            kind=JobKind.IDENTIFICATION,
+            machine=given["name"],
+            document=start,
+            revision=start.revision,
+            options=given | {"files": files},
+            result_name="identification.json",
+            source_name=files[0][0],
+            source_bytes=sum(file.size_bytes for file in received),
+            files=tuple((file.path, file.sha256) for file in received),
         )
+        job = await answered(request, caller, question)
+    found = await answer_of(request, job)
     # In a thread: a report has some ten thousand numbers.
     return await run_in_threadpool(
         lambda: (
@@ -236,8 +239,8 @@ async def _identified(
     )
 
 
-async def _received(request: Request, folder: Path, disk: Disk) -> list[tuple[str, Path]]:
-    """Return names and places of the files of a form."""
+async def _received(request: Request, folder: Path, disk: Disk) -> list[Received]:
+    """Return the files of a form."""
     if not is_form(request):
         raise Problem(
             422, "No form", "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv)."

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Request
@@ -241,6 +242,47 @@ class Intake:
             f"{prefix}machine.json": incoming.with_suffix(".machine"),
             f"{prefix}source/{job.source_name}": incoming,
         }
+        added = self._add(job, files, idempotency=idempotency, shared=shared, audit_row=audit_row)
+        if added.id == job_id:
+            tell(audit_row)
+        return self._taken(added, added.id == job_id, upload)
+
+    def ask(self, job: Job, files: Mapping[str, Path]) -> Job:
+        """Put a job that is no compensation in the queue, unless the owner has the same one.
+
+        Parameters
+        ----------
+        job : Job
+        files : mapping
+            Of its storage's keys to local files, which are moved there.
+
+        Returns
+        -------
+        Job
+            `job`, or the same one: done, or under way.
+
+        Raises
+        ------
+        Problem
+            429 or 507.
+        NoRoom
+        """
+        same = self._store.find_same(job.owner, job.dedupe_key)
+        if same is not None:
+            return same
+        self._disk.check()
+        return self._add(job, files, shared=True)
+
+    def _add(
+        self,
+        job: Job,
+        files: Mapping[str, Path],
+        *,
+        shared: bool,
+        idempotency: tuple[str, str] | None = None,
+        audit_row: Mapping[str, Any] | None = None,
+    ) -> Job:
+        """Store files, then make their job known; return it, or the one that stands for it."""
         added: Job | None = None
         try:
             self._storage.put_all(files)
@@ -256,13 +298,11 @@ class Intake:
         except QuotaExceeded as error:
             raise _too_many(str(error)) from None
         except IdempotencyConflict:
-            raise _conflict(idempotency_key) from None
+            raise _conflict(idempotency and idempotency[0]) from None
         finally:
-            if added is None or added.id != job_id:
-                self._undo(job_id)
-        if added.id == job_id:
-            tell(audit_row)
-        return self._taken(added, added.id == job_id, upload)
+            if added is None or added.id != job.id:
+                self._undo(job.id)
+        return added
 
     def _taken(self, job: Job, is_new: bool, upload: Upload) -> Taken:
         return Taken(job, is_new, upload, self._store.queue_position(job))

@@ -19,7 +19,7 @@ from service.api.problems import Problem, responses
 from service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
 from service.database.engine import DatabaseAway
 from service.deliveries.sender import Sender
-from service.jobs.state import Cancelled, Job, JobState
+from service.jobs.state import Cancelled, Job, JobKind, JobState
 from service.jobs.store import BadCursor, JobStore
 from service.security.audit import record
 from service.security.callers import Caller, Scope
@@ -74,6 +74,10 @@ async def list_jobs(
     state: Annotated[
         list[JobState] | None, Query(description="Only jobs in these states.", max_length=8)
     ] = None,
+    kind: Annotated[
+        list[JobKind] | None,
+        Query(description="Only jobs of these kinds; by default compensations.", max_length=8),
+    ] = None,
     batch: Annotated[str | None, Query(max_length=64, description="Only jobs of a batch.")] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
     cursor: Annotated[
@@ -88,6 +92,7 @@ async def list_jobs(
         page = await run_in_threadpool(
             store.page,
             caller.sees,
+            kinds=kind or (JobKind.COMPENSATION,),
             states=state or (),
             batch=batch,
             limit=limit,

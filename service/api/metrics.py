@@ -59,6 +59,8 @@ class Metrics(Collector):
         Returns the `JobStore`, which is there once the application runs.
     workers, watchers : callable
         Return how many there are; None: it is not known.
+    free_bytes : callable
+        Returns what is free on the disk; None: it is not looked at.
     """
 
     def __init__(
@@ -66,7 +68,9 @@ class Metrics(Collector):
         store: Callable[[], JobStore],
         workers: Callable[[], int | None],
         watchers: Callable[[], int],
+        free_bytes: Callable[[], int | None] = lambda: None,
     ) -> None:
+        self._free_bytes = free_bytes
         self._store, self._workers, self._watchers = store, workers, watchers
         self._lock = threading.Lock()
         self._read_until = time.time() - _SETTLED_S
@@ -115,6 +119,7 @@ class Metrics(Collector):
         try:
             counts = self._store().counts()
             oldest = self._store().oldest_queued_at()
+            for_room, most_bytes = self._store().waiting_for_room()
             ended = self._store().ended_between(self._read_until, now - _SETTLED_S)
         except StoreError:
             yield GaugeMetricFamily("stillpath_database_up", "Whether it answers", value=0)
@@ -128,6 +133,19 @@ class Metrics(Collector):
         for state, count in counts.items():
             jobs.add_metric((state.value,), count)
         yield jobs
+        yield GaugeMetricFamily(
+            "stillpath_jobs_waiting_for_room", "Jobs that the disk has no room for", value=for_room
+        )
+        yield GaugeMetricFamily(
+            "stillpath_room_wanted_bytes",
+            "Room on the disk that the largest of these needs at least",
+            value=most_bytes,
+        )
+        free_bytes = self._free_bytes()
+        if free_bytes is not None:
+            yield GaugeMetricFamily(
+                "stillpath_disk_free_bytes", "Free on the disk of the service", value=free_bytes
+            )
         yield GaugeMetricFamily(
             "stillpath_queue_oldest_seconds",
             "How long the oldest queued job has been waiting",

@@ -53,6 +53,12 @@ class Problem(Exception):  # named as in RFC 9457
         self.document = problem(status, title, detail, **extra)
         self.headers = dict(headers or {})
 
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Problem:
+        """Return the problem of a document, as jobs keep them."""
+        known = {name: value for name, value in document.items() if name != "type"}
+        return cls(known.pop("status"), known.pop("title"), known.pop("detail"), **known)
+
 
 def problem_response(
     document: Mapping[str, Any], headers: Mapping[str, str] | None = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from service.deliveries.targets import read_url
-from service.jobs.state import Job, JobState
+from service.jobs.state import Job, JobKind, JobState
 from service.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
@@ -26,8 +26,10 @@ __all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerInd
 
 _EXAMPLE: dict[str, Any] = {
     "id": "5f2c8e0e6c0d4a3f9d1b7a52c4e86f10",
+    "kind": "compensation",
     "state": "running",
     "stage": "compensating",
+    "room_bytes": None,
     "progress": 0.42,
     "eta_s": 3.1,
     "queue_position": None,
@@ -213,8 +215,16 @@ class JobView(BaseModel):
     model_config = ConfigDict(json_schema_extra={"examples": [_EXAMPLE]})
 
     id: str
+    kind: JobKind = Field(
+        default=JobKind.COMPENSATION,
+        description="What is computed; jobs of other kinds than `compensation` have a result only.",
+    )
     state: JobState
     stage: str = Field(description="What is being done, for a person.")
+    room_bytes: int | None = Field(
+        default=None,
+        description="Room on the disk that it needs at least, while it waits for that.",
+    )
     progress: float = Field(ge=0, le=1)
     eta_s: float | None = Field(description="Seconds still needed; null while unknown.")
     queue_position: int | None = Field(description="Jobs before this one while it is queued.")
@@ -255,12 +265,16 @@ class JobView(BaseModel):
         """Return the view of a job."""
         here = f"/v1/jobs/{job.id}"
         done = job.state is JobState.DONE
-        made = ("result", "report", "report.json", "layers", "trajectories")
+        made = ["result"]
+        if job.kind is JobKind.COMPENSATION:
+            made += ["report", "report.json", "layers", "trajectories"]
         links = {name.replace(".", "_"): f"{here}/{name}" for name in made if done}
         return cls(
             id=job.id,
+            kind=job.kind,
             state=job.state,
-            stage=job.stage,
+            stage=_stage(job),
+            room_bytes=job.room_bytes if job.waits_for_room else None,
             progress=job.progress,
             eta_s=job.eta_s,
             queue_position=queue_position,
@@ -315,6 +329,12 @@ class Health(BaseModel):
 
     status: str
     version: str
+
+
+def _stage(job: Job) -> str:
+    if job.waits_for_room and job.room_bytes:
+        return f"{job.stage}: more than {job.room_bytes >> 20} MiB are needed"
+    return job.stage
 
 
 def _moment(seconds: float | None) -> datetime | None:

@@ -13,9 +13,12 @@ from starlette.responses import Response, StreamingResponse
 from service.api.problems import Problem
 from service.storage.base import Storage
 
-__all__ = ["HEADERS", "RANGES", "matches", "stored"]
+__all__ = ["HEADERS", "MEDIA", "RANGES", "matches", "stored"]
 
 _RANGE = re.compile(r"bytes=(\d{1,18})?-(\d{1,18})?")
+
+MEDIA = {".csv": "text/csv", ".npz": "application/octet-stream", ".json": "application/json"}
+"""Kinds of answers, by the suffix of their file names."""
 
 HEADERS = {
     "ETag": {"schema": {"type": "string"}, "description": "Names these bytes."},

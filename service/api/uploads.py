@@ -20,6 +20,7 @@ from service.api.problems import Problem
 from service.storage.disk import Disk
 
 __all__ = [
+    "Received",
     "Upload",
     "limited_body",
     "receive_document",
@@ -55,6 +56,16 @@ class Upload:
     fields: Mapping[str, str]
 
 
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A file of a form: what its sender called it, and where it is now."""
+
+    label: str
+    path: Path
+    size_bytes: int
+    sha256: str
+
+
 async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk: Disk) -> Upload:
     """Write the body of a request, raw or multipart/form-data, to `target`.
 
@@ -76,7 +87,8 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
         408 if its sender falls silent, 413 if the body is too large, 422 if it is empty or broken.
     NoRoom
     """
-    _check_declared(request, max_bytes, disk)
+    # Beside the upload lies what is made of it, which is as large at least.
+    disk.check_ever(2 * _check_declared(request, max_bytes, disk))
     fields: dict[str, str] = {}
     with target.open("wb") as file:
         sink = _Sink(file, disk)
@@ -109,8 +121,8 @@ async def receive_upload(request: Request, target: Path, *, max_bytes: int, disk
 
 async def receive_files(
     request: Request, folder: Path, *, max_bytes: int, max_files: int, disk: Disk
-) -> list[tuple[str, Path]]:
-    """Write the files of a form into a folder; return what each was called and where it is.
+) -> list[Received]:
+    """Write the files of a form into a folder.
 
     Parameters
     ----------
@@ -149,7 +161,10 @@ async def receive_files(
         await read_form(request, limited_body(request, max_bytes), begin, drain)
         for sink in sinks:
             await sink.flush()
-    return found
+    return [
+        Received(label, path, sink.size_bytes, sink.digest.hexdigest())
+        for (label, path), sink in zip(found, sinks, strict=True)
+    ]
 
 
 async def receive_document(request: Request, *, max_bytes: int) -> bytes:
@@ -229,13 +244,14 @@ async def limited_body(request: Request, max_bytes: int) -> AsyncGenerator[bytes
         yield chunk
 
 
-def _check_declared(request: Request, max_bytes: int, disk: Disk) -> None:
-    """Refuse by what the headers say, before anything is read."""
+def _check_declared(request: Request, max_bytes: int, disk: Disk) -> int:
+    """Refuse by what the headers say, before anything is read; return the declared size."""
     declared = request.headers.get("content-length", "")
     size = int(declared) if declared.isdecimal() else 0
     if size > max_bytes:
         raise _too_large(max_bytes)
     disk.check(size)
+    return size
 
 
 def _too_large(max_bytes: int) -> Problem:

@@ -1,132 +1,136 @@
-"""The tasks themselves: plain values in, plain values out; run in a process of their own."""
+"""What is computed besides compensations: each takes a job's task and writes an answer."""
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
+import json
+from collections.abc import Callable
 from typing import Any
 
-__all__ = ["design", "design_controller", "identify", "list_loops", "trajectories"]
+from service.jobs.state import JobKind
+from service.jobs.task import Task
+from service.pipeline.progress import Progress, ProgressCallback, telling
+
+__all__ = ["answer"]
 
 # What is imported in the functions takes a second, which the API need not wait for.
 
 
-def identify(given: dict[str, Any]) -> dict[str, Any]:
-    """Identify a machine from measurement files.
-
-    Parameters
-    ----------
-    given : dict
-        `files` (path, name and condition of each), `start` (the machine), `settings` (of reading),
-        `name`, `title`, `order`.
-
-    Returns
-    -------
-    dict
-        `machine` and `report`, as documents.
+def answer(task: Task, progress: ProgressCallback) -> dict[str, Any]:
+    """Write what the task asks for to its target; a `service.jobs.task.Runner`.
 
     Raises
     ------
-    ModelError
+    DesignError, GcodeError, ModelError
+    """
+    _WRITERS[task.kind](task, progress)
+    return {}
+
+
+def _identify(task: Task, progress: ProgressCallback) -> None:
+    """Write `machine` and `report`, identified from measurement files.
+
+    Options: `files` (name and condition of each), `settings` (of reading), `name`, `title` and
+    `order`.
     """
     from models.identification.conditions import Condition
     from models.identification.readers import ReadSettings
-    from models.machine import Machine
     from service.identification.run import InputFile, identify_files
 
+    asked = task.options
     inputs = [
-        InputFile(name, Path(path).read_bytes(), Condition.parse(condition))
-        for path, name, condition in given["files"]
+        InputFile(name, path.read_bytes(), Condition.parse(condition))
+        for path, (name, condition) in zip(task.sources, asked["files"], strict=True)
     ]
     found = identify_files(
         inputs,
-        Machine.model_validate(given["start"]),
-        ReadSettings.model_validate(given["settings"]),
-        name=given["name"],
-        title=given["title"],
-        max_order=given["order"],
+        task.pinned().machine,
+        ReadSettings.model_validate(asked["settings"]),
+        name=asked["name"],
+        title=asked["title"],
+        max_order=asked["order"],
+        progress=lambda stage, fraction: progress(Progress(stage, fraction, 0.0, 0.0, None)),
     )
-    return {
-        "machine": found.machine.model_dump(mode="json"),
-        "report": found.report.model_dump(mode="json"),
-    }
+    _write(
+        task,
+        {
+            "machine": found.machine.model_dump(mode="json"),
+            "report": found.report.model_dump(mode="json"),
+        },
+    )
 
 
-def design(given: dict[str, Any]) -> dict[str, Any]:
-    """Design one axis of a `machine`: `axis`, `basis`, `robust`; return the report.
-
-    Raises
-    ------
-    DesignError, ModelError
-    """
-    from models.machine import Machine
+def _design(task: Task, progress: ProgressCallback) -> None:
+    """Write the report of the design of one axis; options: `axis`, `basis`, `robust`."""
     from service.design.design import design_report
 
-    machine = Machine.model_validate(given["machine"])
-    report = design_report(machine, given["axis"], basis=given["basis"], robust=given["robust"])
-    return report.model_dump(mode="json")
+    telling(progress, "designing", 0.0)(0.0)
+    asked = task.options
+    report = design_report(
+        task.pinned().machine, asked["axis"], basis=asked["basis"], robust=asked["robust"]
+    )
+    _write(task, report.model_dump(mode="json"))
 
 
-def design_controller(given: dict[str, Any]) -> dict[str, Any]:
-    """Design an add-on controller with `options` for the closed-loop machine `name`.
+def _design_controller(task: Task, progress: ProgressCallback) -> None:
+    """Write `report`, `page` and `c` (the header) of an add-on controller.
 
-    Returns
-    -------
-    dict
-        `report`, `page` and `c`: the figures, the page and the C header.
-
-    Raises
-    ------
-    DesignError, ModelError
+    The options are those of the request; the machine is a closed-loop one.
     """
-    from service.controllers.design import design_controller as designed
+    from service.controllers.design import design_controller
     from service.controllers.options import read_options, resolved
     from service.controllers.page import render_controller
 
-    options = read_options(given["options"])
-    made = designed(resolved(given["name"], options), options)
-    return {
-        "report": made.report.model_dump_json(),
-        "page": render_controller(made.report),
-        "c": made.controller.to_c_header(),
-    }
+    telling(progress, "designing", 0.0)(0.0)
+    options = read_options(task.options)
+    made = design_controller(resolved(task.machine, options), options)
+    _write(
+        task,
+        {
+            "report": made.report.model_dump_json(),
+            "page": render_controller(made.report),
+            "c": made.controller.to_c_header(),
+        },
+    )
 
 
-def list_loops(_: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the built-in closed-loop machines and the methods that fit each."""
+def _list_loops(task: Task, progress: ProgressCallback) -> None:
+    """Write the built-in closed-loop machines and the methods that fit each."""
     from service.controllers.design import loop_figures
 
-    return [figures.model_dump(mode="json") for figures in loop_figures()]
+    telling(progress, "designing", 0.0)(0.0)
+    _write(task, [figures.model_dump(mode="json") for figures in loop_figures()])
 
 
-def trajectories(given: dict[str, Any]) -> None:
-    """Write the motion of a job to the file `target`.
-
-    Parameters
-    ----------
-    given : dict
-        `source`, `machine_file` and `target` (paths), `machine` and `options` of the job, `cache`
-        (a folder), and what was `chosen`: format and times.
-
-    Raises
-    ------
-    GcodeError
-    """
-    from service.machines.resolve import PinnedMachine
+def _trace(task: Task, progress: ProgressCallback) -> None:
+    """Write the motion of another job; options: that job's `options`, `format` and times."""
     from service.pipeline.options import Options
     from service.pipeline.trajectories import write_trajectories
 
-    settings = Options.model_validate(given["options"])
-    target = Path(given["target"])
-    # Whoever deletes this folder deletes all, also of a process that was ended.
-    tempfile.tempdir = str(target.parent)
+    asked = task.options
+    settings = Options.model_validate(asked["options"])
     write_trajectories(
-        Path(given["source"]),
-        target,
-        PinnedMachine.read(Path(given["machine_file"]), given["machine"]).machine,
+        task.source,
+        task.target,
+        task.pinned().machine,
         settings,
+        format=asked["format"],
+        start_s=asked["start_s"],
+        stop_s=asked["stop_s"],
         dialect=settings.dialect,
         plate=settings.plate,
-        cache_dir=Path(given["cache"]),
-        **given["chosen"],
+        cache_dir=task.cache_dir,
+        progress=progress,
     )
+
+
+_WRITERS: dict[JobKind, Callable[[Task, ProgressCallback], None]] = {
+    JobKind.IDENTIFICATION: _identify,
+    JobKind.DESIGN: _design,
+    JobKind.CONTROLLER: _design_controller,
+    JobKind.LOOPS: _list_loops,
+    JobKind.TRAJECTORIES: _trace,
+}
+
+
+def _write(task: Task, found: Any) -> None:
+    task.target.write_text(json.dumps(found))

@@ -78,6 +78,9 @@ jobs = Table(
     Column("print_after", Boolean, nullable=False, default=False),
     # By `seen_time`: since when the job is known to be over.
     Column("kept_from_s", Float),
+    # What is computed.
+    Column("kind", String(16), nullable=False, server_default="compensation"),
+    Column("room_bytes", BigInteger),
     Index("jobs_by_state", "state", "priority", "created_at"),
     Index("jobs_by_owner", "owner", "created_at"),
     Index("jobs_by_age", "created_at"),

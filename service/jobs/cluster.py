@@ -26,7 +26,8 @@ import structlog
 
 from service.jobs.preload import quiet_dask
 from service.jobs.state import Job
-from service.jobs.worker import Runner, run_job
+from service.jobs.task import Runner
+from service.jobs.worker import run_job
 from service.processes import METHOD, OF_THE_SERVICE, loaded_context
 from service.settings import Settings
 
@@ -130,8 +131,9 @@ class Cluster:
         with self._explained() as client:
             threads = client.sync(client.scheduler.ncores, callback_timeout=_TIMEOUT_S)
             slots = int(sum(threads.values()))
-            if self._local is not None and slots < self._settings.workers:
-                _start_missing(self._local, self._settings.workers)
+            wanted = self._settings.workers + self._settings.computing_processes
+            if self._local is not None and slots < wanted:
+                _start_missing(self._local, wanted)
         return slots
 
     def submit(self, job: Job, when_done: Callable[[], object]) -> Future:

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import CursorResult, Engine, delete, select, update
+from sqlalchemy import CursorResult, Engine, and_, delete, or_, select, update
 
 from service.database import tables
 from service.database.engine import insert, reading, writing
-from service.jobs.state import JobState
+from service.jobs.state import JobKind, JobState
 
 __all__ = ["Expiry"]
 
@@ -58,10 +58,17 @@ class Expiry:
             )
         return now
 
-    def old_jobs(self, before: float) -> list[str]:
-        """Return ids of the jobs that were over by a time, as `passed` counts it; oldest first."""
+    def old_jobs(self, before: float, answers_before: float | None = None) -> list[str]:
+        """Return ids of the jobs that were over by a time, as `passed` counts it; oldest first.
+
+        `answers_before` is the time for jobs that are no compensations, if it is another one.
+        """
         row = tables.jobs.c
-        query = select(row.id).where(row.state.in_(_OVER), row.kept_from_s < before)
+        is_old = row.kept_from_s < before
+        if answers_before is not None:
+            is_answer = row.kind != JobKind.COMPENSATION.value
+            is_old = or_(is_old, and_(is_answer, row.kept_from_s < answers_before))
+        query = select(row.id).where(row.state.in_(_OVER), is_old)
         with reading(self._engine) as connection:
             return list(connection.execute(query.order_by(row.kept_from_s, row.id)).scalars())
 

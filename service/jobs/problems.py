@@ -5,11 +5,27 @@ from __future__ import annotations
 import errno
 from typing import Any
 
-__all__ = ["DISK_FULL", "PROBLEM_MEDIA_TYPE", "problem", "problem_of"]
+from service.jobs.state import JobKind
+
+__all__ = [
+    "DISK_FULL",
+    "PROBLEM_MEDIA_TYPE",
+    "input_gone",
+    "never_fits",
+    "problem",
+    "problem_of",
+]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Numbers of errors that say that a disk takes no more."""
+_REFUSED = {
+    JobKind.TRAJECTORIES: "No trajectories",
+    JobKind.IDENTIFICATION: "The machine cannot be used",
+    JobKind.DESIGN: "No such design",
+    JobKind.CONTROLLER: "No such controller",
+}
+"""Titles, where what was asked cannot be computed."""
 
 
 def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any]:
@@ -29,8 +45,8 @@ def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any
     return {"type": "about:blank", "title": title, "status": status, "detail": detail, **extra}
 
 
-def problem_of(error: BaseException) -> dict[str, Any]:
-    """Return the problem document for an error of the road.
+def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> dict[str, Any]:
+    """Return the problem document for an error of a job's work.
 
     The three error roots of the house are the input's fault (422) and are told in full; anything
     else is ours (500), and the details stay in the log.
@@ -40,6 +56,10 @@ def problem_of(error: BaseException) -> dict[str, Any]:
     from models.errors import ModelError
 
     match error:
+        case GcodeError() | ModelError() | DesignError() if kind in _REFUSED:
+            reason = getattr(error, "reason", None)
+            extra = {} if reason is None else {"reason": reason}
+            return problem(422, _REFUSED[kind], str(error), **extra)
         case GcodeError():
             place = {} if error.line is None else {"line": error.line, "text": error.text}
             return problem(422, "The G-code cannot be processed", str(error), **place)
@@ -62,3 +82,19 @@ def problem_of(error: BaseException) -> dict[str, Any]:
                 "Internal error",
                 f"The job broke with {type(error).__name__}; the service's log holds the details.",
             )
+
+
+def input_gone(name: str) -> dict[str, Any]:
+    """Return the problem of a job whose input was deleted; `name` of the file."""
+    return problem(404, "The file is gone", f"{name} is no longer in the storage.")
+
+
+def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
+    """Return the problem of a job whose files are larger than the disk."""
+    return problem(
+        507,
+        "The job is larger than the disk",
+        f"It had written {room_bytes >> 20} MiB when the disk was full; the disk of the worker has "
+        f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). Cut "
+        "the print into several files, or give the service a larger disk.",
+    )

@@ -16,7 +16,7 @@ import structlog
 
 from service.database.engine import DatabaseAway
 from service.jobs.cluster import Cluster, ClusterAway
-from service.jobs.state import WAITING_FOR_ROOM, Job, JobState, Lost
+from service.jobs.state import Job, JobState, Lost
 from service.jobs.store import JobStore
 from service.jobs.sweep import Sweep
 from service.settings import Settings
@@ -247,17 +247,30 @@ class Reconciler:
 
         No more: one that waits at Dask would not see that a more urgent one has come.
         """
-        running = {job.id for job in self._store.in_state(JobState.RUNNING)}
-        free = self.slots - len(running | set(self._in_flight))
+        busy = {job.id: job for job in self._store.in_state(JobState.RUNNING)}
+        busy |= {job_id: job for job_id, (job, _) in self._in_flight.items()}
+        free = self.slots - len(busy)
         if free > 0 and self._is_room():
-            now = time.monotonic()
-            left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
-            for job in self._store.next_queued(free, exclude=[*self._in_flight, *left_alone]):
-                if job.stage == WAITING_FOR_ROOM and not self._may_try_again(job, now):
-                    continue
-                self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
-                free -= 1
+            # Short jobs may have any place; some are kept for them alone.
+            long = sum(not job.kind.is_short for job in busy.values())
+            kept = min(self._settings.computing_processes, self.slots - 1)
+            free -= self._begin(free, short=True)
+            free -= self._begin(min(free, self.slots - kept - long), short=False)
         self._free = max(free, 0)
+
+    def _begin(self, most: int, *, short: bool) -> int:
+        """Hand over up to so many jobs; return how many there were."""
+        if most <= 0:
+            return 0
+        now, begun = time.monotonic(), 0
+        left_alone = [job_id for job_id, (_, until) in self._no_room.items() if until > now]
+        exclude = [*self._in_flight, *left_alone]
+        for job in self._store.next_queued(most, short=short, exclude=exclude):
+            if job.waits_for_room and not self._may_try_again(job, now):
+                continue
+            self._in_flight[job.id] = (job, self._cluster.submit(job, self._wake.set))
+            begun += 1
+        return begun
 
     def _is_room(self) -> bool:
         """Return whether jobs may begin; the workers of other computers look for themselves."""
@@ -272,10 +285,16 @@ class Reconciler:
         return has_room
 
     def _may_try_again(self, job: Job, now: float) -> bool:
-        """Return whether a job whose files had no room has been left alone for long enough."""
+        """Return whether a job whose files had no room has been left alone for long enough.
+
+        Our own workers' disk is seen from here: the job then waits until there is what it needs.
+        """
         attempt, until = self._no_room.get(job.id, (-1, 0.0))
-        if attempt == job.attempt:
-            return until <= now
+        if attempt == job.attempt and until > now:
+            return False
+        has_room = not self._cluster.is_own or self._disk.has_room_for(job.room_bytes or 0)
+        if attempt == job.attempt and has_room:
+            return True
         if len(self._no_room) > _MOST_REMEMBERED:
             self._no_room.clear()
         self._no_room[job.id] = (job.attempt, now + _NO_ROOM_S)

@@ -30,6 +30,7 @@ __all__ = [
     "Failed",
     "Finished",
     "Job",
+    "JobKind",
     "JobState",
     "Lost",
     "NoRoom",
@@ -40,6 +41,22 @@ __all__ = [
 
 WAITING_FOR_ROOM = "waiting for room on the disk"
 """Stage of a job that went back to the queue because its files had no room."""
+
+
+class JobKind(StrEnum):
+    """What is computed."""
+
+    COMPENSATION = "compensation"
+    TRAJECTORIES = "trajectories"
+    IDENTIFICATION = "identification"
+    DESIGN = "design"
+    CONTROLLER = "controller"
+    LOOPS = "loops"
+
+    @property
+    def is_short(self) -> bool:
+        """Whether it is over within minutes: it does not queue behind what takes hours."""
+        return self not in (JobKind.COMPENSATION, JobKind.TRAJECTORIES)
 
 
 class JobState(StrEnum):
@@ -64,6 +81,8 @@ class Job:
     Attributes
     ----------
     id : str
+    kind : JobKind
+        Compensations have a caller's file and a report; of the others only the answer counts.
     owner : str
         Whose job it is.
     batch : str or None
@@ -71,7 +90,7 @@ class Job:
     machine, machine_revision : str
         Name of a machine, and which state of it; the document is kept with the job's files.
     options : dict
-        The fields of `service.pipeline.options.Options`.
+        The fields of `service.pipeline.options.Options`; of other kinds, what was asked.
     dedupe_key : str
         Equal for jobs that must have the same result: of input, machine, options and version.
     priority : int
@@ -98,6 +117,8 @@ class Job:
         Why the job failed, as a problem document (RFC 9457).
     created_at, started_at, heartbeat_at, finished_at : float or None
         Seconds since the epoch. `heartbeat_at`: when the worker was last heard of.
+    room_bytes : int or None
+        Room on the disk that it needs at least, if there was too little once.
     webhook : str or None
         Address that is told when the job is over.
     printer, print_after : str or None, bool
@@ -115,6 +136,7 @@ class Job:
     source_sha256: str
     result_name: str
     created_at: float
+    kind: JobKind = JobKind.COMPENSATION
     batch: str | None = None
     priority: int = 0
     output: str | None = None
@@ -133,9 +155,41 @@ class Job:
     started_at: float | None = None
     heartbeat_at: float | None = None
     finished_at: float | None = None
+    room_bytes: int | None = None
     webhook: str | None = None
     printer: str | None = None
     print_after: bool = False
+
+    @property
+    def sources(self) -> list[str]:
+        """Where its input lies in the storage."""
+        match self.kind:
+            case JobKind.COMPENSATION | JobKind.TRAJECTORIES:
+                return [f"{self._origin}/source/{self.source_name}"]
+            case JobKind.IDENTIFICATION:
+                return [f"{self._origin}/source/{n}" for n in range(len(self.options["files"]))]
+            case _:
+                return []
+
+    @property
+    def machine_file(self) -> str:
+        """Where its machine lies in the storage, if it has one."""
+        return f"{self._origin}/machine.json"
+
+    @property
+    def result(self) -> str:
+        """Where its result lies in the storage, once it is done."""
+        return f"{self.output}/result/{self.result_name}"
+
+    @property
+    def waits_for_room(self) -> bool:
+        """Whether it would run if the disk had more room."""
+        return self.state is JobState.QUEUED and self.stage == WAITING_FOR_ROOM
+
+    @property
+    def _origin(self) -> str:
+        # Trajectories are those of another job.
+        return f"jobs/{self.options['of'] if self.kind is JobKind.TRAJECTORIES else self.id}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,10 +249,14 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class NoRoom:
-    """The disk is full, or nearly: the job waits until there is room again."""
+    """The disk is full, or nearly: the job waits until there is room again.
+
+    `room_bytes` is what it needs at least: what it had written when it was stopped.
+    """
 
     attempt: int
     at: float
+    room_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +325,8 @@ def advance(job: Job, event: Event) -> Job:
         case Failed():
             return _failed(job, event.problem, event.at)
         case NoRoom():
-            return replace(_waiting(job), stage=WAITING_FOR_ROOM)
+            room_bytes = max(job.room_bytes or 0, event.room_bytes)
+            return replace(_waiting(job), stage=WAITING_FOR_ROOM, room_bytes=room_bytes)
         case Lost():
             if not event.blame:
                 return _waiting(job)

@@ -34,7 +34,16 @@ from sqlalchemy import (
 
 from service.database import tables
 from service.database.engine import insert, reading, write_together, writing
-from service.jobs.state import Claimed, Event, Job, JobState, Stale, advance
+from service.jobs.state import (
+    WAITING_FOR_ROOM,
+    Claimed,
+    Event,
+    Job,
+    JobKind,
+    JobState,
+    Stale,
+    advance,
+)
 
 __all__ = [
     "BadCursor",
@@ -50,31 +59,58 @@ _JOBS = tables.jobs.c
 _FIELDS = tuple(field.name for field in fields(Job))
 _NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
 _OVER = tuple(state.value for state in JobState if state.is_final)
+_SHORT = tuple(kind.value for kind in JobKind if kind.is_short)
 _CLOCKS_APART = 12
 """A lease that lasts for longer than so many times what it may was taken before clocks were set."""
 
 
 def _in_order() -> Subquery:
-    """Return id and place, from 1, of every waiting job in the order of dispatch."""
+    """Return id and place, from 1, of every waiting job in the order of dispatch.
+
+    Short jobs stand in a line of their own.
+    """
+    is_short = case((_JOBS.kind.in_(_SHORT), 1), else_=0).label("is_short")
+    # Of one owner, what is asked about a job that is done comes before further files.
+    is_file = case((_JOBS.kind == "compensation", 1), else_=0).label("is_file")
+    present = (
+        select(
+            _JOBS.id,
+            _JOBS.owner,
+            _JOBS.state,
+            _JOBS.priority,
+            _JOBS.created_at,
+            is_short,
+            is_file,
+        )
+        .where(_JOBS.state.in_(_NOT_OVER))
+        .subquery("present")
+    )
+    job = present.c
     running = (
-        select(_JOBS.owner, func.count().label("jobs"))
-        .where(_JOBS.state == "running")
-        .group_by(_JOBS.owner)
+        select(job.owner, job.is_short, func.count().label("jobs"))
+        .where(job.state == "running")
+        .group_by(job.owner, job.is_short)
         .subquery("running")
     )
-    age = (_JOBS.created_at, _JOBS.id)
     own_turn = func.row_number().over(
-        partition_by=_JOBS.owner, order_by=(_JOBS.priority.desc(), *age)
+        partition_by=(job.owner, job.is_short),
+        order_by=(job.priority.desc(), job.is_file, job.created_at, job.id),
     )
+    turn = (own_turn + func.coalesce(running.c.jobs, 0)).label("turn")
     waiting = (
-        select(*age, _JOBS.priority, (own_turn + func.coalesce(running.c.jobs, 0)).label("turn"))
-        .outerjoin_from(tables.jobs, running, running.c.owner == _JOBS.owner)
-        .where(_JOBS.state == "queued")
+        select(job.id, job.created_at, job.priority, job.is_short, turn)
+        .outerjoin_from(
+            present,
+            running,
+            and_(running.c.owner == job.owner, running.c.is_short == job.is_short),
+        )
+        .where(job.state == "queued")
         .subquery("waiting")
     )
     row = waiting.c
     order = (row.priority.desc(), row.turn, row.created_at, row.id)
-    return select(row.id, func.row_number().over(order_by=order).label("place")).subquery("queue")
+    place = func.row_number().over(partition_by=row.is_short, order_by=order).label("place")
+    return select(row.id, row.is_short, place).subquery("queue")
 
 
 # Statements of every upload and every look of the reconciler are made once: to put one together
@@ -238,6 +274,7 @@ class JobStore:
         self,
         owner: str | None,
         *,
+        kinds: Collection[JobKind] = (),
         states: Collection[JobState] = (),
         batch: str | None = None,
         limit: int,
@@ -249,7 +286,7 @@ class JobStore:
         ----------
         owner : str or None
             None: everybody's.
-        states, batch
+        kinds, states, batch
             Which jobs; by default all.
         limit : int
             How many at most.
@@ -263,6 +300,8 @@ class JobStore:
         query = select(tables.jobs).order_by(_JOBS.created_at.desc(), _JOBS.id.desc())
         if owner is not None:
             query = query.where(_JOBS.owner == owner)
+        if kinds:
+            query = query.where(_JOBS.kind.in_([kind.value for kind in kinds]))
         if states:
             query = query.where(_JOBS.state.in_([state.value for state in states]))
         if batch is not None:
@@ -290,6 +329,15 @@ class JobStore:
                 select(func.min(_JOBS.created_at)).where(_JOBS.state == "queued")
             ).scalar()
 
+    def waiting_for_room(self) -> tuple[int, int]:
+        """Return how many jobs wait for room on the disk, and the most that one of them needs."""
+        query = select(func.count(), func.max(_JOBS.room_bytes)).where(
+            _JOBS.state == "queued", _JOBS.stage == WAITING_FOR_ROOM
+        )
+        with reading(self.engine) as connection:
+            jobs, most = connection.execute(query).one()
+        return int(jobs), int(most or 0)
+
     def ended_between(self, after: float, until: float) -> list[Job]:
         """Return the jobs that ended after a time and not later than another."""
         ended = (_JOBS.finished_at > after, _JOBS.finished_at <= until)
@@ -302,8 +350,10 @@ class JobStore:
 
     # The queue
 
-    def next_queued(self, limit: int, *, exclude: Collection[str] = ()) -> list[Job]:
-        """Return waiting jobs in the order in which they are to be started.
+    def next_queued(
+        self, limit: int, *, short: bool = False, exclude: Collection[str] = ()
+    ) -> list[Job]:
+        """Return waiting jobs, short ones or the others, in the order of their start.
 
         Higher priority first; then owners take turns, where a job that runs was its owner's turn;
         then the older first. Jobs to `exclude` take their owners' turns but are not returned.
@@ -311,7 +361,7 @@ class JobStore:
         query = (
             select(tables.jobs)
             .join(_QUEUE, _QUEUE.c.id == _JOBS.id)
-            .where(_JOBS.id.not_in(list(exclude)))
+            .where(_QUEUE.c.is_short == int(short), _JOBS.id.not_in(list(exclude)))
             .order_by(_QUEUE.c.place)
             .limit(limit)
         )
@@ -540,12 +590,13 @@ def _note_deliveries(connection: Connection, job: Job) -> None:
 
 
 def _to_row(job: Job) -> dict[str, Any]:
-    return asdict(job) | {"state": job.state.value}
+    return asdict(job) | {"state": job.state.value, "kind": job.kind.value}
 
 
 def _from_row(row: Row[Any]) -> Job:
     values = row._mapping
-    return Job(**{name: values[name] for name in _FIELDS} | {"state": JobState(values["state"])})
+    named = {"state": JobState(values["state"]), "kind": JobKind(values["kind"])}
+    return Job(**{name: values[name] for name in _FIELDS} | named)
 
 
 def _to_cursor(job: Job) -> str:

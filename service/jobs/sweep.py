@@ -26,6 +26,8 @@ _AT_ONCE = 500
 """Ids in one question to the database."""
 _DAY_S = 86400.0
 _SUBMISSIONS_KEPT_S = _DAY_S
+_ANSWERS_KEPT_S = _DAY_S
+"""Whatever is no compensation is computed again when somebody asks again."""
 _ORPHAN_S = 3600.0
 """Files without a row are of an upload, until they have been seen without one for so long."""
 _UPLOAD_S = _DAY_S
@@ -88,7 +90,8 @@ class Sweep:
         at, before = self._clock(), self._counted_at
         now = self._expiry.passed(0.0 if before is None else at - before)
         self._counted_at = at
-        for job_id in self._expiry.old_jobs(now - self._settings.keep_days * _DAY_S):
+        before = now - self._settings.keep_days * _DAY_S
+        for job_id in self._expiry.old_jobs(before, max(before, now - _ANSWERS_KEPT_S)):
             # The row first: no job whose files are gone is ever shown.
             if self._store.forget(job_id):
                 self._storage.delete(f"{_JOBS}{job_id}/")

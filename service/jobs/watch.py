@@ -18,24 +18,73 @@ import structlog
 
 from service.database.engine import DatabaseAway
 from service.jobs.problems import problem
-from service.jobs.state import Event, Failed, Job, Lost, NoRoom
+from service.jobs.state import Event, Failed, Job, JobKind, Lost, NoRoom
 from service.jobs.store import JobStore
 from service.pipeline.progress import Cancelled, Progress
+from service.settings import Settings
 
-__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "too_large"]
+__all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "held_bytes"]
 
 STUCK_EXIT_CODE = 70
 _BEAT_S = 0.5
 _MIB = 1 << 20
+_SHORT_GRACE_S = 1.0
+"""Short jobs seldom say where they are; to start another process costs less than to wait."""
+_SHORT_REMEDIES = {
+    JobKind.IDENTIFICATION: "Send the test as the firmware wrote it, fewer files at once",
+    JobKind.DESIGN: "Give the machine fewer members or places",
+    JobKind.CONTROLLER: "Give the machine fewer states or plants",
+    JobKind.LOOPS: "Ask again",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What an attempt may take; see `service.settings.Settings`."""
+    """What an attempt may take, and the settings that say so (`service.settings.Settings`)."""
 
-    max_job_s: float
-    max_job_bytes: int
+    max_s: float
+    max_bytes: int
     cancel_grace_s: float
+    seconds_setting: str = "STILLPATH_MAX_JOB_S"
+    bytes_setting: str = "STILLPATH_MAX_JOB_BYTES"
+    remedy: str = "Cut the print into several files"
+
+    @classmethod
+    def of(cls, kind: JobKind, settings: Settings) -> Self:
+        """Return the limits of a kind of job."""
+        if not kind.is_short:
+            return cls(settings.max_job_s, settings.max_job_bytes, settings.cancel_grace_s)
+        return cls(
+            settings.max_computing_s,
+            settings.max_computing_bytes,
+            min(settings.cancel_grace_s, _SHORT_GRACE_S),
+            "STILLPATH_MAX_COMPUTING_S",
+            "STILLPATH_MAX_COMPUTING_BYTES",
+            _SHORT_REMEDIES[kind],
+        )
+
+    def too_long(self, seconds: float) -> dict[str, object]:
+        """Return the problem of a job that took so long."""
+        return problem(
+            422,
+            "The job takes too long",
+            f"It was stopped after {seconds:.0f} s; the limit is {self.max_s:g} s "
+            f"({self.seconds_setting}). {self.remedy}, or have the limit raised.",
+        )
+
+    def too_large(self, what: str) -> dict[str, object]:
+        """Return the problem of a job that needs too much memory; `what` happened."""
+        return problem(
+            422,
+            "The job needs too much memory",
+            f"{what}; the limit is {self.max_bytes // _MIB} MiB ({self.bytes_setting}). "
+            f"{self.remedy}, or have the limit raised.",
+        )
+
+
+def held_bytes() -> int:
+    """Return how much memory this process holds."""
+    return int(psutil.Process().memory_info().rss)
 
 
 class Watch:
@@ -53,6 +102,8 @@ class Watch:
         Whether the disk has room for more; the rest of it belongs to the database.
     end : callable
         Ends this process with an exit code.
+    no_room : callable
+        Says what becomes of the job where it has none.
 
     Attributes
     ----------
@@ -68,6 +119,7 @@ class Watch:
         *,
         interrupted: Callable[[], str | None],
         has_room: Callable[[], bool] = lambda: True,
+        no_room: Callable[[], Event] | None = None,
         end: Callable[[int], object],
     ) -> None:
         self._store = store
@@ -75,6 +127,7 @@ class Watch:
         self._limits = limits
         self._interrupted = interrupted
         self._has_room = has_room
+        self._no_room = no_room or (lambda: NoRoom(job.attempt, time.time()))
         self._end = end
         self._began = time.monotonic()
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)
@@ -153,7 +206,7 @@ class Watch:
         elif (found := self._limit_reached()) is not None:
             self._decide(Failed(attempt, now, found))
         elif not self._has_room():
-            self._decide(NoRoom(attempt, now))
+            self._decide(self._no_room())
         else:
             at = self._latest
             if not self._store.beat(self._job.id, attempt, now, at.stage, at.fraction, at.eta_s):
@@ -168,26 +221,9 @@ class Watch:
         self._verdict = None
 
     def _limit_reached(self) -> dict[str, object] | None:
-        if (seconds := time.monotonic() - self._began) > self._limits.max_job_s:
-            return problem(
-                422,
-                "The job takes too long",
-                f"It was stopped after {seconds:.0f} s; the limit is "
-                f"{self._limits.max_job_s:g} s (STILLPATH_MAX_JOB_S). Cut the print into several "
-                "files, or have the limit raised.",
-            )
-        size = psutil.Process().memory_info().rss
-        if size > self._limits.max_job_bytes:
+        if (seconds := time.monotonic() - self._began) > self._limits.max_s:
+            return self._limits.too_long(seconds)
+        if (size := held_bytes()) > self._limits.max_bytes:
             self.outgrown = True
-            return too_large(f"Its process grew to {size // _MIB} MiB", self._limits.max_job_bytes)
+            return self._limits.too_large(f"Its process grew to {size // _MIB} MiB")
         return None
-
-
-def too_large(what: str, max_job_bytes: int) -> dict[str, object]:
-    """Return the problem of a job that needs too much memory; `what` happened."""
-    return problem(
-        422,
-        "The job needs too much memory",
-        f"{what}; the limit is {max_job_bytes // _MIB} MiB (STILLPATH_MAX_JOB_BYTES). Cut the "
-        "print into several files, or have the limit raised.",
-    )

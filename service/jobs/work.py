@@ -5,7 +5,8 @@ from __future__ import annotations
 from service.jobs.cluster import Cluster
 from service.jobs.reconciler import Reconciler
 from service.jobs.store import JobStore
-from service.jobs.worker import Runner, run_task
+from service.jobs.task import Runner
+from service.jobs.worker import run_task
 from service.settings import Settings
 from service.storage import Storage
 

@@ -24,12 +24,14 @@ from typing import Any, TypeVar
 
 import structlog
 
+from service.computing.tasks import answer
 from service.database.engine import DatabaseAway, StoreError, open_database
 from service.environment import prepare_environment
-from service.jobs.problems import DISK_FULL, problem_of
-from service.jobs.state import Event, Failed, Finished, Job, Lost, NoRoom
+from service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
+from service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
 from service.jobs.store import JobStore
-from service.jobs.watch import Limits, Watch, too_large
+from service.jobs.task import Runner, Task
+from service.jobs.watch import Limits, Watch, held_bytes
 from service.logs import configure_logging
 from service.pipeline.progress import Cancelled, Progress
 from service.processes import limit_memory
@@ -38,46 +40,21 @@ from service.storage import Storage, StorageError
 from service.storage.disk import Disk
 from service.storage.opened import open_storage
 
-__all__ = ["Runner", "Task", "Workplace", "execute", "run_job", "run_task"]
+__all__ = ["Workplace", "execute", "run_job", "run_task"]
 
 _PATIENCE_S = 60.0
 """How long storage and database may be away before an attempt is given up."""
 _LONGEST_PAUSE_S = 4.0
 _KEPT_BYTES = 256 << 20
+_MOST_KEPT_BYTES = 512 << 20
+"""A process that is larger after a short job ends: what it keeps would count for the next one."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 _Given = TypeVar("_Given")
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One attempt at a job, as a runner sees it: files on this computer.
-
-    Attributes
-    ----------
-    machine_file : Path
-        Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`).
-    source : Path
-        To be read only.
-    target, report : Path
-        File and folder to be made; the folders above exist.
-    cache_dir : Path
-        What is worth keeping between jobs.
-    """
-
-    job_id: str
-    attempt: int
-    machine: str
-    machine_file: Path
-    options: dict[str, Any]
-    source: Path
-    target: Path
-    report: Path
-    cache_dir: Path
-
-
-Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]
-"""Does the work of a task and returns the figures that lists show; importable by its name."""
+class _InputGone(Exception):
+    """A job's input is no longer in the storage; the message is its name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +120,11 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         return
     log = structlog.get_logger("worker")
     settings = workplace.settings
-    limits = Limits(settings.max_job_s, settings.max_job_bytes, settings.cancel_grace_s)
+    limits = Limits.of(job.kind, settings)
+    # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
+    limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
+    if job.kind is not JobKind.COMPENSATION:
+        runner = answer
     disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
     watch = Watch(
         store,
@@ -151,31 +132,31 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         limits,
         interrupted=workplace.interrupted,
         has_room=lambda: disk.lets_jobs_go_on,
+        no_room=lambda: _no_room(job, workplace),
         end=workplace.end,
     )
     with structlog.contextvars.bound_contextvars(job=job.id, attempt=job.attempt):
         log.info("job started", worker=workplace.name)
         with watch:
-            event = _attempt(job, workplace, runner, watch)
+            event = _attempt(job, workplace, runner, watch, limits)
         # A verdict of the watch that the database has not heard of comes first.
         for said in (watch.verdict, event):
             if said is not None:
                 _report(store, job, said)
         _tidy(job, workplace)
         log.info("job over", outcome="dropped" if event is None else type(event).__name__)
-    if watch.outgrown:
+    if watch.outgrown or (job.kind.is_short and held_bytes() > _MOST_KEPT_BYTES):
         workplace.end(0)
 
 
 def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Compensate the task's file and write its report; see `Runner`."""
     from service.compiling import compiling_told
-    from service.machines.resolve import PinnedMachine
     from service.pipeline.options import Options
     from service.pipeline.road import compensate_file
     from service.reports import write_report
 
-    pinned = PinnedMachine.read(task.machine_file, task.machine)
+    pinned = task.pinned()
     with compiling_told(progress) as told:
         result = compensate_file(
             task.source,
@@ -198,53 +179,81 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]
     }
 
 
-def _attempt(job: Job, workplace: Workplace, runner: Runner, watch: Watch) -> Event | None:
+def _attempt(
+    job: Job, workplace: Workplace, runner: Runner, watch: Watch, limits: Limits
+) -> Event | None:
     """Return how the attempt ended; None if it was stopped from outside.
 
     A full disk is nobody's fault: the job waits for room.
     """
     try:
-        with _folder(workplace.scratch / f"{job.id}-{job.attempt}") as folder:
-            return _work(job, workplace, runner, watch, folder)
+        with _folder(_place(job, workplace)) as folder:
+            try:
+                return _work(job, workplace, runner, watch, folder)
+            except OSError as error:
+                if error.errno not in _NO_ROOM:
+                    raise
+                structlog.get_logger("worker").warning("no room for the job", reason=str(error))
+                return _no_room(job, workplace)  # while it can be seen what it has written
     except Cancelled:
         return None
     except MemoryError:
         what = "The system refused its process more memory"
-        return Failed(job.attempt, time.time(), too_large(what, workplace.settings.max_job_bytes))
+        return Failed(job.attempt, time.time(), limits.too_large(what))
+    except _InputGone as error:
+        return Failed(job.attempt, time.time(), input_gone(str(error)))
     except OSError as error:
         if error.errno in _NO_ROOM:
-            structlog.get_logger("worker").warning("no room for the job", reason=str(error))
-            return NoRoom(job.attempt, time.time())
+            return NoRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
             # Perhaps it answers another worker, or later.
             return Lost(job.attempt, time.time(), str(error), workplace.settings.max_attempts)
-        return Failed(job.attempt, time.time(), problem_of(error))
+        return Failed(job.attempt, time.time(), problem_of(error, job.kind))
     except Exception as error:
-        found = problem_of(error)
+        found = problem_of(error, job.kind)
         if found["status"] >= 500:
             _log_crash()
         return Failed(job.attempt, time.time(), found)
 
 
+def _no_room(job: Job, workplace: Workplace) -> Event:
+    """Return what becomes of a job that the disk has no room for, by what it has written."""
+    disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
+    written = 0
+    with contextlib.suppress(OSError):  # files come and go meanwhile
+        for path in _place(job, workplace).rglob("*"):
+            written += path.stat().st_size
+    if disk.fits_ever(written + job.source_bytes):
+        return NoRoom(job.attempt, time.time(), written)
+    return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
+
+
+def _place(job: Job, workplace: Workplace) -> Path:
+    return workplace.scratch / f"{job.id}-{job.attempt}"
+
+
 def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: Path) -> Finished:
-    storage, place = workplace.storage, f"jobs/{job.id}"
+    storage = workplace.storage
     target, report = folder / "result" / job.result_name, folder / "report"
     target.parent.mkdir()
     with contextlib.ExitStack() as stack:
 
         def fetch(key: str) -> Path:
             return _patiently(
-                lambda: stack.enter_context(storage.local(f"{place}/{key}")),
+                lambda: stack.enter_context(storage.local(key)),
                 StorageError,
                 watch.pause,
             )
 
-        source = fetch(f"source/{job.source_name}")
         try:
-            machine = fetch("machine.json")
+            sources = tuple(fetch(key) for key in job.sources)
         except FileNotFoundError:
-            machine = folder / "machine.json"  # a job of an earlier version
+            raise _InputGone(job.source_name) from None
+        try:
+            machine = fetch(job.machine_file)
+        except FileNotFoundError:
+            machine = folder / "machine.json"  # it needs none, or is a job of an earlier version
         cache = workplace.settings.data_dir / "cache"
         cache.mkdir(parents=True, exist_ok=True)
         summary = runner(
@@ -254,10 +263,11 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
                 job.machine,
                 machine,
                 job.options,
-                source,
+                sources,
                 target,
                 report,
                 cache,
+                job.kind,
             ),
             watch.tell,
         )
@@ -265,7 +275,10 @@ def _work(job: Job, workplace: Workplace, runner: Runner, watch: Watch, folder: 
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     result_bytes = target.stat().st_size
-    output, output_bytes = f"{place}/{job.attempt}", sum(path.stat().st_size for path in files)
+    output, output_bytes = (
+        f"jobs/{job.id}/{job.attempt}",
+        sum(path.stat().st_size for path in files),
+    )
     for path in files:
         key = f"{output}/{path.relative_to(folder).as_posix()}"
         watch.check()
@@ -326,8 +339,6 @@ def _opened(given: str | None) -> tuple[Settings, JobStore, Storage]:
     prepare_environment()
     configure_logging()
     settings = Settings() if given is None else Settings.model_validate_json(given)
-    # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
-    limit_memory(settings.max_job_bytes + max(settings.max_job_bytes // 4, _KEPT_BYTES))
     engine = _patiently(lambda: open_database(settings), StoreError, time.sleep)
     return settings, JobStore(engine), open_storage(settings)
 

@@ -55,6 +55,35 @@ class Disk:
             private_folder(self._folder)
             return shutil.disk_usage(self._folder).free
 
+    def total_bytes(self) -> int:
+        """Return how large the disk is."""
+        self.free_bytes()  # makes the folder
+        return shutil.disk_usage(self._folder).total
+
+    def fits_ever(self, more_bytes: int) -> bool:
+        """Return whether a disk with nothing else on it would have room for a job's files.
+
+        A reserve that is larger than the disk is no job's fault.
+        """
+        most = self.total_bytes() - self._reserve_bytes
+        return not self._reserve_bytes or most <= 0 or more_bytes <= most
+
+    def has_room_for(self, more_bytes: int) -> bool:
+        """Return whether a job may begin that needs so much."""
+        if not self._reserve_bytes:
+            return True
+        return self.free_bytes() - more_bytes >= self._reserve_bytes // 4 and self.lets_jobs_begin
+
+    def check_ever(self, job_bytes: int) -> None:
+        """Raise `NoRoom` if the files of a job are larger than the disk."""
+        if not self.fits_ever(job_bytes):
+            raise NoRoom(
+                f"the job needs {job_bytes // _MIB} MiB for the upload and its result, more than "
+                f"the disk of the service can ever have: {self.total_bytes() // _MIB} MiB in all, "
+                f"of which {self._reserve_bytes // _MIB} MiB stay free "
+                "(STILLPATH_DISK_RESERVE_BYTES). Cut the print into several files"
+            )
+
     def refusal(self, more_bytes: int = 0) -> str | None:
         """Return why the service takes no upload of so many bytes, or None."""
         if not self._reserve_bytes:

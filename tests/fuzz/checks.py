@@ -43,6 +43,7 @@ class Outcome:
     written: bytes | None
     """None: refused as a whole."""
     put_back: int = 0
+    print_s: float = 0.0
 
 
 def roomy(machine: Machine, half_mm: float = 5000.0) -> Machine:
@@ -60,17 +61,17 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
     # Ends of lines other than LF and CRLF are the interpreter's business alone.
     if b"\r" not in text.replace(b"\r\n", b"\n"):
         text = _tagged(text)
-    written, put_back = None, 0
+    written, put_back, print_s = None, 0, 0.0
     for _ in range(8):
         try:
-            written, put_back = through_the_road(text, machine, folder, method, cache)
+            written, put_back, print_s = through_the_road(text, machine, folder, method, cache)
             break
         except GcodeError as error:
             refusals.append(error)
             if error.line is None:
                 break
             text = _without(text, {error.line})
-    return Outcome(text, refusals, written, put_back)
+    return Outcome(text, refusals, written, put_back, print_s)
 
 
 def read_through(data: bytes, machine: Machine) -> GcodeError | None:
@@ -161,8 +162,14 @@ def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeErr
 
 def through_the_road(
     text: bytes, machine: Machine, folder: Path, method: str, cache: Path
-) -> tuple[bytes, int]:
-    """Compensate a file; check lines, states and that nothing else is left behind."""
+) -> tuple[bytes, int, float]:
+    """Compensate a file; check lines, states and that nothing else is left behind.
+
+    Returns
+    -------
+    (bytes, int, float)
+        What was written, how many pieces were put back, and how long the print takes.
+    """
     source, target = folder / "in.gcode", folder / "out.gcode"
     target.unlink(missing_ok=True)
     source.write_bytes(text)
@@ -180,7 +187,7 @@ def through_the_road(
     elif b"\r" not in text.replace(b"\r\n", b"\n"):
         problems = differences(text, written, machine)
         assert problems == [], problems[:5]
-    return written, len(result.put_back)
+    return written, len(result.put_back), max(result.original_time_s, result.time_s)
 
 
 def _lasts_s(moves: Moves) -> np.ndarray:

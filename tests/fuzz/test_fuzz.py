@@ -90,6 +90,10 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 FOUND = {
+    "an arc may begin with chords of Z alone": (
+        "G28\nM83\nG1 X126 Y120\nG1 X125.518 Y120.144 E.06729\nG4 P1\nG3 X12 Z3 I1 K1\n"
+        "G1 X124.983 Y119.953 E.08619\nG1 X124.525 Y121.057 E.02594\n"
+    ),
     "an arc that only feeds needs the file's F": (
         "M83\nG1 X252.037 Y148.647 E.00484\nG3 X252.48 Y147.533 I8.433 J2.711 E.0386\n"
         "G3 X252.48 Y147.533 I8.433 J2.711 E.0386\nG1 X253.084 Y146.652 E.03435\n"
@@ -154,6 +158,17 @@ NO_TIME = (
     "G1 X108.526 Y117.369 E5.0076\nG1 E1.5076 F3600\nG1 E.0076 F3600\nG1 F7200\n"
     "G1 X111.498 Y117.81 E1.40752\n"
 )
+AFTER_DUST = (
+    "G1 X137.81 Y108.441 E.31343\nG1 X138.937 Y110.131 E.06728\nG0.006 X10 Y10 R-20\n"
+    "G1 X138.937 Y110.131 E.06728\nG1\n"
+)
+"""The fourth line moves by a rounding error of E, from a place that nobody knows."""
+
+
+@pytest.mark.slow
+def test_what_was_found_on_reprapfirmware(tmp_path: Path, cache: Path) -> None:
+    data = tagged(AFTER_DUST.encode())
+    through_the_road(data, machine_of("reprapfirmware"), tmp_path, "shaper:mzv", cache)
 
 
 @pytest.mark.slow
@@ -171,6 +186,15 @@ def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> Non
 @pytest.mark.parametrize("method", ["shaper:mzv", "fbf"])
 def test_what_was_found_once(name: str, method: str, tmp_path: Path, cache: Path) -> None:
     through_the_road(tagged(FOUND[name].encode()), machine_of("klipper"), tmp_path, method, cache)
+
+
+@pytest.mark.shared
+@pytest.mark.slow
+def test_the_file_that_took_its_job_down(tmp_path: Path, cache: Path, shared_dir: Path) -> None:
+    """A piece of moves that round to nothing: ValueError in the encoder, once."""
+    data = tagged((shared_dir / "corpus" / "fuzz" / "crash_klipper_1.gcode").read_bytes())
+    _, put_back, _ = through_the_road(data, machine_of("klipper"), tmp_path, "fbf", cache)
+    assert put_back <= 1
 
 
 @pytest.mark.shared

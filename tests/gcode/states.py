@@ -21,6 +21,7 @@ __all__ = ["State", "differences", "states", "tagged"]
 
 _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
+_DUST_MM = 1e-9
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
@@ -85,6 +86,9 @@ def states(data: bytes, machine: Machine) -> list[State]:
     streams = _streams(lines)
     for block in [*reader.push(data), *reader.flush()]:
         moves, events = block.moves, block.events
+        # Dust (see `_is_dust`) is a move in one file and none in the other: it tells nothing.
+        is_move = np.max(np.abs(moves.end_mm - moves.start_mm), axis=1, initial=0.0) >= _DUST_MM
+        latest = np.maximum.accumulate(np.where(is_move, np.arange(len(moves)), -1))
         for i in range(len(moves)):
             number = int(moves.line[i])
             first = found.get(number)
@@ -103,8 +107,9 @@ def states(data: bytes, machine: Machine) -> list[State]:
             )
         for i in range(len(events)):
             number, at = int(events.line[i]), int(events.move_index[i]) - block.first_move
-            if len(moves) and at > 0:
-                last, known = moves.end_mm[at - 1], int(moves.known[at - 1])
+            if len(moves) and at > 0 and latest[at - 1] >= 0:
+                row = latest[at - 1]
+                last, known = moves.end_mm[row], int(moves.known[row])
             found[number] = State(
                 lines[number - 1],
                 int(events.kind[i]),
@@ -116,8 +121,8 @@ def states(data: bytes, machine: Machine) -> list[State]:
                 block.limits[events.limits_id[i]],
                 streams[number - 1],
             )
-        if len(moves):
-            last, known = moves.end_mm[-1], int(moves.known[-1])
+        if len(moves) and latest[-1] >= 0:
+            last, known = moves.end_mm[latest[-1]], int(moves.known[latest[-1]])
     assert sorted(found) == list(range(1, len(lines) + 1))
     return [found[k] for k in sorted(found)]
 
@@ -191,7 +196,7 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
 
 def _is_dust(state: State) -> bool:
     """Sums of relative E miss the absolute one by rounding errors, which are moves."""
-    return bool(np.max(np.abs(state.end_mm - state.start_mm)) < 1e-9)
+    return bool(np.max(np.abs(state.end_mm - state.start_mm)) < _DUST_MM)
 
 
 def _differ(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gcode.errors import GcodeError
-from service.jobs.worker import Task
+from service.jobs.task import Task
 from service.pipeline.progress import Progress
 
 __all__ = ["light", "pretend"]

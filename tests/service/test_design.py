@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import re
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from models.plants import FirSpec, PlantSetSpec, discretise, plant_set
 from models.store import load_machine
 from service.api import create_app
 from service.api import designs as routes
+from service.api.computing import Question
 from service.cli import run
 from service.design import design as module
 from service.design.design import design_report
@@ -396,14 +396,18 @@ def test_command(
 def client(
     tmp_path: Path, off: DesignReport, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[TestClient]:
-    async def pretended(*asked: Any, **_: Any) -> Any:
-        given = asked[4]
+    # What a job computes takes ten seconds; tests/service/api/test_computing.py has real ones.
+    async def pretended(_: Any, __: Any, asked: Question) -> Any:
+        given = asked.options
         settings = (given["axis"], given["basis"], given["robust"])
-        pretended.calls.append((given["machine"]["name"], *settings))
+        pretended.calls.append((asked.document.name, *settings))
+
+    async def answer(*_: Any) -> Any:
         return off.model_dump(mode="json")
 
     pretended.calls = []
-    monkeypatch.setattr(routes, "computed", pretended)
+    monkeypatch.setattr(routes, "answered", pretended)
+    monkeypatch.setattr(routes, "answer_of", answer)
     app = create_app(Settings(data_dir=tmp_path), runner=pretend)
     with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as opened:
         opened.calls = pretended.calls
@@ -423,9 +427,9 @@ def test_api(client: Any, off: DesignReport) -> None:
     ):
         assert page.headers["content-type"].startswith("text/html")
         assert "Creality Ender 3, axis X" in page.text
-    assert client.calls == [("ender3", "x", "ce-opt", "off")]
+    assert client.calls == [("ender3", "x", "ce-opt", "off")] * 3
     client.get(f"{where}?axis=x&robust=minimax&basis=dct")
-    assert client.calls[1:] == [("ender3", "x", "dct", "minimax")]
+    assert client.calls[3:] == [("ender3", "x", "dct", "minimax")]
     for url, status, word in (
         (where, 422, "axis"),
         (f"{where}?axis=z", 422, "axis"),
@@ -438,29 +442,6 @@ def test_api(client: Any, off: DesignReport) -> None:
         assert problem.headers["content-type"] == "application/problem+json"
         assert word in problem.json()["detail"]
     assert "/v1/machines/{name}/design" in client.get("/openapi.json").json()["paths"]
-
-
-def test_who_asks_for_the_same_design_waits_for_it(machine: Machine, off: DesignReport) -> None:
-    made = []
-
-    async def ask() -> list[DesignReport]:
-        designs = routes.Designs()
-
-        def make(axis: str) -> Any:
-            async def slow() -> DesignReport:
-                made.append(axis)
-                await asyncio.sleep(0.05)
-                return off
-
-            return designs.get(machine, (axis, "ce-opt", "off"), slow)  # type: ignore[arg-type]
-
-        first, *others = [asyncio.ensure_future(make(axis)) for axis in ("x", "y", "x", "x")]
-        await asyncio.sleep(0.01)
-        first.cancel()  # has hung up; the next one goes on
-        return list(await asyncio.gather(*others))
-
-    assert asyncio.run(ask()) == [off] * 3
-    assert sorted(made) == ["x", "x", "y"]
 
 
 @pytest.mark.slow

@@ -16,7 +16,8 @@ from starlette.testclient import TestClient
 from models.machine import Machine
 from models.store import builtin_machines
 from service.api import create_app
-from service.jobs.worker import Task, run_task
+from service.jobs.task import Task
+from service.jobs.worker import run_task
 from service.machines.resolve import PinnedMachine, Resolver
 from service.machines.store import MachineStore
 from service.settings import Settings
@@ -239,7 +240,7 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
         machine="mine",
         machine_file=tmp_path / "machine.json",
         options={"method": "none"},
-        source=tmp_path / "upload.gcode",
+        sources=(tmp_path / "upload.gcode",),
         target=tmp_path / "result" / "out.gcode",
         report=tmp_path / "report",
         cache_dir=tmp_path / "cache",

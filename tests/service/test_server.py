@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import httpx2
+import psutil
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -23,11 +25,13 @@ REAL += ["--data-dir"]
 
 @contextmanager
 def server(
-    command: list[str], data_dir: Path, *more: str
+    command: list[str], data_dir: Path, *more: str, log: Path | None = None
 ) -> Iterator[tuple[httpx2.Client, subprocess.Popen]]:
+    stack = ExitStack()
     process = subprocess.Popen(
         [*command, str(data_dir), *more],
         stdout=subprocess.PIPE,
+        stderr=None if log is None else stack.enter_context(log.open("wb")),
         text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         cwd=data_dir,
@@ -44,6 +48,7 @@ def server(
         process.wait(timeout=180)
         if process.stdout is not None:
             process.stdout.close()
+        stack.close()
 
 
 def _answers(client: httpx2.Client) -> bool:
@@ -115,6 +120,26 @@ def test_a_killed_server_finishes_its_jobs_after_the_next_start(tmp_path: Path):
         assert finished(client, waiting)["state"] == "done"
         result = client.get(f"{running}/result")
         assert result.text == "; compensated\nG1 X2\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="counts processes of Linux")
+def test_logs_are_json_whatever_is_killed(tmp_path: Path):
+    log, data = tmp_path / "log", tmp_path / "data"
+    data.mkdir()
+    with server(PRETEND, data, log=log) as (client, process):
+        finished(client, post(client, b"G1 X1"))
+        job = post(client, b"slow-once")
+        until(lambda: client.get(job).json()["state"] == "running")
+        for child in psutil.Process(process.pid).children(recursive=True):
+            if "resource_tracker" not in " ".join(child.cmdline()):
+                child.kill()
+        assert finished(client, job)["state"] == "done"
+        client.get("/v1/machines/ender3/design?axis=x", headers={"Prefer": "wait=1"})
+    lines = log.read_text().splitlines()
+    assert len(lines) > 5
+    assert all("event" in json.loads(line) for line in lines)
+    assert "Traceback" not in log.read_text()
 
 
 @pytest.mark.slow

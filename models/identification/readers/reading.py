@@ -18,7 +18,7 @@ from models.identification.readers.matlab import is_matlab
 from models.identification.readers.model_files import read_json_models, read_matlab_models
 from models.identification.readers.responses import is_response, read_responses
 from models.identification.readers.settings import ReadSettings, direction_of
-from models.identification.readers.spectra import is_spectrum, read_spectrum
+from models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
 from models.identification.readers.tables import Table, as_table, check_size
 from models.identification.types import Measurement
 
@@ -26,6 +26,7 @@ __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 
 LARGEST_BYTES = 200_000_000
 _LARGEST_MODEL_BYTES = 16_000_000
+_HEAD_BYTES = 16_384
 
 _DIRECTION = r"-?\d+\.\d+,-?\d+\.\d+(?:,-?\d+\.\d+)?"
 _KLIPPER_NAME = re.compile(
@@ -103,8 +104,25 @@ def _from_content(
     if is_json:
         return read_json_models(content, name, axis, settings)
     check_size(content, name)
+    _check_spectrum(content, name)
     table = as_table(content.decode("utf-8-sig", errors="replace"), name)
     return _from_table(table, axis, settings)
+
+
+def _check_spectrum(content: bytes, name: str) -> None:
+    """Refuse a spectrum of far too many lines by its beginning, before all is taken apart."""
+    lines = content.count(b"\n")
+    head = content[: content.rfind(b"\n", 0, _HEAD_BYTES) + 1]
+    if lines <= MOST_BINS or not head:
+        return
+    table = as_table(head.decode("utf-8-sig", errors="replace"), name)
+    others = (is_klipper_log, is_m956, is_response)
+    rows = lines - head.count(b"\n") + len(table.rows)
+    if is_spectrum(table) and not any(other(table) for other in others) and rows > MOST_BINS:
+        raise ModelError(
+            f"{name}: {rows} frequencies, at most {MOST_BINS} are read; give the file as it was "
+            "written, or fewer"
+        )
 
 
 def _from_table(table: Table, axis: str | None, settings: ReadSettings) -> tuple[Measurement, ...]:

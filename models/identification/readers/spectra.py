@@ -13,11 +13,12 @@ from models.identification.readers.settings import ReadSettings
 from models.identification.readers.tables import Table
 from models.identification.types import Spectrum
 
-__all__ = ["is_spectrum", "read_spectrum"]
+__all__ = ["MOST_BINS", "is_spectrum", "read_spectrum"]
 
 Array = NDArray[np.float64]
 
-_LEAST_BINS, _MOST_BINS = 16, 2000
+MOST_BINS = 2000
+_LEAST_BINS = 16
 """Klipper writes some 130, up to 200 Hz; work and memory grow with their square."""
 _PER_HZ = "accel_per_hz"
 _SHAPER = re.compile(r"\w+\([\d./]+\)|(smooth_)?(zvd?|mzv|ei|[23]hump_ei|zvd_ei|si)")
@@ -44,7 +45,7 @@ def read_spectrum(table: Table, axis: str | None, settings: ReadSettings) -> Spe
         If there is no density, one is negative, or the tested axis has none.
     """
     names, shapers = _densities(table)
-    check_long(table, _LEAST_BINS, "frequencies", _MOST_BINS)
+    check_long(table, _LEAST_BINS, "frequencies", MOST_BINS)
     has_per_hz = _PER_HZ in table.names
     values = table.numbers(["freq", *names, *([_PER_HZ] if has_per_hz else [])])
     f_hz, psd = values[:, 0], values[:, 1 : 1 + len(names)]

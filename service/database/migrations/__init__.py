@@ -6,5 +6,5 @@ compares the two.
 
 __all__ = ["LATEST"]
 
-LATEST = "0002"
+LATEST = "0003"
 """Revision that `service.database.tables` describes."""

@@ -1,6 +1,6 @@
 /** Planned and executed motion as samples: computed when asked for, a stretch of the print at a time. */
 
-import { isAbort, request } from "../lib/api.js";
+import { computed, isAbort } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
 import { save } from "../lib/files.js";
 import { problemPanel } from "../lib/problem.js";
@@ -27,7 +27,7 @@ export function trajectories(job, signal) {
     fill(status, h("p.row", null, h("progress", { "aria-label": "Computing" }), "Computing; this takes as long as the job did up to there …"));
     try {
       const query = { format: format.value, start_s: start.value, stop_s: String(Number(start.value) + Number(length.value)) };
-      save(await (await request(where, { query, signal })).blob(), `${stem}.${start.value}s.${format.value}`);
+      save(await (await computed(where, { query, signal })).blob(), `${stem}.${start.value}s.${format.value}`);
       fill(status);
     } catch (error) {
       if (!isAbort(error)) fill(status, problemPanel(error));

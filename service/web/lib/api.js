@@ -3,6 +3,8 @@
 import { askForKey, keyHeaders, storedKey } from "./keys.js";
 import { problemOf, unreachable } from "./problem.js";
 
+const LOOK_MS = 1000;
+
 /**
  * @typedef {object} Asking
  * @property {string} [method]
@@ -38,6 +40,30 @@ export async function request(path, asking = {}) {
  */
 export async function getJson(path, asking = {}) {
   return (await request(path, asking)).json();
+}
+
+/**
+ * Send a request that a job answers. Where that takes longer than the service waits, wait for the
+ * job and ask again: the same request is then answered at once.
+ *
+ * @param {string} path
+ * @param {Asking} [asking]
+ * @param {(job: any) => void} [onProgress]
+ * @returns {Promise<Response>} A success.
+ */
+export async function computed(path, asking = {}, onProgress = () => {}) {
+  const { signal } = asking;
+  for (;;) {
+    const answer = await request(path, asking);
+    if (answer.status !== 202) return answer;
+    let job = await answer.json();
+    while (["queued", "running"].includes(job.state)) {
+      onProgress(job);
+      await pause(LOOK_MS, signal);
+      job = await getJson(job.links.self, { signal });
+    }
+    if (job.state === "failed") throw problemOf(job.error.status, JSON.stringify(job.error));
+  }
 }
 
 /**
@@ -78,6 +104,17 @@ export async function upload(path, query, body, onProgress, signal) {
  */
 export function isAbort(error) {
   return error instanceof DOMException && error.name === "AbortError";
+}
+
+/** @param {number} ms @param {AbortSignal} [signal] @returns {Promise<void>} */
+function pause(ms, signal) {
+  return new Promise((resolve, reject) => {
+    const timer = setTimeout(resolve, ms);
+    signal?.addEventListener("abort", () => {
+      clearTimeout(timer);
+      reject(new DOMException("Nobody waits any more.", "AbortError"));
+    }, { once: true });
+  });
 }
 
 /** @param {string} path @param {Asking} asking @returns {Promise<Response>} */

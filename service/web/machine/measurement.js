@@ -1,6 +1,6 @@
 /** Upload measurements, look at the fit, and keep it as a revision. */
 
-import { address, isAbort, request } from "../lib/api.js";
+import { address, computed, isAbort } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
 import { counted } from "../lib/format.js";
@@ -50,11 +50,12 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     const body = new FormData();
     for (const file of files) body.append("file", file, file.name);
     look.disabled = true;
-    fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), "Identifying; this takes some ten seconds …"));
+    const said = h("span", null, "Identifying; this takes some ten seconds …");
+    fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), said));
     try {
       const path = address(`/v1/machines/${encodeURIComponent(target)}/measurements`, {
         trial: trial ? "true" : "", base: own ? "" : base ?? start.value, author: author.value.trim(), ...test.read() });
-      const found = await (await request(path, { method: "POST", body, signal })).json();
+      const found = await (await computed(path, { method: "POST", body, signal }, (job) => fill(said, `Identifying: ${job.stage} …`))).json();
       if (!trial) {
         announce(`Revision ${found.revision.number} of ${target} is kept.`);
         const here = `#/machines/${encodeURIComponent(target)}`;

@@ -47,6 +47,13 @@ def jobs_of(client: httpx2.Client) -> list[dict[str, Any]]:
     return found
 
 
+def handed_in(client: httpx2.Client, content: bytes) -> httpx2.Response:
+    while True:
+        # Who is refused before he has sent all may not hear why.
+        with contextlib.suppress(httpx2.TransportError):
+            return client.post("/v1/jobs?machine=ender3", content=content)
+
+
 def test_what_the_reserve_is_for(small_disk: Path) -> None:
     disk = Disk(small_disk, RESERVE_MIB * MIB)
     disk.hold()
@@ -62,6 +69,9 @@ def test_what_the_reserve_is_for(small_disk: Path) -> None:
     disk.give_up()
     assert disk.free_bytes() == 4 * MIB
     assert Disk(small_disk, 0).refusal(1 << 40) is None
+    assert disk.fits_ever(44 * MIB)
+    assert not disk.fits_ever(45 * MIB)
+    assert Disk(small_disk, 0).fits_ever(1 << 40)
     foreign = small_disk / "foreign"
     foreign.unlink()
     assert Disk(small_disk / "new" / "data", RESERVE_MIB * MIB).lets_jobs_go_on
@@ -77,11 +87,7 @@ def test_a_full_disk_loses_no_job(small_disk: Path, monkeypatch: pytest.MonkeyPa
     with server(PRETEND, data) as (client, _):
 
         def post(number: int) -> httpx2.Response:
-            content = f"nap 0.2 {number}\n".encode().ljust(MIB, b";")
-            while True:
-                # Who is refused before he has sent all may not hear why.
-                with contextlib.suppress(httpx2.WriteError, httpx2.ReadError):
-                    return client.post("/v1/jobs?machine=ender3", content=content)
+            return handed_in(client, f"nap 0.2 {number}\n".encode().ljust(MIB, b";"))
 
         answers = [post(number) for number in range(50)]
         accepted = [a.headers["location"] for a in answers if a.status_code == 202]
@@ -120,3 +126,50 @@ def test_a_full_disk_loses_no_job(small_disk: Path, monkeypatch: pytest.MonkeyPa
         assert until(fetch_and_delete, 120)
         assert until(lambda: client.get("/readyz").status_code == 200, 60)
         assert post(99).status_code == 202
+
+
+@pytest.mark.slow
+def test_a_job_too_large_for_the_disk_is_told_so(
+    small_disk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STILLPATH_DISK_RESERVE_BYTES", str(RESERVE_MIB * MIB))
+    data = small_disk / "data"
+    data.mkdir()
+    foreign = small_disk / "foreign"
+
+    def post(content: bytes) -> httpx2.Response:
+        return handed_in(client, content)
+
+    def figure(name: str) -> float:
+        text = client.get("/metrics").text
+        return next(float(line.split()[1]) for line in text.splitlines() if line.startswith(name))
+
+    with server(PRETEND, data) as (client, _):
+        # Upload and result would never fit: refused before the body is read.
+        answer = post(b"nap 0.1\n".ljust(25 * MIB, b";"))
+        assert answer.status_code == 507
+        assert "50 MiB for the upload and its result" in answer.json()["detail"]
+
+        # What grows beyond the whole disk fails, and says why.
+        where = post(b"long 100").headers["location"]
+        job = until(lambda: (j := client.get(where).json())["state"] == "failed" and j, 60)
+        assert job["error"]["title"] == "The job is larger than the disk"
+        assert "60 MiB in all" in job["error"]["detail"]
+        assert client.delete(where).status_code == 204
+
+        # What would fit without a neighbour waits, says for how much, and holds nobody up.
+        foreign.write_bytes(bytes(25 * MIB))
+        where = post(b"long 34").headers["location"]
+        job = until(lambda: (j := client.get(where).json())["room_bytes"] and j, 60)
+        assert job["state"] == "queued"
+        assert 10 * MIB < job["room_bytes"] <= 31 * MIB
+        assert job["stage"].startswith("waiting for room on the disk: more than ")
+        assert figure("stillpath_jobs_waiting_for_room ") == 1
+        assert figure("stillpath_room_wanted_bytes ") == job["room_bytes"]
+        assert 0 < figure("stillpath_disk_free_bytes ") < 60 * MIB
+        other = post(b"G1 X1").headers["location"]
+        until(lambda: client.get(other).json()["state"] == "done", 60)
+        assert client.get(where).json()["attempt"] == 1
+        foreign.unlink()
+        until(lambda: client.get(where).json()["state"] == "done", 90)
+        assert client.get(where).json()["room_bytes"] is None

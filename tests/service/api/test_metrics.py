@@ -42,7 +42,7 @@ def test_figures(tmp_path: Path):
         assert found["stillpath_jobs", frozenset({("state", "failed")})] == 1
         assert found["stillpath_queue_oldest_seconds", frozenset()] == 0
         assert found["stillpath_upload_bytes_total", frozenset()] == 8
-        assert found["stillpath_workers", frozenset()] == 1
+        assert found["stillpath_workers", frozenset()] == 2
         assert found["stillpath_sse_watchers", frozenset()] == 0
         assert found["stillpath_database_up", frozenset()] == 1
         labels = {("method", "GET"), ("route", "/v1/machines/{name}"), ("status", "404")}

@@ -19,6 +19,7 @@ from service.jobs.state import (
     Event,
     Failed,
     Job,
+    JobKind,
     JobState,
     Lost,
     Progressed,
@@ -320,7 +321,38 @@ def test_what_has_been_kept_long_enough(store: JobStore):
     assert expiry.old_jobs(10.0) == []
 
 
+def test_answers_are_kept_for_a_shorter_time(store: JobStore):
+    file = store.add(make_job())
+    design = store.add(make_job(kind=JobKind.DESIGN))
+    for job in (file, design):
+        store.apply(job.id, Cancelled(3000.0))
+    expiry = Expiry(store.engine)
+    expiry.passed(10.0)
+    assert expiry.old_jobs(5.0, 20.0) == [design.id]
+    assert expiry.old_jobs(20.0) == sorted([file.id, design.id])
+
+
 # The queue
+
+
+def test_short_jobs_have_a_line_of_their_own(store: JobStore):
+    files = [store.add(make_job(created_at=1000.0 + n)).id for n in range(2)]
+    short = {"kind": JobKind.DESIGN}
+    annas = [store.add(make_job(created_at=1010.0 + n, **short)).id for n in range(2)]
+    bobs = store.add(make_job(owner="bob", created_at=1020.0, **short)).id
+    traced = store.add(make_job(created_at=1030.0, kind=JobKind.TRAJECTORIES)).id
+    assert [job.id for job in store.next_queued(9, short=True)] == [annas[0], bobs, annas[1]]
+    # What is asked about a job that is done comes before its owner's further files.
+    assert [job.id for job in store.next_queued(9)] == [traced, *files]
+    # Positions count within a line, and so does what runs.
+    assert store.queue_positions()[bobs] == 1
+    assert store.claim(files[0], 1500.0, "w") is not None
+    assert [job.id for job in store.next_queued(1, short=True)] == [annas[0]]
+    assert store.claim(annas[0], 1500.0, "w") is not None
+    assert [job.id for job in store.next_queued(9, short=True)] == [bobs, annas[1]]
+    assert [job.kind for job in store.page(None, kinds=[JobKind.TRAJECTORIES], limit=9).jobs] == [
+        JobKind.TRAJECTORIES
+    ]
 
 
 def test_owners_take_turns(store: JobStore):

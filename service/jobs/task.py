@@ -1,0 +1,65 @@
+"""One attempt at a job, as whoever computes sees it: plain values, and files on this computer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.jobs.state import JobKind
+from service.pipeline.progress import Progress
+
+if TYPE_CHECKING:
+    from service.machines.resolve import PinnedMachine
+
+__all__ = ["Runner", "Task"]
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One attempt at a job.
+
+    Attributes
+    ----------
+    machine_file : Path
+        Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`).
+    sources : tuple of Path
+        To be read only.
+    target, report : Path
+        File and folder to be made; the folders above exist.
+    cache_dir : Path
+        What is worth keeping between jobs.
+    """
+
+    job_id: str
+    attempt: int
+    machine: str
+    machine_file: Path
+    options: dict[str, Any]
+    sources: tuple[Path, ...]
+    target: Path
+    report: Path
+    cache_dir: Path
+    kind: JobKind = JobKind.COMPENSATION
+
+    @property
+    def source(self) -> Path:
+        """The only source."""
+        (source,) = self.sources
+        return source
+
+    def pinned(self) -> PinnedMachine:
+        """Return the machine.
+
+        Raises
+        ------
+        ModelError
+        """
+        from service.machines.resolve import PinnedMachine
+
+        return PinnedMachine.read(self.machine_file, self.machine)
+
+
+Runner = Callable[[Task, Callable[[Progress], None]], dict[str, Any]]
+"""Does the work of a task and returns the figures that lists show; importable by its name."""
