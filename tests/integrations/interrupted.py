@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 from models.machine import Machine
 from tests.integrations.klipper_host import Steps, printer_cfg, steps_of
 
-__all__ = ["EVENTS", "MACROS", "SAMPLE_S", "Asked", "asked", "disturbed", "run", "stream_lines", "two_objects"]
+__all__ = [
+    "EVENTS",
+    "ONCE",
+    "SAMPLE_S",
+    "Asked",
+    "asked",
+    "disturbed",
+    "homed",
+    "run",
+    "two_objects",
+]
 
 MACROS = (Path(__file__).resolve().parents[2] / "integrations/klipper/stillpath.cfg").read_text()
 USERS = """
@@ -33,7 +43,7 @@ _MEAN = 4
 EVENTS = {
     "nothing": "",
     "PAUSE, RESUME": "PAUSE\nG4 P300\nRESUME",
-    "babystep": "SET_GCODE_OFFSET Z_ADJUST=.05 MOVE=1\nG4 P50\nSET_GCODE_OFFSET Z_ADJUST=-.05 MOVE=1",
+    "babystep": "SET_GCODE_OFFSET Z_ADJUST=.05 MOVE=1",
     "host stalls": "G4 P2500",
     "M220 S200": "M220 S200",
     "M220 S50": "M220 S50",
@@ -41,7 +51,7 @@ EVENTS = {
     "CANCEL_PRINT": "CANCEL_PRINT",
     "started at a layer": "",
 }
-_ONCE = ("EXCLUDE_OBJECT", "CANCEL_PRINT", "started at a layer")
+ONCE = ("EXCLUDE_OBJECT", "CANCEL_PRINT", "started at a layer")
 """What cannot happen twice in a print."""
 
 
@@ -71,34 +81,33 @@ def two_objects(layers: int = 2) -> str:
     return "\n".join(lines) + "\n"
 
 
-def stream_lines(text: str) -> list[int]:
-    """Numbers of the moves inside streams."""
-    found, inside = [], False
-    for number, line in enumerate(text.split("\n")):
-        if "; stillpath: stream " in line:
-            inside = line.endswith("on")
-        elif inside and line.startswith("G1") and ("X" in line or "Y" in line):
-            found.append(number)
-    return found
+def homed(machine: Machine) -> Machine:
+    """The machine, homed where the host's endstops are."""
+    firmware = machine.firmware.model_copy(update={"home_mm": (0.0, 0.0, 0.0)})
+    return machine.model_copy(update={"firmware": firmware})
 
 
-def disturbed(text: str, event: str, times: int, fastest: int | None = None) -> list[str]:
+def disturbed(text: str, event: str, times: int) -> list[str]:
     """The files that come of a file when something happens at so many lines of its streams.
 
-    One file with all of them, or one for each where it can happen only once.
+    One file with all of them, or one for each where it can happen only once. The fastest line is
+    among them.
     """
-    lines, places = text.split("\n"), stream_lines(text)
-    chosen = {places[int(k)] for k in np.linspace(3, len(places) - 3, times)}
-    chosen |= set() if fastest is None else {fastest}
     if event == "nothing":
         return [text]
+    lines, speeds = text.split("\n"), _stream_lines(text)
+    places = list(speeds)
+    chosen = {places[int(k)] for k in np.linspace(3, len(places) - 3, times - 1)}
+    chosen.add(max(places, key=speeds.__getitem__))
     if event == "started at a layer":
-        head = lines[: next(k for k, line in enumerate(lines) if line.startswith("EXCLUDE_OBJECT_D"))]
+        head = lines[
+            : next(k for k, line in enumerate(lines) if line.startswith("EXCLUDE_OBJECT_D"))
+        ]
         return ["\n".join([*head, *lines[k:]]) for k in sorted(chosen)]
     script = EVENTS[event].split("\n")
     if event == "CANCEL_PRINT":
         return ["\n".join([*lines[: k + 1], *script, ""]) for k in sorted(chosen)]
-    if event in _ONCE:
+    if event in ONCE:
         return ["\n".join([*lines[: k + 1], *script, *lines[k + 1 :]]) for k in sorted(chosen)]
     whole: list[str] = []
     for k, line in enumerate(lines):
@@ -116,6 +125,18 @@ def asked(steps: Steps, machine: Machine) -> Asked:
 def run(text: str, machine: Machine, folder: Path) -> Steps:
     """Let the host run a file with our macros behind somebody's own."""
     return steps_of(text, printer_cfg(machine, USERS, MACROS), folder)
+
+
+def _stream_lines(text: str) -> dict[int, float]:
+    """Numbers of the moves inside streams, and their F."""
+    found, inside, feed = {}, False, 0.0
+    for number, line in enumerate(text.split("\n")):
+        if "; stillpath: stream " in line:
+            inside = line.endswith("on")
+        elif inside and line.startswith("G1") and ("X" in line or "Y" in line):
+            feed = float(line.rpartition("F")[2]) if "F" in line else feed
+            found[number] = feed
+    return found
 
 
 def _change(velocity: NDArray[np.float64], within_s: float) -> float:
