@@ -12,6 +12,7 @@ from models.machine import Machine
 from models.store import load_machine
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file, plan_file
+from service.proof.motor_test import borne, levels_of, motor_test
 from tests.integrations.interrupted import (
     EVENTS,
     ONCE,
@@ -68,6 +69,18 @@ def test_the_host_moves_as_we_read_the_file_back(
 def test_a_slicers_file_moves_as_we_read_it_back(tmp_path: Path) -> None:
     layers = GEAR.read_text().partition(";LAYER:2")[0]
     check_motion(*write(layers, homed(load_machine("ender3")), tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_a_search_for_lost_steps_asks_for_what_it_says(name: str, tmp_path: Path) -> None:
+    machine = homed(load_machine(name))
+    text = motor_test(machine, 12_000.0)
+    best = levels_of(text)[-1]
+    found = asked(run(text, machine, tmp_path), machine)
+    assert 0.95 * best.accel_mm_s2 < found.ramp_mm_s / 10e-3 < 1.3 * best.accel_mm_s2
+    assert 0.9 * best.speed_step_mm_s < found.step_mm_s < 1.1 * best.speed_step_mm_s + 12.0
+    # No endstop is hit in batch mode, so that counters differ; but there are as many as needed.
+    borne(levels_of(text), (tmp_path / "klippy.log").read_text(), 16)
 
 
 def check_motion(file: Path, machine: Machine, folder: Path) -> None:
