@@ -67,6 +67,8 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
     place = f"G1 X{middle[0]:.3f} Y{middle[1]:.3f} F6000"
     lines = ["; STILLPATH_OFF", "; a search for lost steps: nothing is heated, nothing printed"]
     lines += ["G28", "G90", "M83", f"G1 Z{_HEIGHT_MM:g} F600", *home]
+    # A shaper would spare the motors what a stream asks of them.
+    lines += voice.shaper_off.decode().splitlines()
     for number, level in enumerate(levels, 1):
         accel, step = level.accel_mm_s2, level.speed_step_mm_s
         text = f"level {number}: accel {accel:.0f} mm/s2, step {step:.1f} mm/s"
@@ -82,7 +84,9 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
             )
             lines += _corners(middle, direction, level)
         lines += [voice.limits(_own(firmware)).decode().strip(), *home]
-    return "\n".join([*lines, "M118 the search is over", ""])
+    shaper = voice.shaper_on
+    over = "; the shaper stays off until FIRMWARE_RESTART" if shaper is None else shaper.decode()
+    return "\n".join([*lines, *over.splitlines(), "M118 the search is over", ""])
 
 
 def levels_of(text: str) -> list[Level]:
