@@ -54,7 +54,7 @@ def test_no_break_asks_for_more_than_the_motors_bear(
 ) -> None:
     file, machine = written
     bears = machine.command
-    for text in disturbed(file.read_text(), event, 4 if event in ONCE else 20):
+    for text in disturbed(file.read_text(), event, 3 if event in ONCE else 20):
         found = asked(run(text, machine, tmp_path), machine)
         assert found.step_mm_s <= bears.speed_step_mm_s
         assert found.ramp_mm_s <= bears.speed_step_mm_s + 10e-3 * bears.accel_mm_s2
