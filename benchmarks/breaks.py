@@ -6,11 +6,17 @@ rules, and goes on from there. The table gives the largest change of velocity of
 ms around all breaks, at some speed factors (M220), beside what the machine says its motors bear;
 and the report's contour error of one model (a prediction), print time, segments a second and put
 back pieces, for comparison with streams that ran under other limits.
+
+`--corpus SECONDS` takes so much of every file of the corpus instead, and gives the worst of each
+machine and firmware.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
+import re
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +25,7 @@ import numpy as np
 from firmwares import machine_with, without_macros
 from readback import find_input, plain_copy, shared_folder
 
+from gcode.errors import GcodeError
 from gcode.firmware.planning import plan_moves
 from gcode.firmware.registry import kit
 from gcode.interpreter import Interpreter
@@ -30,11 +37,16 @@ from service.pipeline.files import default_cache_dir
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests.e2e.round_trip import corpus_files, corpus_folder, made_to_fit, text_of
+
 FILES = ("cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v24-250")
 FIRMWARES = ("klipper", "marlin", "reprapfirmware")
+FOUR = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
 FACTORS = (0.5, 1.0, 2.0)
 _SAMPLE_S, _REACH = 5e-5, 20
+_SAME_MM = 1e-4
 _AROUND = 60
 """Moves that are looked at before and behind a break."""
 
@@ -78,13 +90,79 @@ def worst_steps(written: Path, machine: Machine, breaks: int) -> list[float]:
     total = max(sum(map(len, ours)), 1)
     for block, rows in zip(blocks, ours, strict=True):
         chosen = rows[rng.random(len(rows)) < breaks / total]
+        # Homing and the like: behind it the machine is elsewhere.
+        apart = np.abs(block.moves.start_mm[1:, :3] - block.moves.end_mm[:-1, :3]) > _SAME_MM
+        jumps = np.concatenate([[0], np.flatnonzero(apart.any(axis=1)) + 1, [len(block.moves)]])
         for k in chosen.tolist():
-            for part in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
+            behind = np.searchsorted(jumps, k, side="right")
+            low, high = int(jumps[behind - 1]), int(jumps[behind])
+            for part in (slice(max(k - _AROUND, low), k), slice(k, min(k + _AROUND, high))):
                 for i, factor in enumerate(FACTORS):
                     moves = rows_of(block.moves, part)
                     moves = replace(moves, speed_mm_s=factor * moves.speed_mm_s)
                     worst[i] = max(worst[i], velocity_step(moves, list(block.limits), machine))
     return worst
+
+
+def cut(data: bytes, seconds: float) -> bytes:
+    """The beginning of a file that takes about so long, by lengths and F alone."""
+    place, feed, passed, whole = {b"X": 0.0, b"Y": 0.0}, 1500.0, 0.0, []
+    for line in data.splitlines(keepends=True):
+        whole.append(line)
+        if not re.match(rb"\s*G[0-3]\b", line):
+            continue
+        words = re.findall(rb"([XYF])(-?[\d.]+)", line.partition(b";")[0])
+        before = dict(place)
+        for letter, number in words:
+            feed = float(number) or feed if letter == b"F" else feed
+            if letter != b"F":
+                place[letter] = float(number)
+        passed += math.dist(before.values(), place.values()) * 60.0 / feed
+        if passed > seconds:
+            break
+    return b"".join(whole)
+
+
+def over_the_corpus(
+    seconds: float, machines: list[str], firmwares: list[str], breaks: int, folder: Path
+) -> None:
+    """Print the worst of all files for each machine and firmware, and which file it was."""
+    texts = {name: cut(text_of(corpus_folder() / name), seconds) for name in corpus_files()}
+    head = " ".join(f"{f'{100 * factor:.0f} %':>6}" for factor in FACTORS)
+    print(f"{'machine':15}{'firmware':15}{'bears':>6} {head}  files  worst file")
+    source, target = folder / "in.gcode", folder / "out.gcode"
+    for machine_name in machines:
+        for firmware in firmwares:
+            worst, count, which = [0.0] * len(FACTORS), 0, ""
+            for name, text in texts.items():
+                machine = load_machine(machine_name)
+                if firmware != "klipper":
+                    machine = machine_with(machine_name, firmware, 80.0)
+                lines = text.splitlines(keepends=True)
+                source.write_bytes(
+                    b"".join(x for x in lines if not x.startswith(b"EXCLUDE_OBJECT_DEFINE"))
+                )
+                machine = made_to_fit(machine, text)
+                try:
+                    compensate_file(
+                        source,
+                        target,
+                        machine,
+                        Options(robust="off"),
+                        cache_dir=default_cache_dir(),
+                    )
+                except GcodeError:
+                    continue
+                found = worst_steps(target, machine, breaks)
+                count += max(found) > 0.0
+                which = name if max(found) > max(worst) else which
+                worst = [max(pair) for pair in zip(worst, found, strict=True)]
+            print(
+                f"{machine_name:15}{firmware:15}{machine.command.speed_step_mm_s:6.0f} "
+                + " ".join(f"{step:6.0f}" for step in worst)
+                + f" {count:6d}  {Path(which).name.split('.gcode')[0]}",
+                flush=True,
+            )
 
 
 def main() -> None:
@@ -94,7 +172,13 @@ def main() -> None:
     parser.add_argument("--firmwares", nargs="+", default=list(FIRMWARES))
     parser.add_argument("--accel-mm-s2", type=float, help="what the motors bear, of all machines")
     parser.add_argument("--breaks", type=int, default=300, help="lines of each file")
+    parser.add_argument("--corpus", type=float, metavar="SECONDS", help="of every file")
     given = parser.parse_args()
+    if given.corpus:
+        machines = given.machines if given.machines != list(MACHINES) else list(FOUR)
+        with tempfile.TemporaryDirectory(prefix="stillpath-breaks-") as folder:
+            over_the_corpus(given.corpus, machines, given.firmwares, given.breaks, Path(folder))
+        return
     head = " ".join(f"{f'{100 * factor:.0f} %':>6}" for factor in FACTORS)
     print(
         f"{'file':26}{'machine':15}{'firmware':15}{'bears':>6} {head}  rms um  time s  seg/s back"

@@ -41,8 +41,8 @@ EndGcode = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add coupon, tower, ring-test and verify to a command line."""
-    for command in (coupon, tower, ring_test, verify):
+    """Add coupon, tower, ring-test, motor-test and verify to a command line."""
+    for command in (coupon, tower, ring_test, motor_test, verify):
         app.command()(command)
 
 
@@ -123,6 +123,33 @@ def ring_test(
     with progress_shown("stillpath") as progress:
         made = write_ring_test(found.machine, check_output(output), settings, progress=progress)
     print_proof(made, found.warnings)
+
+
+def motor_test(
+    machine: MachineOption,
+    output: Output,
+    most: Annotated[
+        float, typer.Option("--to", metavar="MM_S2", help="The highest acceleration to try.")
+    ] = 20_000.0,
+) -> None:
+    """Write a search for lost steps at rising limits (Klipper). Nothing is heated or printed.
+
+    Then `stillpath machines motors NAME OUT CONSOLE` reads what the console said.
+    """
+    found = open_machines().for_job(machine, files=True)
+
+    from service.proof.motor_test import levels_of
+    from service.proof.motor_test import motor_test as written
+
+    text = written(found.machine, most)
+    check_output(output).write_text(text, encoding="utf-8")
+    for number, level in enumerate(levels_of(text), 1):
+        accel, step = level.accel_mm_s2, level.speed_step_mm_s
+        typer.echo(f"level {number}: {accel:.0f} mm/s2, steps of {step:.0f} mm/s")
+    typer.echo(
+        f"Run {output} with a hand on the switch. Then copy the console (or klippy.log) to a file: "
+        f"stillpath machines motors {found.machine.name} {output} CONSOLE"
+    )
 
 
 def verify(

@@ -9,6 +9,7 @@ import pytest
 
 from gcode.firmware.encoding import as_moves, limits_in_force
 from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
 from gcode.pieces import Piece
 from gcode.sampler import sample_phases
 from gcode.types import Limits, Moves, rows_of
@@ -71,3 +72,40 @@ def test_no_break_asks_for_more_than_the_motors_bear(
         for rows in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
             worst = max(worst, velocity_step(rows_of(moves, rows), limits, machine))
     assert worst <= times * machine.command.speed_step_mm_s, worst
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0])
+def test_waits_of_a_queue_leave_no_motor_behind(factor: float) -> None:
+    """RepRapFirmware holds moves back where they come faster than it prepares them: late steps.
+
+    What the motor should have gone meanwhile stays below a quarter of a full step (.2 mm), where
+    it still has most of its torque.
+    """
+    machine = ender3_with("reprapfirmware")
+    phases = plan_moves(*written(*compensated(HEAD + BODY, machine), factor), machine)
+    ends_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    waits_s = np.maximum(phases.t_s[1:] - ends_s[:-1], 0.0)
+    late_mm = waits_s * np.minimum(phases.end_mm_s[:-1], phases.start_mm_s[1:])
+    assert late_mm.max() <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "most"),
+    [
+        # Around small angles velocity steps by 1.82 times the speed through a square corner.
+        ("klipper", 1.83 * 5.0 + 1e-3 * 5000.0),
+        # sqrt(8 a J)
+        ("marlin", 31.0 + 1e-3 * 2000.0),
+        # M566 of both axes
+        ("reprapfirmware", 1.42 * 10.0 + 1e-3 * 6000.0),
+    ],
+)
+def test_a_stream_that_is_begun_at_a_layers_line(kind: str, most: float) -> None:
+    """What an emergency resume does: no "stream on" was read, the printer's own limits hold."""
+    machine = ender3_with(kind)
+    moves, _ = written(*compensated(HEAD + BODY, machine), 1.0)
+    own = replace(moves, limits_id=np.zeros_like(moves.limits_id))
+    limits = [kit(machine).initial_limits()]
+    parts = (slice(k, k + _AROUND) for k in range(5, len(own), 7))
+    worst = max(velocity_step(rows_of(own, part), limits, machine) for part in parts)
+    assert worst <= most < machine.command.speed_step_mm_s

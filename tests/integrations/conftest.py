@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.integrations.klipper_host import NO_KLIPPER
 from tests.integrations.moonraker import NO_MOONRAKER
 from tests.integrations.octoprint import NO_OCTOPRINT
 from tests.integrations.running import Running
@@ -46,3 +47,4 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     tell(terminalreporter, NOT_HERE, "a slicer (tests/integrations/get-slicers)")
     tell(terminalreporter, NO_OCTOPRINT, "OctoPrint (tests/get-tools)")
     tell(terminalreporter, NO_MOONRAKER, "Moonraker (tests/get-tools)")
+    tell(terminalreporter, NO_KLIPPER, "Klipper's host (tests/get-tools)")

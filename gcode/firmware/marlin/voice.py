@@ -14,8 +14,8 @@ __all__ = ["MarlinVoice"]
 
 _NOTES = (
     "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",
-    "are raised and every move is timed: leave the speed at 100 %. To stop in there,",
-    "stop at once (M112) or let the print end: a pause would park at raised limits.",
+    "are the motors' and every move is timed: leave the speed at 100 %. A print that is",
+    "stopped in there leaves them in force: send M501; see Stillpath's docs/safety.md.",
 )
 
 _FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*[A-Z]", re.IGNORECASE)

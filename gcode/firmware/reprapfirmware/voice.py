@@ -31,8 +31,8 @@ class RepRapVoice:
 
     notes = (
         "between 'stream on' and 'stream off' M201, M203, M204 and M566 are raised, M593 and",
-        "M572 are off, and every move is timed: leave the speed slider at 100 %. pause.g and",
-        "cancel.g must put your own values back first: see Stillpath's docs/safety.md.",
+        "M572 are off, and every move is timed: leave the speed slider at 100 %. cancel.g",
+        "must put your own values back first: see Stillpath's docs/safety.md.",
     )
     stand_still = b"M400\n"
     positioning_sets_extruder = False

