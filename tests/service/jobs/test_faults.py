@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from service.database.engine import DatabaseAway
-from service.jobs.state import WAITING_FOR_ROOM, JobState
+from service.jobs.state import JobState
 from tests.service.jobs.site import ROOT, Process, Site, until
 
 pytestmark = [
@@ -140,7 +140,7 @@ def test_silence_is_a_loss(site: Site):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounts a small disk")
-def test_a_job_that_has_no_room_waits_and_others_go_on(tmp_path: Path):
+def test_a_job_larger_than_the_disk_fails_and_others_go_on(tmp_path: Path):
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
@@ -156,9 +156,9 @@ def test_a_job_that_has_no_room_waits_and_others_go_on(tmp_path: Path):
                 after = site.submit("G1")
                 assert site.ended(small).state is JobState.DONE
                 assert site.ended(after).state is JobState.DONE
-                until(lambda: site.get(large).stage == WAITING_FOR_ROOM)
-                assert site.get(large).losses == 0
-                site.cancel(large)
+                job = site.ended(large)
+                assert (job.state, job.losses) == (JobState.FAILED, 0)
+                assert job.problem["title"] == "The job is larger than the disk"
             site.check_files()
         finally:
             site.close()
