@@ -65,10 +65,11 @@ class Ringing(Aligned):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one case showed: report and execution."""
+    """What one case showed: report and execution; how much longer it takes than the file came."""
 
     max_um: tuple[float, float]
     time_s: tuple[float, float]
+    longer: float
     left_alone_s: float
 
     @property
@@ -95,6 +96,7 @@ def compared(file: Path, machine: Machine, options: Options) -> Row:
     return Row(
         (reported.extruding.contour_max_um, 1e3 * judge.contour.max),
         (result.time_s, written.time_s),
+        written.time_s / own.time_s - 1.0,
         result.left_alone_s,
     )
 
@@ -117,7 +119,8 @@ def main() -> None:
                 (a, b), (s, t) = row.max_um, row.time_s
                 print(
                     f"{file.stem[:32]:34}{machine:15}{a:7.1f} {b:7.1f} {100 * (a / b - 1):6.1f}  "
-                    f"{s:9.2f} {t:9.2f} {100 * (s / t - 1):8.4f}  "
+                    f"{s:9.2f} {t:9.2f} {100 * (s / t - 1):8.4f} "
+                    f"{100 * row.longer:+6.2f} % than as sliced, "
                     f"left alone {row.left_alone_s:.1f} s"
                     f"{'  MISS' if row.missed else ''}",
                     flush=True,
