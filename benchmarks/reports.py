@@ -76,8 +76,8 @@ class Row:
     def missed(self) -> bool:
         """Tell whether they differ by too much."""
         return (
-            abs(self.max_um[0] / self.max_um[1] - 1.0) > _MAX_SHARE
-            or abs(self.time_s[0] / self.time_s[1] - 1.0) > _TIME_SHARE
+            abs(self.max_um[0] - self.max_um[1]) > _MAX_SHARE * self.max_um[1]
+            or abs(self.time_s[0] - self.time_s[1]) > _TIME_SHARE * self.time_s[1]
         )
 
 
@@ -118,7 +118,7 @@ def main() -> None:
                 missed += row.missed
                 (a, b), (s, t) = row.max_um, row.time_s
                 print(
-                    f"{file.stem[:32]:34}{machine:15}{a:7.1f} {b:7.1f} {100 * (a / b - 1):6.1f}  "
+                    f"{file.stem[:32]:34}{machine:15}{a:7.1f} {b:7.1f} {100 * (a - b) / max(b, 1e-9):6.1f}  "
                     f"{s:9.2f} {t:9.2f} {100 * (s / t - 1):8.4f} "
                     f"{100 * row.longer:+6.2f} % than as sliced, "
                     f"left alone {row.left_alone_s:.1f} s"
