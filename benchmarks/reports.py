@@ -118,7 +118,8 @@ def main() -> None:
                 missed += row.missed
                 (a, b), (s, t) = row.max_um, row.time_s
                 print(
-                    f"{file.stem[:32]:34}{machine:15}{a:7.1f} {b:7.1f} {100 * (a - b) / max(b, 1e-9):6.1f}  "
+                    f"{file.stem[:32]:34}{machine:15}{a:7.1f} {b:7.1f} "
+                    f"{100 * (a - b) / max(b, 1e-9):6.1f}  "
                     f"{s:9.2f} {t:9.2f} {100 * (s / t - 1):8.4f} "
                     f"{100 * row.longer:+6.2f} % than as sliced, "
                     f"left alone {row.left_alone_s:.1f} s"
