@@ -4,7 +4,9 @@ For each file and machine the best shaper is tuned on the file as golden/README.
 `quality.py`) and judged at the file's own accelerations: the contour error (rms while extruding) of
 the worst plant, nominal or member, is the budget. The file is then compensated within that budget,
 and the written file is judged by the same judge, from its bytes alone: interpreted, planned by the
-firmware's rules, sampled at 10 kHz, answered by the continuous plants.
+firmware's rules, sampled at 10 kHz, answered by the continuous plants. By its report, no class of
+moves that was raised may be above the budget ("above" counts those that are), and the command must
+keep the machine's own limit of acceleration ("accel": its largest in % of that).
 
 A quicker file has other times, so paths compare by filament: where the written file has fed so
 much, the nozzle should be where the original is after as much.
@@ -46,6 +48,7 @@ from gcode.types import Phases
 from models.store import load_machine
 from service.pipeline.files import default_cache_dir
 from service.pipeline.options import Options
+from service.pipeline.result import BudgetClass
 from service.pipeline.road import compensate_file
 
 Array = NDArray[np.float64]
@@ -74,6 +77,9 @@ class Row:
     shaper_s: float | None
     factors: str
     put_back_percent: float
+    classes_above: int
+    accel_share: float
+    """Largest acceleration of the command over what the machine allows."""
     cpu_s: float
 
     @property
@@ -83,8 +89,9 @@ class Row:
 
     @property
     def missed(self) -> bool:
-        """Tell whether the error is larger than the shaper's."""
-        return self.ours_worst > self.shaper_worst or self.ours_rms > self.shaper_rms
+        """Tell whether the error is larger than the shaper's, or a limit is not kept."""
+        larger = self.ours_worst > self.shaper_worst or self.ours_rms > self.shaper_rms
+        return larger or self.classes_above > 0 or self.accel_share > 1.0
 
 
 def main() -> None:
@@ -127,7 +134,7 @@ def main() -> None:
     met = print_means(rows) and not failures
     cpu_s, above = sum(row.cpu_s for row in rows), sum(row.missed for row in rows)
     print(
-        f"{len(rows)} cases, {above} above the shaper's error, {failures} failed; "
+        f"{len(rows)} cases, {above} above the shaper's error or a limit, {failures} failed; "
         f"{cpu_s / 60:.1f} CPU min, {(time.monotonic() - began) / 60:.1f} min"
     )
     sys.exit(0 if met else 1)
@@ -168,8 +175,16 @@ def judged(task: Task) -> Row:
         shaper_s=result.budget.shaper_time_s,
         factors=", ".join(f"{c.name} {c.acceleration_factor:.3g}" for c in result.budget.classes),
         put_back_percent=100.0 * result.put_back_extruding_share,
+        classes_above=sum(_above(one, worst_um) for one in result.budget.classes),
+        accel_share=result.peak_accel_mm_s2 / machine.command.accel_mm_s2,
         cpu_s=time.process_time() - began,
     )
+
+
+def _above(one: BudgetClass, budget_um: float) -> bool:
+    """Tell whether a class that was raised is above what it may have."""
+    allowed_um = 2.0 * budget_um if one.name == "travel" else budget_um
+    return one.acceleration_factor > 1.0 and one.contour_rms_um > allowed_um
 
 
 class Laid(Timed):
@@ -269,7 +284,8 @@ def print_head() -> None:
     print("s of the file, with the best shaper at its error, and written; factors of acceleration")
     print(
         f"{'file':26}{'machine':14}{'shaper':>13} {'ours':>13} {'max':>5} {'original':>9} "
-        f"{'shaper':>8} {'written':>8} {'saved':>7} {'put':>6} {'CPU':>4}  factors"
+        f"{'shaper':>8} {'written':>8} {'saved':>7} {'put':>6} {'above':>5} {'accel':>6} "
+        f"{'CPU':>4}  factors"
     )
 
 
@@ -279,7 +295,8 @@ def print_row(r: Row) -> None:
         f"{r.file[:25]:26}{r.machine[:13]:14}{r.shaper_rms:6.2f}/{r.shaper_worst:<6.2f} "
         f"{r.ours_rms:6.2f}/{r.ours_worst:<6.2f} {r.ours_max:5.0f} {r.original_s:9.1f} {shaper_s} "
         f"{r.written_s:8.1f} {100 * (1 - r.ratio):6.1f}% {r.put_back_percent:5.2f}% "
-        f"{r.cpu_s:4.0f}  {'ABOVE  ' if r.missed else ''}{r.factors}",
+        f"{r.classes_above:5} {100 * r.accel_share:5.0f}% {r.cpu_s:4.0f}  "
+        f"{'ABOVE  ' if r.missed else ''}{r.factors}",
         flush=True,
     )
 

@@ -80,7 +80,7 @@ def find_input(name: str, shared: Path | None) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    for folder in ("own", "third-party"):
+    for folder in ("own", "third_party", "third-party"):
         for ending in (".gcode.gz", ".gcode"):
             if shared is not None and (shared / "corpus" / folder / f"{name}{ending}").is_file():
                 return shared / "corpus" / folder / f"{name}{ending}"
@@ -303,7 +303,7 @@ class Aligned(Timed):
             inside = (self.written_rows[0] >= a) & (self.written_rows[0] < b)
             if not inside.any():
                 continue
-            part = object.__new__(Aligned)
+            part = object.__new__(type(self))
             part._path, part._written = self._path, _rows(written.phases, a, b)
             part._from_s, part._until_s = self._from_s[inside], self._until_s[inside]
             part._begin_s = self._begin_s[inside]

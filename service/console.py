@@ -83,7 +83,8 @@ def print_result(result: Result, console: Console | None = None) -> None:
     if any(channel.name == "after" for channel in result.channels) and result.advice is None:
         console.print(
             f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
-            f"{100 * result.put_back_extruding_share:.2f} % of the extruding time"
+            f"{100 * result.put_back_extruding_share:.2f} % of the extruding time; left alone by "
+            f"rule: {left_alone(result)}"
         )
     if result.slicer_time_s is not None:
         console.print(
@@ -92,6 +93,15 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def left_alone(result: Result) -> str:
+    """Return how much of the print keeps its own lines by rule."""
+    share = result.left_alone_s / result.time_s if result.time_s else 0.0
+    return (
+        f"{100 * share:.2f} % of the print time ({result.left_alone_s:.1f} s, "
+        f"{result.left_alone_extruding_s:.1f} s extruding)"
+    )
 
 
 def budget_line(budget: BudgetFigures) -> str:

@@ -22,6 +22,7 @@ from simulation._contour_kernels import (
 )
 
 __all__ = [
+    "ChosenMeter",
     "ContourErrors",
     "ContourMeter",
     "GroupTally",
@@ -212,6 +213,56 @@ class ContourMeter:
             self._path = self._path[:, drop:].copy()
             self._path_from += drop
         return ContourErrors(first, self._stride, errors)
+
+
+class ChosenMeter:
+    """Contour errors of chosen samples of motions beside one path that arrive in blocks.
+
+    Parameters
+    ----------
+    dt_s, window_s, channels
+        As `ContourMeter` has them.
+    """
+
+    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.08, channels: int = 1) -> None:
+        self._window = round(window_s / dt_s)
+        self._path = np.zeros((2, 0))
+        self._points = np.zeros((channels, 2, 0))
+        self._centres = np.zeros(0, np.int64)
+
+    def push(self, y_d_mm: Array, y_mm: Array, chosen: NDArray[np.int64]) -> Array:
+        """Add a block as `ContourMeter` has it, and which of its samples are to be measured.
+
+        Returns the errors (channels, m) of the next chosen samples, as many as have their window.
+        """
+        self._centres = np.append(self._centres, chosen + self._path.shape[1])
+        self._path = np.concatenate([self._path, y_d_mm], axis=1)
+        self._points = np.concatenate([self._points, y_mm[:, :, chosen]], axis=2)
+        return self._measure(self._path.shape[1] - self._window)
+
+    def flush(self) -> Array:
+        """Return the errors of the samples still waiting; their window ends with the motion."""
+        return self._measure(self._path.shape[1])
+
+    def _measure(self, stop: int) -> Array:
+        count = int(np.searchsorted(self._centres, stop))
+        errors = np.empty((len(self._points), count))
+        if count:
+            begin = max(int(self._centres[0]) - self._window, 0)
+            path = np.ascontiguousarray(self._path[:, begin:])
+            contour_errors(
+                path,
+                *_room_for_tables(path),
+                np.ascontiguousarray(self._points[:, :, :count]),
+                self._centres[:count] - begin,
+                self._window,
+                errors,
+            )
+        self._centres, self._points = self._centres[count:], self._points[:, :, count:]
+        first = int(self._centres[0]) if len(self._centres) else self._path.shape[1]
+        drop = max(first - self._window, 0)
+        self._path, self._centres = self._path[:, drop:], self._centres - drop
+        return errors
 
 
 class MotionMeter:

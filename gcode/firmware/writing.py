@@ -75,6 +75,8 @@ class StreamWriter:
         self._stamp = stamp
         self._streaming = False
         self._shaper_off = False
+        self._marked: Limits | None = None
+        """The file's limits, in force with the mark of a stream because the shaper stays off."""
         self._shaper_lines: dict[bytes, bytes] = {}
         """The file's own lines, the last of each form."""
         self._shaper_names: dict[str, tuple[int, int]] = {}
@@ -104,6 +106,14 @@ class StreamWriter:
             f"The file sets the firmware's input shaper: {said}. Compensation and shaper do not "
             "add up: in compensated stretches it is off, around them as the file sets it."
         )
+
+    @property
+    def switching_off(self) -> bytes:
+        """Lines that a piece that comes now begins with to switch the shaper off; often none."""
+        if self._streaming or self._shaper_off:
+            return b""
+        off = self._voice.shaper_off
+        return off or (self._voice.file_shaper_off if self._shaper_lines else b"")
 
     def header(self) -> bytes:
         """Lines that say who processed the file, and what to mind."""
@@ -135,6 +145,8 @@ class StreamWriter:
         """
         moves, events = passage.moves, passage.events
         lead = self._off(passage, extruder_mm)
+        if self._marked is not None:
+            self._marked = passage.limits_after
         for row in np.flatnonzero(np.isin(events.kind, _SHAPED)):
             line = passage.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
             conflict = self._voice.conflict(line)
@@ -382,12 +394,9 @@ class StreamWriter:
             parts.append(self._voice.stand_still)
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
-            off = self._voice.shaper_off
-            if not off and self._shaper_lines:
-                off = self._voice.file_shaper_off
-            if not self._shaper_off and off:
-                parts.append(off)
-                self._shaper_off = True
+            parts.append(self.switching_off)
+            self._shaper_off = self._shaper_off or bool(self.switching_off)
+            self._marked = None
             parts.append(self._voice.limits(limits))
             self._limits_now = limits
             self._streaming = True
@@ -397,11 +406,22 @@ class StreamWriter:
 
     def _off(self, passage: Passage, extruder_mm: float) -> bytes:
         """Lines that give the printer back to the file."""
+        shaper = self._shaper_before(passage)
         if not self._streaming:
-            return self._shaper_before(passage)
+            return self._unmarked() + shaper
         stop = b"" if self._at_rest or self._rests(passage, 0) else self._voice.stand_still
-        text = stop + self._stream_off(passage.limits_before, passage.modal_before, extruder_mm)
-        return text + self._shaper_before(passage)
+        limits = passage.limits_before
+        if self._shaper_off and self._shaper_is_known:
+            self._marked, limits = limits, self._voice.in_stream(limits)
+        text = stop + self._stream_off(limits, passage.modal_before, extruder_mm)
+        return text + shaper
+
+    def _unmarked(self) -> bytes:
+        """Lines that take the mark of a stream away, once the shaper is on again."""
+        if self._marked is None or self._shaper_off:
+            return b""
+        limits, self._marked = self._marked, None
+        return self._voice.limits(limits)
 
     def _rests(self, passage: Passage, row: int) -> bool:
         """Whether the machine stands at a move of the passage by itself, before and after it."""
@@ -420,7 +440,8 @@ class StreamWriter:
         if self._streaming and self._behind is not None:
             text = b"" if self._at_rest else self._voice.stand_still
             text += self._stream_off(*self._behind, extruder_mm)
-        return text + self._shaper_on()
+        shaper = self._shaper_on()
+        return text + self._unmarked() + shaper
 
     def _stream_off(self, limits: Limits, state: ModalState, extruder_mm: float) -> bytes:
         self._streaming = False
@@ -430,19 +451,27 @@ class StreamWriter:
         return text + _feed_line(self._file_feed_mm_min) + b"; stillpath: stream off\n"
 
     def _shaper_before(self, passage: Passage) -> bytes:
-        """Set the firmware's shaper again before lines that move X or Y on their own."""
+        """Set the firmware's shaper again before lines that print on their own.
+
+        Firmwares stand still for it. Travel between two streams, as behind an object mark, is not
+        worth that: the next stream takes care of its vibration.
+        """
         travel = passage.moves.end_mm - passage.moves.start_mm
-        moves_xy = bool(np.any(travel[:, :2] != 0.0))
+        prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(passage.events.kind, _SHAPED)))
-        return self._shaper_on() if moves_xy or foreign else b""
+        return self._shaper_on() if prints or foreign else b""
+
+    @property
+    def _shaper_is_known(self) -> bool:
+        return self._voice.shaper_on is not None or bool(self._shaper_lines)
 
     def _shaper_on(self) -> bytes:
         if not self._shaper_off:
             return b""
         self._shaper_off = False
         stated = self._voice.shaper_on
-        if stated is None and not self._shaper_lines:
+        if not self._shaper_is_known:
             self.shaper_unknown = True
             self._shaper_off = True
             return b""

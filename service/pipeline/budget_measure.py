@@ -49,11 +49,12 @@ class BudgetMeasurement(Measurement):
         *,
         take_layer: Callable[[LayerTile], None] | None = None,
         trace: Callable[[Trace], None] | None = None,
+        size: int | None = None,
     ) -> None:
         super().__init__(
-            machine, dt_s, shaper, compensated=True, take_layer=take_layer, trace=trace
+            machine, dt_s, shaper, compensated=True, take_layer=take_layer, trace=trace, size=size
         )
-        self._sliced = Measurement(machine, dt_s, shaper, compensated=False)
+        self._sliced = Measurement(machine, dt_s, shaper, compensated=False, size=size)
         self._set = SetErrors(machine, dt_s, stride=_STRIDE)
 
     def operate_at(self, point: OperatingPoint) -> None:

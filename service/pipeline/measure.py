@@ -19,6 +19,7 @@ from service.pipeline.answers import Answered, Answers
 from service.pipeline.band import BandContent
 from service.pipeline.layer_views import LayerViews
 from service.pipeline.layers import LayerRecorder, LayerTile
+from service.pipeline.line_ends import RINGING_S, LineEnds
 from service.pipeline.points import MeasuredPoints, MotionSamples
 from service.pipeline.result import (
     AxisSpectrum,
@@ -39,6 +40,8 @@ Array = NDArray[np.float64]
 
 STRIDE = 6
 """Contour errors are measured at every sixth sample: they change over tens of samples."""
+_SMALL_BYTES = 200_000
+"""Of smaller files every sample is measured: there are too few for chance to even out."""
 _TRACK_BINS = 400
 
 
@@ -65,6 +68,8 @@ class Measurement:
         Is given every layer as soon as it is measured; channels as `channel_names` has them.
     trace : callable, optional
         Is given the motion. Errors are then measured at every sample.
+    size : int, optional
+        Of the file that is measured, in bytes.
     """
 
     def __init__(
@@ -79,9 +84,11 @@ class Measurement:
         trace: Callable[[Trace], None] | None = None,
         beside: Callable[[MeasuredPoints], Array] | None = None,
         noted: Callable[[MeasuredPoints, Array], None] | None = None,
+        size: int | None = None,
     ) -> None:
         self._beside, self._noted = beside, noted
-        self._stride = STRIDE if trace is None else 1
+        all_of_it = trace is not None or (size is not None and size < _SMALL_BYTES)
+        self._stride = 1 if all_of_it else STRIDE
         self._tracer = None if trace is None else Tracer(trace)
         self._dt_s = dt_s
         self._band = BandContent(machine, dt_s)
@@ -90,6 +97,7 @@ class Measurement:
         self._shown = shown
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
+        self._ends = LineEnds(dt_s, len(self._names))
         self._answers = Answers(machine, dt_s, shaper, self._names, compensated=compensated)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
@@ -117,6 +125,7 @@ class Measurement:
                 self._jumped = False
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
+            self._ends.add(samples)
             self._measure(self._answers.push(samples))
 
     def stand(self, samples: int) -> Array | None:
@@ -144,14 +153,17 @@ class Measurement:
         """Say that the position is lost: the machine stands still when motion goes on."""
         self._measure(self._answers.flush())
         self._band.jump()
+        self._ends.jump()
         self._spectra.jump()
         self._jumped = True
         self._last = None
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Say that the motion has ended: the machine stands, and rings where it ended."""
+        self.stand(round(RINGING_S / self._dt_s))
         self._measure(self._answers.flush())
         self._note(self._meter.flush())
+        self._ends.finish()
         self._tiles.finish()
 
     def _measure(self, found: Answered | None) -> None:
@@ -159,6 +171,7 @@ class Measurement:
             return
         path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding
         self._spectra.add(path_mm, answer_mm, extruding)
+        self._ends.answered(path_mm, answer_mm)
         if self._tracer is not None:
             self._tracer.wait(found.executed_mm, answer_mm)
         self._note(self._meter.push(path_mm, answer_mm, extruding))
@@ -204,13 +217,15 @@ class Measurement:
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""
         labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
-        meter = self._meter
+        meter, ends_mm = self._meter, self._ends.max_mm
         return [
             Channel(
                 name=name,
                 label=labels[name],
-                extruding=_figures(meter.contour_extruding[c], meter.tracking_extruding[c]),
-                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c]),
+                extruding=_figures(
+                    meter.contour_extruding[c], meter.tracking_extruding[c], ends_mm[c]
+                ),
+                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c], ends_mm[c]),
                 residual_rms_um=1e3 * meter.residual[c].rms,
             )
             for c, name in enumerate(self._names)
@@ -222,25 +237,32 @@ class Measurement:
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
-        return self._groups(self._layers, None)
+        return self._groups(self._layers, self._ends.layers, None)
 
     def features(self, names: Sequence[str]) -> list[GroupFigures]:
         """Return the figures by feature."""
-        return self._groups(self._features, names)
+        return self._groups(self._features, self._ends.features, names)
 
-    def _groups(self, groups: GroupTally, names: Sequence[str] | None) -> list[GroupFigures]:
+    def _groups(
+        self, groups: GroupTally, ends_mm: dict[int, Array], names: Sequence[str] | None
+    ) -> list[GroupFigures]:
         tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
         for key, tally in tallies[self._names[0]].items():
             label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
             if names is None and key < 0:
                 label = "before the first layer"
+            behind_mm = ends_mm.get(key, np.zeros(len(tallies)))
             out.append(
                 GroupFigures(
                     name=label,
                     seconds=round(self._stride * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
-                    contour_max_um={n: 1e3 * t[key].max for n, t in tallies.items() if key in t},
+                    contour_max_um={
+                        n: 1e3 * max(t[key].max, float(most))
+                        for (n, t), most in zip(tallies.items(), behind_mm, strict=True)
+                        if key in t
+                    },
                 )
             )
         return out
@@ -299,10 +321,10 @@ class _Bins:
         return [[round(float(v), 3) for v in 1e3 * np.sqrt(row[: self._used])] for row in mean]
 
 
-def _figures(contour: Tally, tracking: Tally) -> ErrorFigures:
+def _figures(contour: Tally, tracking: Tally, ends_mm: float) -> ErrorFigures:
     return ErrorFigures(
         contour_rms_um=1e3 * contour.rms,
-        contour_max_um=1e3 * contour.max,
+        contour_max_um=1e3 * max(contour.max, ends_mm),
         tracking_rms_um=1e3 * tracking.rms,
         tracking_max_um=1e3 * tracking.max,
     )

@@ -151,6 +151,7 @@ def simulate_file(
             compensated=False,
             take_layer=writer.add if writer else None,
             trace=trace,
+            size=source.stat().st_size,
         )
         shaper_stream = ShapedMotion(DT_S)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from gcode.firmware.planning import plan_moves, stops
 from gcode.pieces import Passage, Piece
-from gcode.types import EventKind, Phases, rows_of
+from gcode.types import EventKind, Phases, ProgramBlock, rows_of
 from models.machine import Machine
 
-__all__ = ["feeding", "last_length_mm", "plan_passage", "takes_s"]
+__all__ = ["feeding", "last_length_mm", "plan_passage", "switching_s", "takes_s"]
 
 
 def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float | None]:
@@ -51,6 +51,11 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
 def takes_s(part: Phases | float | None) -> float:
     """Return how long a part of a passage takes."""
     return part.duration_s if isinstance(part, Phases) else part or 0.0
+
+
+def switching_s(parts: Iterable[Passage | ProgramBlock]) -> float:
+    """Return how long the machine stands still because its shaper is switched."""
+    return sum(float(np.sum(p.events.dwell_s[p.events.kind == EventKind.SHAPER])) for p in parts)
 
 
 def last_length_mm(phases: Phases) -> float:

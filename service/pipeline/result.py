@@ -33,7 +33,8 @@ class ErrorFigures(_Figures):
     contour_rms_um: float
     """Distance to the planned path, root mean square over time [um]."""
     contour_max_um: float
-    """Distance to the planned path, largest [um]."""
+    """Distance to the planned path, largest [um]; while the nozzle stands behind the end of a line
+    and rings, 0.1 s at most, it counts for that line."""
     tracking_rms_um: float
     """Distance to where the nozzle was planned to be at that moment, root mean square [um]."""
     tracking_max_um: float
@@ -274,6 +275,11 @@ class Result(_Figures):
     """Those that left as they came, in order."""
     put_back_extruding_share: float
     """Their share of the extruding time, 0 to 1."""
+    left_alone_s: float = 0.0
+    """Time of the moves that keep their own lines by rule [s]: those behind homing or an object's
+    mark, steep ones, and others whose place or state is not known; put back pieces not counted."""
+    left_alone_extruding_s: float = 0.0
+    """How much of that extrudes [s]."""
     warnings: list[str]
     """What asks for attention, for a person."""
     notes: list[str] = []

@@ -53,7 +53,7 @@ from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.motion import STANDING_S, plan_file, simulate_file
 from service.pipeline.operating import Operation
 from service.pipeline.options import Options, stamp
-from service.pipeline.passages import feeding, plan_passage, takes_s
+from service.pipeline.passages import feeding, plan_passage, switching_s, takes_s
 from service.pipeline.points import MotionSamples, part_of
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
@@ -246,14 +246,21 @@ class _Job:
         self._budget = budget
         self._pairs: BudgetMeasurement | None = None
         take_layer = layers.add if layers else None
+        size = source.seek(0, io.SEEK_END)
         if self.has_budget(options):
             self._pairs = BudgetMeasurement(
-                machine, DT_S, self._shaper, take_layer=take_layer, trace=trace
+                machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
             )
             self._measurement: Measurement = self._pairs
         else:
             self._measurement = Measurement(
-                machine, DT_S, self._shaper, compensated=True, take_layer=take_layer, trace=trace
+                machine,
+                DT_S,
+                self._shaper,
+                compensated=True,
+                take_layer=take_layer,
+                trace=trace,
+                size=size,
             )
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
@@ -304,7 +311,9 @@ class _Job:
         if self._sum.moves == 0:
             raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
         if self._changes:
-            self._emit(self._writer.end(self._sum.newline, self._checker.extruder_mm))
+            text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
+            self._wait(switching_s(self._checker.push(text)))
+            self._emit(text)
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
@@ -362,6 +371,7 @@ class _Job:
             # Homed, say: the machine did not come here along the path.
             self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
             self._sum.jumped = False
+        switched_s = self._switched_off_s()
         for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
             try:
                 attempt = self._attempt(piece, paced)
@@ -371,6 +381,7 @@ class _Job:
             except GcodeError as error:  # its line is one of what was written
                 reason = f"the firmware would refuse what was made of it: {error.message}"
         else:
+            self._sum.time_s -= switched_s
             self._put_back(piece, original_s, reason)
             return
         self._work.compensator.commit()
@@ -381,6 +392,17 @@ class _Job:
             self._measure_piece(piece, part_of(attempt.motion, 0, len(attempt.motion) - 1))
         late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
         self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
+
+    def _switched_off_s(self) -> float:
+        """Stand still where a piece that comes now begins with a line that makes the machine stand.
+
+        Before it is compensated: vibration dies down meanwhile.
+        """
+        lines = self._writer.switching_off
+        seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
+        if seconds > 0.0:
+            self._wait(seconds)
+        return seconds
 
     def _attempt(self, piece: Piece, paced: Piece) -> _Attempt:
         """Compensate and write a piece at a pace and read it back; or leave everything as it was.
@@ -466,7 +488,9 @@ class _Job:
         if self._changes:
             text = self._writer.passage(passage, self._checker.extruder_mm)
             with self._clock.stage("read back"):
-                self._checker.push(text)
+                blocks = self._checker.push(text)
+            # Lines of ours make it stand too, or its own longer than they did.
+            self._wait(switching_s(blocks) - switching_s([passage]))
         self._emit(text, passage, self.delay_s)
         self._sum.moves += len(passage.moves)
         self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
@@ -496,6 +520,7 @@ class _Job:
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
         self._sum.time_s += motion_s
+        self._sum.passed_motion_s += motion_s
         feeds = feeding(phases)
         self._sum.extruding_s += float(np.sum(duration[feeds]))
         if np.any(feeds):
@@ -544,7 +569,13 @@ class _Job:
     def _stand(self, dwell_s: float) -> None:
         """Let the machine stand where it is."""
         self._sum.original_s += dwell_s
+        self._wait(dwell_s)
+
+    def _wait(self, dwell_s: float) -> None:
+        """Let the machine stand in the written file."""
         self._sum.time_s += dwell_s
+        if dwell_s <= 0.0:
+            return
         stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
         if stood is not None:
             self._observe(stood)
@@ -644,6 +675,8 @@ class _Job:
             pieces=total.pieces,
             put_back=total.put_back,
             put_back_extruding_share=total.put_back_share,
+            left_alone_s=total.left_alone_s if self._changes else 0.0,
+            left_alone_extruding_s=total.left_alone_extruding_s if self._changes else 0.0,
             warnings=warnings,
             notes=notes,
             confirmation=confirmation_text(self._machine) if self._changes else "",

@@ -25,7 +25,7 @@ class Sums:
         self.original_s = self.time_s = self.compensated_s = self.extruding_s = 0.0
         self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
         self.gap2 = self.gap_max = self.filament_error = 0.0
-        self.passed_s, self.passed_line = 0.0, 0
+        self.passed_s, self.passed_motion_s, self.passed_line = 0.0, 0.0, 0
         self.gap_count = 0
         self.put_back: list[PutBack] = []
         self.warnings: list[str] = []
@@ -61,9 +61,19 @@ class Sums:
         """The same as a share of all extruding time."""
         return self.put_back_s / self.extruding_s if self.extruding_s else 0.0
 
+    @property
+    def left_alone_s(self) -> float:
+        """Time of the motion whose lines were never to be changed."""
+        return max(self.passed_motion_s - sum(piece.seconds for piece in self.put_back), 0.0)
+
+    @property
+    def left_alone_extruding_s(self) -> float:
+        """The part of it that extrudes."""
+        return max(self.passed_s - self.put_back_s, 0.0)
+
     def left_alone(self) -> Iterator[str]:
         """Yield a warning where much was not compensated."""
-        passed_s = self.passed_s - self.put_back_s
+        passed_s = self.left_alone_extruding_s
         if self.put_back_share > _WARN_SHARE:
             longest = max(self.put_back, key=lambda piece: piece.extruding_seconds)
             yield (

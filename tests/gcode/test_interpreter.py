@@ -222,7 +222,8 @@ def test_classes(wary_machine: Machine) -> None:
     }
     block = run("\n".join(expected) + "\n", wary_machine)
     assert dict(zip(expected, kinds(block), strict=True)) == expected
-    assert block.events.dwell_s.sum() == pytest.approx(0.2)
+    # The dwell, and for the shaper twice the time that pressure advance looks ahead.
+    assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.04)
 
 
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:

@@ -16,6 +16,7 @@ from gcode.interpreter import Interpreter
 from gcode.types import EventKind
 from models.firmware.klipper import FirmwareShaper
 from models.machine import Machine
+from models.shaper_pulses import shaper_pulses
 from models.store import load_machine
 from service.pipeline.options import Options
 from service.pipeline.result import Result
@@ -215,6 +216,39 @@ def test_shaper_of_the_machine_is_restored(road: Road, machine: Machine) -> None
     assert calls[1] < len(lines) - 1 - lines[::-1].index(b"G28")
     assert road.result is not None
     assert not any("shaper" in warning for warning in road.result.warnings)
+
+
+def test_the_shaper_is_not_switched_for_travel(road: Road, machine: Machine) -> None:
+    """Klipper stands still for every SET_INPUT_SHAPER: times say how long, and there are few."""
+    shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
+    firmware = machine.firmware.model_copy(update={"shaper": shaper})
+    known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
+    marks = "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
+    text = HEAD + ROUND + 5 * (marks + ROUND) + "G28\n"
+    written = road(text, known)
+    assert differences(text.encode(), written, known) == []
+    assert written.count(b"SET_INPUT_SHAPER") == 2
+    assert road.result is not None
+    result = road.result
+    # Klipper's macros must know that the shaper is off there.
+    limits = re.findall(rb"SQUARE_CORNER_VELOCITY=(\S+) [^\n]*\n[^\n]*\n.*off\nEXCLUDE", written)
+    assert limits == 5 * [b"5.0000005"]
+    assert written.rindex(b"SQUARE_CORNER_VELOCITY=5 ") < written.rindex(b"SET_INPUT_SHAPER")
+    # Off and on: each stands for the times ahead before and behind it. With advance those are 20 ms
+    # each; without, the shaper's longer side where it is on, and a millisecond where it is off.
+    without = known.model_copy(update={"pressure_advance_s": 0.0})
+    road(text, without)
+    reaches_s = []
+    for kind, f_hz in (("ei", 51.5), ("mzv", 39.0)):
+        weights, delays_s = shaper_pulses(kind, f_hz)
+        middle_s = float(weights @ delays_s)
+        reaches_s.append(max(middle_s, float(delays_s[-1]) - middle_s))
+    window_s = max(reaches_s)
+    assert result.time_s - road.result.time_s == pytest.approx(
+        2 * (0.04 - window_s - 1e-3), abs=5e-4
+    )
+    assert 0.0 < result.left_alone_s < 0.2 * result.time_s
+    assert result.left_alone_extruding_s == 0.0
 
 
 def test_shaper_of_the_file_is_restored(road: Road) -> None:

@@ -15,7 +15,7 @@ import re
 
 from gcode.commands import cancel_object, home, retract
 from gcode.dialect import NEEDED, Action, Dialect, Word, words
-from gcode.firmware.klipper import commands
+from gcode.firmware.klipper import commands, flushing
 from gcode.types import EventKind
 from models.firmware import Klipper
 
@@ -55,6 +55,8 @@ PYTHON_WORDS: dict[str, Word] = {
     "RESTORE_GCODE_STATE": commands.restore_state,
     "EXCLUDE_OBJECT_START": commands.exclude_object,
     "EXCLUDE_OBJECT_END": commands.exclude_object,
+    "SET_INPUT_SHAPER": flushing.shaper,
+    "SET_PRESSURE_ADVANCE": flushing.pressure_advance,
 }
 
 RETRACTION_WORDS: dict[str, Word] = {
@@ -72,7 +74,7 @@ NATIVE: dict[str, Word] = {
         "GET_RETRACTION "
         "QUERY_ENDSTOPS QUERY_ADC QUERY_FILAMENT_SENSOR SET_FILAMENT_SENSOR SET_IDLE_TIMEOUT "
         "SET_HEATER_TEMPERATURE TURN_OFF_HEATERS SET_TEMPERATURE_FAN_TARGET SET_FAN_SPEED "
-        "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRESSURE_ADVANCE SET_PRINT_STATS_INFO "
+        "SET_PIN SET_LED SET_LED_TEMPLATE SET_PRINT_STATS_INFO "
         "SET_GCODE_VARIABLE SAVE_VARIABLE EXCLUDE_OBJECT_DEFINE "
         "SET_SERVO BED_MESH_OUTPUT BED_MESH_MAP",
         EventKind.HARMLESS,
@@ -92,7 +94,6 @@ NATIVE: dict[str, Word] = {
         "EXCLUDE_OBJECT EXCLUDE_OBJECT_RESET",
         EventKind.UNKNOWN,
     ),
-    "SET_INPUT_SHAPER": EventKind.SHAPER,
 }
 
 FOREIGN: dict[str, Word] = words(

@@ -8,6 +8,7 @@ written lines set it. Where a feature exceeds its bound there, it is made slower
 from __future__ import annotations
 
 import contextlib
+import io
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -146,7 +147,10 @@ class _Job:
         self, name: str, facts: SlicerFacts, earlier: EarlierErrors, layers: LayerWriter | None
     ) -> Result:
         machine, options = self._machine, self._options
-        original = Measurement(machine, DT_S, self._shaper, compensated=False, noted=earlier.note)
+        size = self._source.seek(0, io.SEEK_END)
+        original = Measurement(
+            machine, DT_S, self._shaper, compensated=False, noted=earlier.note, size=size
+        )
         before = SetErrors(machine, DT_S, stride=STRIDE)
         reading = FirstReading(machine, self._adviser)
         with self._clock.stage("measure the original"):
@@ -183,6 +187,7 @@ class _Job:
             names=("after",),
             take_layer=layers.add if layers else None,
             beside=earlier.at,
+            size=size,
         )
         with self._clock.stage("measure"):
             written = self._go(self._spool, [advised], "measuring", (0.8, 1.0), lambda _: None)

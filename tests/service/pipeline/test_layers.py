@@ -22,7 +22,6 @@ from models.store import load_machine
 from service.pipeline import _layer_kernels as kernels
 from service.pipeline import layers as layers_module
 from service.pipeline.layers import UNKNOWN, LayerRecorder, LayerTile
-from service.pipeline.measure import STRIDE
 from service.pipeline.options import Options
 from service.pipeline.road import compensate_file, plan_file, simulate_file
 from tests.gcode.cutting import HEAD
@@ -90,7 +89,7 @@ def test_a_corner_against_a_simulation_of_its_own(tmp_path: Path, cache: Path) -
     second = np.flatnonzero(tile.line == tile.line[tile.on > 0][-1])
     assert len(second) > 12  # the ringing along the edge is not one number
     ends = np.array([tile.x, tile.y], dtype=float)
-    measured = (np.abs(path[0] - 100.0) < 1e-3) & (span % STRIDE == 0)
+    measured = np.abs(path[0] - 100.0) < 1e-3
     seen = 0
     for k in second:
         stretch = measured & (path[1] > ends[1, k - 1] + 1e-4) & (path[1] < ends[1, k] + 1e-4)
@@ -98,11 +97,10 @@ def test_a_corner_against_a_simulation_of_its_own(tmp_path: Path, cache: Path) -
             seen += 1
             found_um = 0.1 * tile.error["before"][k]
             assert found_um == pytest.approx(1e3 * error[stretch].max(), abs=0.1)
-    # Every sixth sample is measured: peaks may be a little higher in between.
     moving = (np.abs(path[0] - 100.0) < 1e-3) & (path[1] < 94.0)
     inside = second[ends[1, second] < 94.0]
     largest = 0.1 * tile.error["before"][inside].max()
-    assert largest == pytest.approx(1e3 * error[moving].max(), rel=0.1)
+    assert largest == pytest.approx(1e3 * error[moving].max(), rel=0.02)
     assert largest > 20.0
 
 
@@ -133,9 +131,11 @@ def test_every_layer_every_corner(tmp_path: Path, cache: Path) -> None:
         for name in index["channels"]:
             rms, largest = group.contour_rms_um[name], group.contour_max_um[name]
             assert tile.entry["rms_um"][name] == pytest.approx(rms, abs=0.006)
-            assert tile.entry["max_um"][name] == pytest.approx(largest, abs=0.006)
+            # The report's counts what rings behind the ends of lines too.
+            printed = tile.entry["max_um"][name]
+            assert printed <= largest + 0.006
             drawn = tile.error[name][(tile.on > 0) & (tile.error[name] < UNKNOWN)]
-            assert 0.1 * drawn.max() >= largest - 0.06
+            assert 0.1 * drawn.max() >= printed - 0.06
     # Every corner of the file stands there, under its line, with travel and extrusion.
     lines = SMALL.split("\n")
     for tile in tiles:

@@ -1,0 +1,93 @@
+"""How long Klipper stands still for a command that waits until all steps are made.
+
+Steps are made some time ahead of their motion, as far as input shaper and pressure advance look
+ahead. SET_INPUT_SHAPER makes all of them: the next move starts later by the time ahead that held
+until then, and by that which holds from then on.
+
+Sources: klippy/toolhead.py (flush_step_generation, note_step_generation_scan_time,
+_calc_print_time), klippy/extras/input_shaper.py, klippy/kinematics/extruder.py, 2026-08.
+"""
+
+from __future__ import annotations
+
+import math
+
+from gcode.lexer import Command
+from gcode.state import MachineState
+from gcode.types import EventKind
+from models.errors import ModelError
+from models.firmware import Klipper
+from models.shaper_pulses import SHAPERS, shaper_pulses
+
+__all__ = ["pressure_advance", "shaper"]
+
+_LEAST_S = 1e-3
+_SMOOTH_S = 0.04
+"""Klipper's default of pressure_advance_smooth_time."""
+_MOST_SMOOTH_S = 0.2
+_MOST_REACH_S = 1.0
+_KINDS = tuple(SHAPERS)
+_DAMPING = 0.1
+
+
+def pressure_advance(state: MachineState, command: Command) -> int:
+    """SET_PRESSURE_ADVANCE: the motion does not notice, but the next flush does."""
+    given = state.extended(command)
+    for key in ("ADVANCE", "SMOOTH_TIME"):
+        if key in given:
+            state.factors[key] = _number(given[key])
+    return state.event(EventKind.HARMLESS)
+
+
+def shaper(state: MachineState, command: Command) -> int:
+    """SET_INPUT_SHAPER: stands still for the times ahead before and behind it."""
+    given = state.extended(command)
+    before_s = _ahead_s(state)
+    for axis in "XY":
+        kind, f_hz = _shaper(state, axis)
+        kind = given.get(f"SHAPER_TYPE_{axis}", given.get("SHAPER_TYPE", kind)).lower()
+        if f"SHAPER_FREQ_{axis}" in given:
+            f_hz = _number(given[f"SHAPER_FREQ_{axis}"])
+        state.factors[f"shaper {axis}"] = float(_KINDS.index(kind)) if kind in _KINDS else -1.0
+        state.factors[f"f_hz {axis}"] = f_hz
+    return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
+
+
+def _ahead_s(state: MachineState) -> float:
+    """Return how far ahead of the motion steps are made."""
+    advance_s = state.factors.get("ADVANCE", state.machine.pressure_advance_s)
+    smooth_s = state.factors.get("SMOOTH_TIME", _SMOOTH_S) if advance_s > 0.0 else 0.0
+    smooth_s = min(smooth_s, _MOST_SMOOTH_S)
+    return max(_LEAST_S, 0.5 * smooth_s, *(_reach_s(*_shaper(state, axis)) for axis in "XY"))
+
+
+def _shaper(state: MachineState, axis: str) -> tuple[str, float]:
+    """Return type and frequency of an axis' shaper; before the first line those of printer.cfg."""
+    if f"shaper {axis}" in state.factors:
+        kind = int(state.factors[f"shaper {axis}"])
+        return _KINDS[kind] if kind >= 0 else "", state.factors[f"f_hz {axis}"]
+    stated = state.firmware.shaper if isinstance(state.firmware, Klipper) else None
+    if stated is None:
+        return "mzv", 0.0
+    return (stated.type_x, stated.freq_x_hz) if axis == "X" else (stated.type_y, stated.freq_y_hz)
+
+
+def _reach_s(kind: str, f_hz: float) -> float:
+    """Return how far a shaper looks ahead or back, whichever is more; 0: off, or not known."""
+    if f_hz <= 0.0:
+        return 0.0
+    try:
+        weights, delays_s = shaper_pulses(kind, f_hz, _DAMPING)
+    except ModelError:
+        return 0.0
+    middle_s = float(weights @ delays_s)
+    return min(max(middle_s, float(delays_s[-1]) - middle_s), _MOST_REACH_S)
+
+
+def _number(text: str) -> float:
+    """Return a number of a line that stays as it came; Klipper would refuse what is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        return 0.0
+    return value if math.isfinite(value) else 0.0
