@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 6
+_VERSION = 7
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
@@ -60,6 +60,8 @@ _COARSE_UM, _LEAST_FIT = 4.0, 0.5
 share of it: on machines that are known well the segments would be the larger error."""
 _FRICTION_UNSURE = 0.25
 """Relative: of what logs say of it, on virtual printers 10 % are missed, 25 % seldom."""
+_LAG_UNSURE_S = 1.5e-4
+"""Of one axis against the other: alignment sets both to 0, viscous guides may delay one of them."""
 _STRIDE = 5
 
 
@@ -251,18 +253,22 @@ def _ranges(
 ) -> dict[str, tuple[float, float]]:
     """Return least and largest error of the members against the nominal plants', by command.
 
-    Friction, where it is known, differs from member to member too.
+    Friction, where it is known, differs from member to member too, and so does what alignment
+    took from one axis and not from the other.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     nominal = (x.nominal, y.nominal)
     pairs = _side_by_side(x.members, y.members)
+    sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
+    # A set of plants without measured phase holds delays of its own.
+    lag_s = 0.0 if _unseen(machine.axes["x"]) else _LAG_UNSURE_S
     out = {}
     for name, command in commands.items():
         usual = max(rms(response(nominal, _received(machine, command))), 1e-12)
-        found = [
-            rms(response(pair, _received(machine, command, share))) / usual
-            for pair, share in zip(pairs, _frictions(len(pairs)), strict=True)
-        ]
+        found = []
+        for pair, side in zip(pairs, sides, strict=True):
+            received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
+            found.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / usual)
         out[name] = (min(1.0, *found), max(1.0, *found))
     return out
 
@@ -272,8 +278,13 @@ def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
     return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
 
 
-def _frictions(count: int) -> Array:
-    return 1.0 + _FRICTION_UNSURE * np.where(np.arange(count) % 2, 1.0, -1.0)
+def _delayed(y: Array, samples: float) -> Array:
+    """Return a motion (2, n) with X late by so many samples; below 0 Y is late instead."""
+    row = 0 if samples > 0.0 else 1
+    late = y.copy()
+    at = np.arange(y.shape[1], dtype=float)
+    late[row] = np.interp(at - abs(samples), at, y[row])
+    return late
 
 
 def _rank(choice: Choice) -> float:
@@ -282,8 +293,12 @@ def _rank(choice: Choice) -> float:
 
 
 def _most(axis: PlantSetSpec) -> float:
-    about = axis.provenance
-    return _UNSEEN_SHARE if about is None or about.magnitude_only else 1.0
+    return _UNSEEN_SHARE if _unseen(axis) else 1.0
+
+
+def _unseen(axis: PlantSetSpec) -> bool:
+    """Whether the phase of an axis was not measured."""
+    return axis.provenance is None or axis.provenance.magnitude_only
 
 
 def _weights(machine: Machine, count: int) -> Array:

@@ -21,5 +21,8 @@ if __name__ == "__main__":
     from tests.service.runners import light
 
     design = design_report(load_machine("ender3"), "x").model_dump(mode="json")
-    with mock.patch.object(designs, "computed", mock.AsyncMock(return_value=design)):
+    with (
+        mock.patch.object(designs, "answered", mock.AsyncMock(return_value=None)),
+        mock.patch.object(designs, "answer_of", mock.AsyncMock(return_value=design)),
+    ):
         serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=light)

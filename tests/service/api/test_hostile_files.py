@@ -84,6 +84,15 @@ def loop(states: int) -> dict[str, Any]:
     return {"json": {"method": "fmsdob", "targets_hz": [2000.0] * 8, "loop": document}}
 
 
+def answer_to(ask: Callable[[], httpx2.Response]) -> httpx2.Response:
+    """Ask again while the answer takes longer than a request waits."""
+    for _ in range(5):
+        answer = ask()
+        if answer.status_code != 202:
+            break
+    return answer
+
+
 def test_hostile_files_at_all_routes_that_compute(tmp_path: Path) -> None:
     import resource
 
@@ -105,7 +114,7 @@ def test_hostile_files_at_all_routes_that_compute(tmp_path: Path) -> None:
                 lambda: client.get("/v1/machines/ender3/design?axis=y&robust=ensemble"),
                 lambda: client.get(done["links"]["trajectories"]),
             ]
-            answers = [answer.result() for answer in [pool.submit(one) for one in asked]]
+            answers = [one.result() for one in [pool.submit(answer_to, ask) for ask in asked]]
             other = finished(client, job)
     for answer in answers:
         assert answer.status_code in (200, 422, 429), answer.text
