@@ -101,7 +101,7 @@ def test_retractions_far_from_zero_do_not_drift(decimals: int, cache: Path) -> N
     before, after = (
         read(d, "marlin").extruded_mm[0] for d in (text.encode(), check(text, "marlin", cache))
     )
-    # Roundings of single segments remain and add up by chance; how many there are, the command says.
+    # Roundings of single segments remain, and add up by chance.
     assert after == pytest.approx(before, abs=5e-5)
 
 
