@@ -69,8 +69,8 @@ ROBUST_CHOICE = 1.1
 """The robust basis takes n of so many times n functions."""
 WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
-"""What rings in a rest stands over the end of a line: .05 leaves nearly twice as much of it, for no
-less error while extruding; 1 begins to cost some."""
+"""What rings in a rest stands over the end of a line: less leaves more of it and gains no accuracy
+while extruding, 1 begins to cost some."""
 _NESTED = {"ce-opt", "dct"}
 """Bases whose functions for n are the first n of those for more."""
 

@@ -261,7 +261,7 @@ def _ranges(
     pairs = _side_by_side(x.members, y.members)
     sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
     # A set of plants without measured phase holds delays of its own.
-    lag_s = 0.0 if _unseen(machine.axes["x"]) else _LAG_UNSURE_S
+    lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
     out = {}
     for name, command in commands.items():
         usual = max(rms(response(nominal, _received(machine, command))), 1e-12)
