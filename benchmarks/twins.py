@@ -80,6 +80,7 @@ def main() -> int:
     parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
     parser.add_argument("--machines", nargs="+", default=list(MACHINES), choices=list(MACHINES))
     parser.add_argument("--robust", default="auto")
+    parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -89,7 +90,7 @@ def main() -> int:
         sys.exit("the folder of shared data is not there; see --shared")
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    options = Options(robust=given.robust)
+    options = Options(robust=given.robust, tolerance_um=given.tolerance_um)
     head = f"{'file':26}{'machine':15}{'twin':5}{'none':>7}{'shaper':>8}{'ours':>7}{'max':>6}"
     print(f"{head}{'/shaper':>9}{'/none':>7}  tuned shaper of the twin", flush=True)
     rows: list[Row] = []
