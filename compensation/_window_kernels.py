@@ -132,6 +132,7 @@ def solve_windows(
     stepping: Stepping,
     functions: Functions,
     rest_functions: Functions,
+    squeeze: Array,
     path: Array,
     targets: Array,
     weight: Array,
@@ -151,6 +152,8 @@ def solve_windows(
     stepping, functions, rest_functions
         `functions` solve `careful` windows, `rest_functions` those that meet a stop; all others
         take their steps.
+    squeeze : ndarray, shape (k, nz - 2)
+        From the plants' states to those of `rest_functions`, which may have fewer components too.
     path, weight : ndarray, shape (windows update + window,)
         As `tied_window` has them, of the whole piece.
     targets : ndarray, shape (components, windows update + window)
@@ -185,11 +188,15 @@ def solve_windows(
             continue
         _step(stepping, z, waiting, w, u)
         if not (memory.known[w] and _same(memory.z[w], z)):
+            used, states, components = functions, z, len(targets)
+            if behind > met:
+                used, components = rest_functions, len(rest_functions.filtered)
+                states = np.concatenate((np.dot(squeeze, z[:-2]), z[-2:]))
             tied = tied_window(
-                rest_functions if behind > met else functions,
-                z,
+                used,
+                states,
                 path[start : start + window],
-                targets[:, start : start + window],
+                targets[:components, start : start + window],
                 weight[start : start + window],
                 stops[met:behind] - start,
                 limits,

@@ -26,12 +26,17 @@ from compensation.lifted import (
 )
 from models.plants import DiscretePlant
 
-__all__ = ["LiftedWindow", "lifted_window"]
+__all__ = ["Condensed", "LiftedWindow", "condensed", "lifted_window"]
 
 Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-5
 """Components below this share of the largest are left out: of a move of 10 mm, .1 um."""
+_COARSE = 1e-3
+"""The same for windows with rests, which pay for every component: what so few members do otherwise
+changes a command by nanometres to hundredths of a micrometre (`benchmarks/preview.py`)."""
+_HANKEL = 1e-5
+"""States whose Hankel singular value is a smaller share of the largest are left out of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +163,56 @@ def lifted_window(
         ),
         advance=block_diag(*(np.linalg.matrix_power(p.a, update) for p in plants)),
         reach=np.concatenate([_reach(p, window) for p in plants]),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Condensed:
+    """The part of a lifted set that counts, for windows that are solved by themselves.
+
+    Attributes
+    ----------
+    components : int
+        The leading ones.
+    squeeze : ndarray, shape (k, nz - 2)
+        From the members' states to few, in balanced coordinates.
+    from_state : ndarray, shape (components, window, k + 2)
+    reach : ndarray, shape (k, window)
+        As those of `LiftedWindow`, for these.
+    """
+
+    components: int
+    squeeze: Array
+    from_state: Array
+    reach: Array
+
+
+def condensed(lifted: LiftedWindow) -> Condensed:
+    """Leave out what many similar members differ in too little to count.
+
+    Source: balanced truncation (B. C. Moore, IEEE Trans. Autom. Control 26, 1981), with the
+    Gramians of the window instead of infinite ones.
+    """
+    size = np.linalg.norm(lifted.integrated[:, :, 0], axis=1)
+    count = int(np.sum(size > _COARSE * size[0]))
+    free, ends = np.split(lifted.from_state[:count], [-2], axis=2)
+    if len(size) == 1:
+        return Condensed(1, np.eye(free.shape[2]), lifted.from_state, lifted.reach)
+    rows = free.reshape(-1, free.shape[2])
+    spread, turn = np.linalg.eigh(lifted.reach @ lifted.reach.T)
+    reachable = turn * np.sqrt(np.maximum(spread, 0.0))
+    seen = rows @ reachable
+    squares, turn = np.linalg.eigh(seen.T @ seen)
+    hankel = np.sqrt(np.maximum(squares[::-1], 0.0))
+    kept = hankel > _HANKEL * hankel[0]
+    outputs = seen @ (turn[:, ::-1][:, kept] / hankel[kept])
+    outputs *= np.sign(outputs[np.argmax(np.abs(outputs), axis=0), np.arange(outputs.shape[1])])
+    squeeze = outputs.T @ rows
+    return Condensed(
+        count,
+        squeeze,
+        np.concatenate([outputs.reshape(*free.shape[:2], -1), ends], axis=2),
+        squeeze @ lifted.reach,
     )
 
 

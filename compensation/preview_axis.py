@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compensation._preview_kernels import advance_state, advance_window
-from compensation._window_kernels import Memory, Stepping, solve_windows
+from compensation._window_kernels import Functions, Memory, Stepping, solve_windows
 from compensation.base import DesignError
 from compensation.basis import BASES, ce_opt_basis, robust_basis
-from compensation.lifted_window import LiftedWindow, lifted_window
+from compensation.lifted_window import LiftedWindow, condensed, lifted_window
 from compensation.preview import PreviewDesign
 from compensation.window_problem import (
     TRAVEL_SLACK_MM,
@@ -153,6 +153,8 @@ class Designs:
     ladder : tuple of Rung
         `LADDER` with at most so many functions as the model's band allows; rungs that become the
         same are one.
+    at_rests : Condensed
+        The part of `lifted` that windows with rests are solved for.
     """
 
     def __init__(self, lifted: LiftedWindow, basis: str, most: int = 300) -> None:
@@ -163,6 +165,16 @@ class Designs:
         self._made: dict[tuple[int, float], PreviewDesign] = {}
         self._set = lifted.lifted_set()
         self._functions: dict[int, Array] = {}
+        self.at_rests = condensed(lifted)
+        self._rest_functions: dict[PreviewDesign, Functions] = {}
+
+    def rest_functions(self, rung: int) -> Functions:
+        """Return what the windows of a rung that meet a stop need (`Condensed`)."""
+        design = self.design(rung, REST_FUNCTIONS)
+        if design not in self._rest_functions:
+            made = functions_of(design, at_rests=True, part=self.at_rests)
+            self._rest_functions[design] = made
+        return self._rest_functions[design]
 
     def design(self, rung: int, most: int = 300) -> PreviewDesign:
         """Return the design of a rung, with at most so many functions per 300 samples."""
@@ -321,9 +333,9 @@ class PreviewAxis:
         bounds = task.bounds.seen_from(origin)
         alone = np.zeros(windows, bool)
         alone[list(careful)] = True
-        lifted, rested = self._designs.lifted, self._designs.design(rung, REST_FUNCTIONS)
+        lifted = self._designs.lifted
         functions = functions_of(design, at_rests=False)
-        rest_functions = functions_of(rested, at_rests=True)
+        rest_functions = self._designs.rest_functions(rung)
         stepping = Stepping(
             design.command_gain,
             design.state_gain,
@@ -343,6 +355,7 @@ class PreviewAxis:
                         stepping,
                         functions,
                         rest_functions,
+                        self._designs.at_rests.squeeze,
                         drive.path_mm,
                         drive.targets_mm,
                         drive.weight,

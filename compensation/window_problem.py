@@ -30,7 +30,8 @@ from compensation._window_kernels import (
     tied_window,
 )
 from compensation.base import DesignError
-from compensation.preview import PreviewDesign
+from compensation.lifted_window import Condensed
+from compensation.preview import PreviewDesign, running_gram
 
 __all__ = [
     "EFFORT_PRICE",
@@ -165,10 +166,13 @@ def refusing_singular() -> Iterator[None]:
         raise DesignError(f"the window problem at a rest is singular ({error})") from error
 
 
-def functions_of(design: PreviewDesign, *, at_rests: bool) -> Functions:
-    """Return what windows solved by themselves need of a design."""
+def functions_of(
+    design: PreviewDesign, *, at_rests: bool, part: Condensed | None = None
+) -> Functions:
+    """Return what windows solved by themselves need of a design, or of the part that counts."""
     lifted = design.lifted
-    return Functions(
+    price = max(EFFORT_PRICE, design.price) if at_rests else design.price
+    functions = Functions(
         design.basis,
         design.summed,
         design.efforts,
@@ -177,7 +181,17 @@ def functions_of(design: PreviewDesign, *, at_rests: bool) -> Functions:
         lifted.from_state,
         lifted.reach,
         np.ascontiguousarray(lifted.integrated[:, :, 0]),
-        max(EFFORT_PRICE, design.price) if at_rests else design.price,
+        price,
+    )
+    if part is None:
+        return functions
+    filtered = design.filtered[: part.components]
+    return functions._replace(
+        filtered=filtered,
+        grams=running_gram(filtered),
+        free=np.ascontiguousarray(part.from_state),
+        reach=np.ascontiguousarray(part.reach),
+        stop=functions.stop[: part.components],
     )
 
 
