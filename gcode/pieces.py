@@ -33,7 +33,7 @@ from gcode.types import (
 )
 from models.machine import Machine
 
-__all__ = ["Passage", "Piece", "Splitter", "excerpt"]
+__all__ = ["LeftOut", "Passage", "Piece", "Splitter", "excerpt"]
 
 T = TypeVar("T", Moves, Events, Phases)
 S = TypeVar("S", Moves, Events)
@@ -100,6 +100,10 @@ class Piece(Passage):
     def planned(cls, lines: Passage, phases: Phases) -> Piece:
         """Return the lines of a passage with the plan of its moves."""
         return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
+
+
+class LeftOut(Passage):
+    """Lines that could be compensated and leave as they came because somebody chose so."""
 
 
 class Splitter:

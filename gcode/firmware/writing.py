@@ -17,7 +17,7 @@ from gcode.firmware._writing_kernels import format_moves
 from gcode.firmware.base import FirmwareKit
 from gcode.firmware.encoding import Encoded
 from gcode.firmware.planning import stops
-from gcode.pieces import Passage, Piece
+from gcode.pieces import LeftOut, Passage, Piece
 from gcode.types import EventKind, Limits, ModalState
 
 __all__ = ["StreamWriter"]
@@ -460,7 +460,8 @@ class StreamWriter:
         prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(passage.events.kind, _SHAPED)))
-        return self._shaper_on() if prints or foreign else b""
+        aside = isinstance(passage, LeftOut)  # between streams again and again
+        return self._shaper_on() if (prints and not aside) or foreign else b""
 
     @property
     def _shaper_is_known(self) -> bool:

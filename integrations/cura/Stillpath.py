@@ -129,6 +129,17 @@ _SETTINGS: dict[str, dict[str, Any]] = {
         "minimum_value": "0",
         "maximum_value": "1000",
     },
+    "features": {
+        "label": "Compensate",
+        "description": "What is compensated. The rest stays as sliced, and the file is smaller.",
+        "type": "enum",
+        "options": {
+            "all": "everywhere",
+            "visible": "outer walls, top and bottom",
+            "walls": "outer walls",
+        },
+        "default_value": "all",
+    },
     "times": {
         "label": "Times",
         "description": "Times in the G-code: of the compensated print, or as Cura wrote them.",
@@ -253,6 +264,8 @@ class Stillpath(Script):
         options = {name: self._value(name) for name in names}
         if self._value("budget_um"):
             options["budget_um"] = self._value("budget_um")
+        elif self._value("features") != "all":
+            options["where"] = self._value("features")
         return options if options["method"] == "fbf" else {**options, "robust": "auto"}
 
     def _value(self, key: str) -> Any:

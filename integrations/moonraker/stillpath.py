@@ -27,7 +27,17 @@ _SUFFIXES = (".gcode", ".gco", ".g")
 _RESULT = ".sp.gcode"
 _KEPT = 50
 _PROGRESS = re.compile(r"stillpath-post: (?P<stage>.*?)(?: (?P<percent>\d+) %)?$")
-_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "budget_um", "times")
+_OPTIONS = (
+    "method",
+    "basis",
+    "robust",
+    "along",
+    "tolerance_um",
+    "budget_um",
+    "where",
+    "max_mb",
+    "times",
+)
 _WAITING = ("queued", "running")
 _IDLE = ("standby", "complete", "cancelled")
 _BUSY = ("printing", "paused")

@@ -40,7 +40,18 @@ if TYPE_CHECKING:
     from typing import BinaryIO, NoReturn, TextIO
 
 PROGRAM = "stillpath-post"
-_OPTIONS = ("method", "basis", "robust", "along", "tolerance_um", "budget_um", "times", "plate")
+_OPTIONS = (
+    "method",
+    "basis",
+    "robust",
+    "along",
+    "tolerance_um",
+    "budget_um",
+    "where",
+    "max_mb",
+    "times",
+    "plate",
+)
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
 _PRINTER_NAMES = ("PHYSICAL_PRINTER_SETTINGS_ID", "PRINTER_SETTINGS_ID", "PRINTER_MODEL")

@@ -14,9 +14,11 @@ from service.pipeline.options import (
     BasisName,
     BudgetUm,
     DialectName,
+    MaxMb,
     MethodName,
     Options,
     RobustMode,
+    Where,
 )
 
 if TYPE_CHECKING:
@@ -117,6 +119,16 @@ class JobQuery(BaseModel):
         le=50,
         allow_inf_nan=False,
         description="How far the written path may be from the computed one.",
+    )
+    where: Where = Field(
+        default="all",
+        description="What is compensated: everything, what is `visible` (outer walls, top and "
+        "bottom surfaces), or outer `walls`. The rest stays as sliced, and the file is smaller.",
+    )
+    max_mb: MaxMb | None = Field(
+        default=None,
+        description="The most that the G-code may have, in millions of bytes: less is compensated, "
+        "down to outer walls alone, until it fits.",
     )
     budget_um: BudgetUm | None = Field(
         default=None,

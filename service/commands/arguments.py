@@ -15,9 +15,11 @@ __all__ = [
     "DialectOption",
     "Input",
     "MachineOption",
+    "MaxMbOption",
     "PlateOption",
     "Refused",
     "ReportOption",
+    "WhereOption",
     "check_folder",
     "check_input",
     "check_output",
@@ -56,6 +58,24 @@ ReportOption = Annotated[
     Path | None,
     typer.Option(
         "--report", metavar="DIR", help="Folder for report.html and .json, layers.json and .bin."
+    ),
+]
+
+
+WhereOption = Annotated[
+    str,
+    typer.Option(
+        help="What is compensated: all, visible (outer walls, top and bottom surfaces) or walls "
+        "(outer ones). The rest stays as sliced, and the file is smaller."
+    ),
+]
+MaxMbOption = Annotated[
+    float | None,
+    typer.Option(
+        "--max-mb",
+        metavar="MB",
+        help="The most that the written G-code may have: compensate less, down to the walls, until "
+        "it fits.",
     ),
 ]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import ModelError
-from service.commands.arguments import chosen_options
+from service.commands.arguments import MaxMbOption, WhereOption, chosen_options
 
 if TYPE_CHECKING:
     from service.farm.crew import Crew
@@ -74,10 +74,12 @@ def batch(
     key: Key = None,
     method: Method = "fbf",
     basis: str = "ce-opt",
-    robust: str = "off",
+    robust: str = "auto",
     along: Along = None,
     tolerance_um: Tolerance = None,
     budget_um: Budget = None,
+    where: WhereOption = "all",
+    max_mb: MaxMbOption = None,
     dialect: Dialect = None,
     keep_times: KeepTimes = False,
 ) -> None:
@@ -98,6 +100,8 @@ def batch(
         along=along,
         tolerance_um=tolerance_um,
         budget_um=budget_um,
+        where=where,
+        max_mb=max_mb,
         dialect=dialect,
         times="kept" if keep_times else None,
     )
@@ -142,10 +146,12 @@ def watch(
     ] = 10.0,
     method: Method = "fbf",
     basis: str = "ce-opt",
-    robust: str = "off",
+    robust: str = "auto",
     along: Along = None,
     tolerance_um: Tolerance = None,
     budget_um: Budget = None,
+    where: WhereOption = "all",
+    max_mb: MaxMbOption = None,
     dialect: Dialect = None,
     keep_times: KeepTimes = False,
 ) -> None:
@@ -164,6 +170,8 @@ def watch(
         along=along,
         tolerance_um=tolerance_um,
         budget_um=budget_um,
+        where=where,
+        max_mb=max_mb,
         dialect=dialect,
         times="kept" if keep_times else None,
     )

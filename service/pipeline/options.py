@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     model_serializer,
+    model_validator,
 )
 
 from compensation.registry import COMPENSATORS
@@ -24,9 +25,11 @@ __all__ = [
     "BasisName",
     "BudgetUm",
     "DialectName",
+    "MaxMb",
     "MethodName",
     "Options",
     "RobustMode",
+    "Where",
     "stamp",
 ]
 
@@ -49,6 +52,8 @@ MethodName = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"pa
 BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
 RobustMode = Literal["auto", "off", "ensemble", "minimax"]
 DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
+Where = Literal["all", "visible", "walls"]
+MaxMb = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
 BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
 
 
@@ -68,6 +73,9 @@ class Options(BaseModel):
     firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
     worst plant of the machine's set) that every feature may have: the print becomes as fast as
     that allows (None: it keeps its speeds).
+    `where` says which features are compensated (`service.pipeline.selection`); the others leave as
+    sliced, and the file is smaller. `max_mb` is the most that the G-code may have, in millions of
+    bytes: fewer features are compensated, as few as the walls, until it fits.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -81,13 +89,25 @@ class Options(BaseModel):
     times: Literal["new", "kept"] = "new"
     dialect: DialectName | None = None
     budget_um: BudgetUm | None = None
+    where: Where = "all"
+    max_mb: MaxMb | None = None
+
+    @model_validator(mode="after")
+    def _one_selection(self) -> Options:
+        if self.budget_um is not None and (self.where != "all" or self.max_mb is not None):
+            raise ValueError(
+                "budget_um makes the whole print faster: it cannot be combined with where and "
+                "max_mb, which leave parts of it as sliced"
+            )
+        return self
 
     @model_serializer(mode="wrap")
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Digests of options are kept for long: what came later counts only where it is used.
         values: dict[str, Any] = handler(self)
-        if values.get("budget_um") is None:
-            values.pop("budget_um", None)
+        for name, unused in (("budget_um", None), ("where", "all"), ("max_mb", None)):
+            if values.get(name) == unused:
+                values.pop(name, None)
         return values
 
 

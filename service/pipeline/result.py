@@ -280,6 +280,10 @@ class Result(_Figures):
     mark, steep ones, and others whose place or state is not known; put back pieces not counted."""
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
+    left_out_s: float = 0.0
+    """Time of what leaves as sliced because the job asked for less than all (`where`) [s]."""
+    left_out_extruding_s: float = 0.0
+    """How much of that extrudes [s]."""
     warnings: list[str]
     """What asks for attention, for a person."""
     notes: list[str] = []

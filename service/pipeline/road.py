@@ -26,7 +26,7 @@ from gcode.firmware.planning import intended, join_phases, plan_moves
 from gcode.firmware.registry import kit
 from gcode.firmware.writing import StreamWriter
 from gcode.interpreter import Interpreter
-from gcode.pieces import Passage, Piece, Splitter
+from gcode.pieces import LeftOut, Passage, Piece, Splitter
 from gcode.sampler import sample_phases, sample_until
 from gcode.slicers.facts import SlicerFacts
 from gcode.slicers.retiming import Retiming
@@ -59,6 +59,7 @@ from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
 from service.pipeline.result import PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
+from service.pipeline.selection import Selection, TooLarge, narrower
 from service.pipeline.sums import Sums
 from service.pipeline.tracing import Trace
 from service.pipeline.verifying import NEGLIGIBLE_UM, Verifier
@@ -155,7 +156,15 @@ def compensate_file(
             budget: SpeedBudget | None = None
             while True:
                 job = go(writer, traced, budget)
-                result = job.run(source.name, facts)
+                try:
+                    result = job.run(source.name, facts)
+                except TooLarge:
+                    options = _fitting(options, source.name)
+                    go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
+                    spool.seek(0)
+                    spool.truncate()
+                    writer = writer.anew() if writer is not None else None
+                    continue
                 budget = job.milder
                 if budget is None and traced is trace:
                     break
@@ -173,6 +182,17 @@ def compensate_file(
             "written_bytes": temporary.stat().st_size,
         }
         return result.model_copy(update=sizes)
+
+
+def _fitting(options: Options, name: str) -> Options:
+    """Return options with which less is compensated than with those that made a file too large."""
+    less = narrower(options)
+    if less is None:
+        raise GcodeError(
+            f"{name} does not fit into max_mb {options.max_mb:g} even if its outer walls alone are "
+            "compensated: allow more, or take a larger tolerance_um"
+        )
+    return less
 
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
@@ -242,6 +262,7 @@ class _Job:
         self._reader = Interpreter(machine, dialect=dialect)
         self._checker = Interpreter(machine, dialect=dialect)
         self._splitter = Splitter(machine, compensate=self._changes)
+        self._selection = Selection(options.where, machine)
         self._operation = Operation(machine)
         self._budget = budget
         self._pairs: BudgetMeasurement | None = None
@@ -299,7 +320,7 @@ class _Job:
         if self._pairs is not None and self._budget is None:
             self._budget = self._chosen_paces(size)
         self._source.seek(0)
-        for item in self._items():
+        for item in self._selected():
             self._point = self._operation.at(item.moves)
             self._measurement.operate_at(self._point)
             if isinstance(item, Piece):
@@ -334,6 +355,14 @@ class _Job:
             return SpeedBudget.chosen(
                 found, self._machine, self._options, self._shaper, self._caution
             )
+
+    def _selected(self) -> Iterator[Piece | Passage]:
+        for item in self._items():
+            before_s, names = self._sum.original_s, self._reader.feature_names
+            yield from self._timed(self._selection.divide(item, names))
+            if isinstance(item, Piece) and self._options.where != "all":
+                # The file as it came does not stand still where it was divided.
+                self._sum.original_s = before_s + item.phases.duration_s
 
     def _items(self) -> Iterator[Piece | Passage]:
         while True:
@@ -520,11 +549,16 @@ class _Job:
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
         self._sum.time_s += motion_s
-        self._sum.passed_motion_s += motion_s
         feeds = feeding(phases)
-        self._sum.extruding_s += float(np.sum(duration[feeds]))
-        if np.any(feeds):
-            self._sum.passed_s += float(np.sum(duration[feeds]))
+        extruding_s = float(np.sum(duration[feeds]))
+        self._sum.extruding_s += extruding_s
+        if isinstance(passage, LeftOut):
+            self._sum.left_out_s += motion_s
+            self._sum.left_out_extruding_s += extruding_s
+        else:
+            self._sum.passed_motion_s += motion_s
+        if np.any(feeds) and not isinstance(passage, LeftOut):
+            self._sum.passed_s += extruding_s
             first = phases.move_index[int(np.argmax(feeds))]
             self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
         until = np.where(feeds, phases.t_s + duration, -np.inf)
@@ -607,6 +641,9 @@ class _Job:
         self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
     ) -> None:
         self._sum.written += len(text)
+        most_mb = self._options.max_mb
+        if most_mb is not None and self._sum.written > 1e6 * most_mb:
+            raise TooLarge
         self._target.write(text)
         self.retiming.push(text, item, delay_s)
 
@@ -638,10 +675,16 @@ class _Job:
         channels = measured.channels()
         if self._choice is not None:
             channels = [self._choice.ranged(channel) for channel in channels]
+        notes = [*self._standing, *self._operation.notes()]
         if self._changes:
             warnings += total.left_alone()
-            warnings += self._outdone({c.name: c.extruding.contour_rms_um for c in channels})
-        shaper, notes, budget = self._shaper, [*self._standing, *self._operation.notes()], None
+            features = measured.features(self._reader.feature_names)
+            ours = self._selection.rms_um(features)
+            if self._options.where == "all" or not ours:
+                ours = {c.name: c.extruding.contour_rms_um for c in channels}
+            warnings += self._outdone(ours)
+            notes += total.left_out(self._options.where, ours)
+        shaper, budget = self._shaper, None
         if self._budget is not None and self._pairs is not None:
             names, sums = self._reader.feature_names, self._pairs.sums()
             budget = self._budget.figures(sums, names, total.original_s, total.time_s)
@@ -675,6 +718,8 @@ class _Job:
             pieces=total.pieces,
             put_back=total.put_back,
             put_back_extruding_share=total.put_back_share,
+            left_out_s=total.left_out_s,
+            left_out_extruding_s=total.left_out_extruding_s,
             left_alone_s=total.left_alone_s if self._changes else 0.0,
             left_alone_extruding_s=total.left_alone_extruding_s if self._changes else 0.0,
             warnings=warnings,

@@ -26,6 +26,7 @@ class Sums:
         self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
         self.gap2 = self.gap_max = self.filament_error = 0.0
         self.passed_s, self.passed_motion_s, self.passed_line = 0.0, 0.0, 0
+        self.left_out_s = self.left_out_extruding_s = 0.0
         self.gap_count = 0
         self.put_back: list[PutBack] = []
         self.warnings: list[str] = []
@@ -70,6 +71,18 @@ class Sums:
     def left_alone_extruding_s(self) -> float:
         """The part of it that extrudes."""
         return max(self.passed_s - self.put_back_s, 0.0)
+
+    def left_out(self, where: str, rms_um: dict[str, float]) -> Iterator[str]:
+        """Yield what was left as sliced because the job asked for less than all."""
+        if where == "all":
+            return
+        before, after = rms_um.get("before", 0.0), rms_um.get("after", 0.0)
+        yield (
+            f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "
+            f"{self.left_out_extruding_s:.0f} s of them extrude. Where it is compensated, the "
+            f"contour error falls from {before:.2g} to {after:.2g} um rms; figures of the whole "
+            "print count both"
+        )
 
     def left_alone(self) -> Iterator[str]:
         """Yield a warning where much was not compensated."""

@@ -110,6 +110,8 @@ function moreOptions() {
   const robust = select("robust", [["", [["auto", "Automatic: what the measurement bears"], ["off", "The nominal plant"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
   const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
   const budget = h("input", { type: "number", id: "budget", min: "0.5", max: "1000", step: "0.5", placeholder: "keep all speeds" });
+  const where = select("where", [["", [["all", "Everywhere"], ["visible", "Outer walls, top and bottom"], ["walls", "Outer walls"]]]]);
+  const most = h("input", { type: "number", id: "max-mb", min: "1", step: "1", placeholder: "no limit" });
   const plate = h("input", { type: "number", id: "plate", min: "1", step: "1", placeholder: "the only one" });
   const times = select("times", [["", [["new", "Follow the new motion"], ["kept", "Stay as they are"]]]]);
   const dialect = select("dialect", [["", DIALECTS]]);
@@ -120,12 +122,14 @@ function moreOptions() {
       field("basis", "Basis functions", basis),
       field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
       field("budget", "Speed budget, µm", budget, "Contour error (rms) that every feature may have; the print becomes as fast as that allows."),
+      field("where", "Compensate", where, "The rest stays as sliced, and the file is smaller."),
+      field("max-mb", "Largest file, MB", most, "Compensates less, down to the outer walls, until the G-code fits."),
       field("dialect", "File is written for", dialect),
       field("times", "The slicer's times", times),
       field("plate", "Plate of a 3MF package", plate)),
     h("label.check", { for: "fresh" }, fresh, "Compute anew even if the same file was done before"));
   const read = () => ({
-    basis: basis.value, robust: robust.value, along: along.value, budget_um: budget.value, plate: plate.value,
+    basis: basis.value, robust: robust.value, along: along.value, budget_um: budget.value, where: where.value, max_mb: most.value, plate: plate.value,
     times: times.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "",
   });
   return { element, read };

@@ -1,0 +1,138 @@
+"""Divide a piece, where it stands or nearly does, into what is compensated and what is not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcode.firmware.planning import plan_moves
+from gcode.firmware.registry import kit
+from gcode.pieces import LeftOut, Passage, Piece
+from gcode.timeline import group_rows
+from gcode.types import Limits, ModalState, Phases, rows_of
+from models.machine import Machine
+
+__all__ = ["divided", "sections"]
+
+_SLOW_MM_S = 15.0
+"""From here it is a few milliseconds to a stand, and to this speed again."""
+
+
+def sections(piece: Piece) -> list[tuple[int, int]]:
+    """Return runs of moves of X or Y between which a piece may be cut, in order.
+
+    Between two of them lies a rest, or the machine is slow where printing begins or ends: it can
+    stand still there without losing time that counts.
+
+    Returns
+    -------
+    list of (int, int)
+        First row and one past the last.
+    """
+    phases = piece.phases
+    feeds = phases.direction[:, 3] > 0.0
+    slow = (feeds[1:] != feeds[:-1]) & (phases.end_mm_s[:-1] <= _SLOW_MM_S)
+    found = []
+    for group in group_rows(phases):
+        if group.rest:
+            continue
+        inner = np.flatnonzero(slow[group.first : group.last - 1]) + group.first + 1
+        found += list(pairwise([group.first, *inner.tolist(), group.last]))
+    return found
+
+
+def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterator[Piece | LeftOut]:
+    """Cut a piece so that only the wanted sections remain pieces.
+
+    Parameters
+    ----------
+    piece : Piece
+    wanted : ndarray of bool, shape (len(sections(piece)),)
+        Neighbours that are wanted stay one piece, with the rests between them.
+
+    Yields
+    ------
+    Piece or LeftOut
+        In order; their texts add up to the piece's. A part is planned anew, from rest to rest,
+        where the firmware would pass through the rest that bounds it without stopping.
+    """
+    if np.all(wanted):
+        yield piece
+        return
+    rows = sections(piece)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
+    moves = piece.moves
+    done = 0
+    for first, behind in edges.reshape(-1, 2).tolist():
+        start, end = rows[first][0], rows[behind - 1][1]
+        if start > done:
+            yield _left_out(piece, done, start)
+        yield Piece.planned(_part(piece, start, end), _plan(piece, start, end, machine))
+        done = end
+    if done < len(moves):
+        yield _left_out(piece, done, len(moves))
+
+
+def _plan(piece: Piece, start: int, end: int, machine: Machine) -> Phases:
+    """Return the plan of some moves of a piece, which begin and end at rest."""
+    phases = piece.phases
+    bounds = [row for row in (start - 1, end) if 0 <= row < len(phases)]
+    apart = kit(machine).extruder_alone_stops and not np.any(phases.direction[bounds, :3])
+    if apart:
+        return rows_of(phases, slice(start, end))
+    rows = rows_of(piece.moves, slice(start, end))
+    return plan_moves(rows, piece.limits, machine, rests_apart=True)
+
+
+def _part(piece: Piece, start: int, end: int) -> Passage:
+    """Return the lines of moves start..end - 1 of a part that is compensated, no others."""
+    begin = int(piece.moves.byte_start[start]) if start else piece.text_offset
+    return _lines(piece, start, end, begin, int(piece.moves.byte_end[end - 1]))
+
+
+def _left_out(piece: Piece, start: int, end: int) -> LeftOut:
+    """Return moves start..end - 1 with all that stands between the parts around them."""
+    begin, until = piece.text_offset, piece.text_offset + len(piece.text)
+    if start:
+        begin = int(piece.moves.byte_end[start - 1])
+    if end < len(piece.moves):
+        until = int(piece.moves.byte_start[end])
+    lines = _lines(piece, start, end, begin, until)
+    return LeftOut(**{f.name: getattr(lines, f.name) for f in fields(Passage)})
+
+
+def _lines(piece: Piece, start: int, end: int, begin: int, until: int) -> Passage:
+    """Return moves start..end - 1 and the bytes begin..until - 1, both of a piece."""
+    moves, events = piece.moves, piece.events
+    rows = slice(*np.searchsorted(events.byte_start, [begin, until]).tolist())
+    ours = rows_of(events, rows)
+    limits_before, modal_before = _state(piece, begin)
+    limits_after, modal_after = _state(piece, until)
+    return Passage(
+        moves=rows_of(moves, slice(start, end)),
+        events=replace(ours, move_index=ours.move_index - start),
+        text=piece.text[begin - piece.text_offset : until - piece.text_offset],
+        text_offset=begin,
+        limits=piece.limits,
+        modal=piece.modal,
+        limits_before=limits_before,
+        limits_after=limits_after,
+        modal_before=modal_before,
+        modal_after=modal_after,
+    )
+
+
+def _state(piece: Piece, at_byte: int) -> tuple[Limits, ModalState]:
+    """Return limits and modes behind the last line that starts before a byte of the file."""
+    found = piece.limits_before, piece.modal_before
+    latest = -1
+    for table in (piece.moves, piece.events):
+        row = int(np.searchsorted(table.byte_start, at_byte)) - 1
+        if row >= 0 and int(table.byte_start[row]) > latest:
+            latest = int(table.byte_start[row])
+            found = piece.limits[table.limits_id[row]], piece.modal[table.modal_id[row]]
+    return found
