@@ -71,6 +71,8 @@ WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
 """What rings in a rest stands over the end of a line: less leaves more of it and gains no accuracy
 while extruding, 1 begins to cost some."""
+_FORGOTTEN = 1e-12
+"""What is left of a vibration that no state needs to know of."""
 _NESTED = {"ce-opt", "dct"}
 """Bases whose functions for n are the first n of those for more."""
 
@@ -258,6 +260,7 @@ class PreviewAxis:
         self.window, self.update = designs.lifted.window, designs.lifted.update
         self._plants = designs.lifted.plants
         self.members = len(self._plants)
+        self._memory = max(round(p.settling_time_s(_FORGOTTEN) / p.dt_s) for p in self._plants)
         self._rest_at_one = np.concatenate([p.rest_state() for p in self._plants])
         self.rung = self.next_rung = 0
         self._made: _Drive | None = None
@@ -276,7 +279,11 @@ class PreviewAxis:
             return
         origin = float(command[-1])
         self._move_origin(origin)
-        self._states = self._advanced(self._states, command - origin)
+        recent = command[-self._memory :] - origin
+        states = self._states
+        if len(command) > self._memory:
+            states = self._resting(float(recent[0]))
+        self._states = self._advanced(states, recent)
 
     def commit(self, command: AxisCommand) -> None:
         """Take a command as executed."""
