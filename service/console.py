@@ -55,6 +55,11 @@ def print_result(result: Result, console: Console | None = None) -> None:
                     for channel in result.channels
                 ]
                 table.add_row(f"{kind} {measure}, {part}", *cells)
+    if any(c.selected_rms_um is not None for c in result.channels):
+        table.add_row(
+            "contour rms, compensated features",
+            *[f"{c.selected_rms_um or 0.0:.2f}" for c in result.channels],
+        )
     if any(c.contour_range_um for c in result.channels):
         table.add_row(
             "contour rms, of all plants",

@@ -101,7 +101,9 @@ class Choice:
         """Return a channel of a report with the range over the members."""
         if channel.name not in self.ranges:
             return channel
-        low, high = (channel.extruding.contour_rms_um * s for s in self.ranges[channel.name])
+        rms_um = channel.selected_rms_um
+        rms_um = channel.extruding.contour_rms_um if rms_um is None else rms_um
+        low, high = (rms_um * s for s in self.ranges[channel.name])
         return channel.model_copy(update={"contour_range_um": (low, high)})
 
 

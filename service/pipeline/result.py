@@ -53,6 +53,9 @@ class Channel(_Figures):
     contour_range_um: tuple[float, float] | None = None
     """Least and largest contour error while extruding, root mean square, of all plants that explain
     the machine's measurement [um]; null for a machine without such a set."""
+    selected_rms_um: float | None = None
+    """Contour error while extruding, root mean square, of the features that are compensated [um];
+    null where all are. The range is theirs then."""
     all_motion: ErrorFigures
     """Over all motion, travel included [um]."""
     residual_rms_um: float

@@ -57,7 +57,7 @@ from service.pipeline.passages import feeding, plan_passage, switching_s, takes_
 from service.pipeline.points import MotionSamples, part_of
 from service.pipeline.progress import ProgressCallback, Teller, telling
 from service.pipeline.reading import dialect_for, doubts, passed_over
-from service.pipeline.result import PutBack, Result, StageTime
+from service.pipeline.result import Channel, PutBack, Result, StageTime
 from service.pipeline.samples import take_samples
 from service.pipeline.selection import Selection, TooLarge, narrower
 from service.pipeline.sums import Sums
@@ -199,6 +199,11 @@ _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """What says of itself why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """With those of our own: a piece that meets one stays as it came, and the others are printed."""
+
+
+def _counting_rms_um(channel: Channel) -> float:
+    selected_um = channel.selected_rms_um
+    return channel.extruding.contour_rms_um if selected_um is None else selected_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -662,6 +667,19 @@ class _Job:
             "Print it as sliced with that shaper, or let --method advise write the commands"
         )
 
+    def _channels(self) -> list[Channel]:
+        """Return the figures of the whole print, with what counts where a part is compensated."""
+        channels = self._measurement.channels()
+        if self._options.where != "all":
+            features = self._measurement.features(self._reader.feature_names)
+            rms_um = self._selection.rms_um(features)
+            channels = [
+                c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
+            ]
+        if self._choice is not None:
+            channels = [self._choice.ranged(channel) for channel in channels]
+        return channels
+
     def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
         total, measured = self._sum, self._measurement
         warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
@@ -672,18 +690,12 @@ class _Job:
             )
         if self._changes and self._writer.shaper_note is not None:
             warnings.append(self._writer.shaper_note)
-        channels = measured.channels()
-        if self._choice is not None:
-            channels = [self._choice.ranged(channel) for channel in channels]
+        channels = self._channels()
         notes = [*self._standing, *self._operation.notes()]
         if self._changes:
             warnings += total.left_alone()
-            features = measured.features(self._reader.feature_names)
-            ours = self._selection.rms_um(features)
-            if self._options.where == "all" or not ours:
-                ours = {c.name: c.extruding.contour_rms_um for c in channels}
-            warnings += self._outdone(ours)
-            notes += total.left_out(self._options.where, ours)
+            warnings += self._outdone({c.name: _counting_rms_um(c) for c in channels})
+            notes += total.left_out(self._options.where)
         shaper, budget = self._shaper, None
         if self._budget is not None and self._pairs is not None:
             names, sums = self._reader.feature_names, self._pairs.sums()

@@ -72,17 +72,14 @@ class Sums:
         """The part of it that extrudes."""
         return max(self.passed_s - self.put_back_s, 0.0)
 
-    def left_out(self, where: str, rms_um: dict[str, float]) -> Iterator[str]:
+    def left_out(self, where: str) -> Iterator[str]:
         """Yield what was left as sliced because the job asked for less than all."""
-        if where == "all":
-            return
-        before, after = rms_um.get("before", 0.0), rms_um.get("after", 0.0)
-        yield (
-            f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "
-            f"{self.left_out_extruding_s:.0f} s of them extrude. Where it is compensated, the "
-            f"contour error falls from {before:.2g} to {after:.2g} um rms; figures of the whole "
-            "print count both"
-        )
+        if where != "all":
+            yield (
+                f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "
+                f"{self.left_out_extruding_s:.0f} s of them extrude. Figures of the whole print "
+                "count them too"
+            )
 
     def left_alone(self) -> Iterator[str]:
         """Yield a warning where much was not compensated."""

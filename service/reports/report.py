@@ -88,13 +88,16 @@ def _headline(channels: Sequence[Channel]) -> dict[str, Any]:
     extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
     scope = "extruding" if extrudes else "all_motion"
     rms = {channel.name: getattr(channel, scope).contour_rms_um for channel in channels}
+    selected = {c.name: c.selected_rms_um for c in channels if c.selected_rms_um is not None}
+    rms.update(selected)
+    of = "where it is compensated" if selected else "while extruding"
     before, after = rms.get("before"), rms.get("after")
     ratio = before / after if before and after else None
     ranges = {channel.name: channel.contour_range_um for channel in channels}
     return {
         "range": ranges.get("after") if extrudes else None,
         "shaper_range": ranges.get("shaper") if extrudes else None,
-        "of": "while extruding" if extrudes else "of all motion (nothing is extruded)",
+        "of": of if extrudes else "of all motion (nothing is extruded)",
         "before": before,
         "after": after,
         "shaper": rms.get("shaper"),

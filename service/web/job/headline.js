@@ -15,9 +15,11 @@ export function headline(report, channels) {
   // A file that extrudes nothing, such as a coupon drawn with a pen, is judged by all its motion.
   const extrudes = channels.some((c) => c.extruding.contour_max_um > 0);
   const rms = Object.fromEntries(channels.map((c) => [c.name, (extrudes ? c.extruding : c.all_motion).contour_rms_um]));
+  const selected = channels.filter((c) => Number.isFinite(c.selected_rms_um));
+  for (const c of selected) rms[c.name] = c.selected_rms_um;
   const ranges = extrudes ? Object.fromEntries(channels.map((c) => [c.name, c.contour_range_um])) : {};
   const said = (/** @type {string} */ name) => ranges[name] ? `${um(ranges[name][0])} to ${um(ranges[name][1])}` : um(rms[name]);
-  const label = `Contour error ${extrudes ? "while extruding" : "of all motion (nothing is extruded)"}, rms`;
+  const label = `Contour error ${extrudes ? (selected.length ? "where it is compensated" : "while extruding") : "of all motion (nothing is extruded)"}, rms`;
   const ratio = rms.before / rms.after;
   const change = 100 * (report.time_s / report.original_time_s - 1);
   return h("section.headline", { "aria-label": "Headline" },

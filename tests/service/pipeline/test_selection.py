@@ -69,6 +69,12 @@ def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     assert outer["after"] <= more * rms(all_of_it, "WALL-OUTER")["after"] + 0.1
     assert sliced["after"] == pytest.approx(sliced["before"], rel=0.05)
     assert any("where=walls" in note for note in walls.notes)
+    # What counts, and its range, are those of the walls (the skirt and purge lines left out).
+    selected = {c.name: c for c in walls.channels}["after"]
+    assert selected.selected_rms_um == pytest.approx(outer["after"], rel=0.3)
+    assert selected.contour_range_um is not None
+    assert selected.contour_range_um[0] <= selected.selected_rms_um
+    assert selected.contour_range_um[1] < selected.extruding.contour_rms_um * 3
     assert not any("shaper would serve" in warning for warning in walls.warnings)
 
 
