@@ -1,0 +1,530 @@
+"""Follow original and written file side by side, and compare them at every line they share.
+
+Outside of streams the written file holds every line of the original. Within one, straight lines of
+ours stand for its moves of X and Y; all other lines are there in order, or held back as comments.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.machine import Machine
+from service.pipeline.last_check import _reader_kernels as at
+from service.pipeline.last_check.reader import Kind, Reader, code_of, tells_times
+from service.pipeline.last_check.rules import rules_of
+from service.pipeline.result import LastCheckFigures
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
+__all__ = ["LastCheck", "LastCheckError"]
+
+_PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
+_BLOCK_BYTES = 1 << 18
+_ALL = 1 << 60
+_SHOWN = 5
+_SHOWN_CHARACTERS = 60
+_BOM = b"\xef\xbb\xbf"
+_OWN = b"; stillpath"
+_ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
+_OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
+_NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
+_UNITS = ("mm", "mm", "mm", "mm", "mm", "mm/min", "", "", "")
+_ANYWHERE = re.compile(
+    rb"G4 P0 ;|M400\b|G1$|(?:SET_VELOCITY_LIMIT|SET_INPUT_SHAPER|M20[1345]|M566|M572|M593|M74|M493"
+    rb"|M900|M97[45])(?![\d.])",
+    re.IGNORECASE,
+)
+"""Lines that we write outside of streams too: standing still, limits, the firmware's shaper."""
+_IN_STREAM = re.compile(
+    _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
+    re.IGNORECASE,
+)
+
+
+class LastCheckError(Exception):
+    """The written file is not what it should be; it must not be delivered.
+
+    Attributes
+    ----------
+    line, written_line : int
+        Lines of the original and of the written file, from 1.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, line: int, written_line: int) -> None:
+        self.line, self.written_line = line, written_line
+        super().__init__(
+            f"the last check refuses the written file at its line {written_line} (line {line} of "
+            f"the original): {message}. This is an error of Stillpath, nothing was written: "
+            "please report it with the file, and print the original"
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuilt, (self.args[0], self.line, self.written_line)
+
+
+def _rebuilt(text: str, line: int, written_line: int) -> LastCheckError:
+    error = LastCheckError("", line, written_line)
+    error.args = (text,)
+    return error
+
+
+@dataclass(slots=True)
+class _Text:
+    """Whole lines of a file that are at hand."""
+
+    data: bytes = b""
+    at: int = 0
+    line: int = 1
+    """Number of the line at `at`."""
+    bytes_before: int = 0
+    """Where `data` begins in the file."""
+    array: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+
+    @property
+    def is_read(self) -> bool:
+        """Nothing is left."""
+        return self.at >= len(self.data)
+
+    def take(self, data: bytes) -> None:
+        """Go on with other lines, behind those that were at hand."""
+        self.bytes_before += len(self.data)
+        self.data, self.at = data, 0
+        self.array = np.frombuffer(data, np.uint8)
+
+    def peek(self) -> tuple[bytes, int]:
+        """Return the next line without its end, and where the one behind it begins."""
+        end = self.data.index(b"\n", self.at)
+        line = self.data[self.at : end]
+        if self.line == 1 and line.startswith(_BOM):
+            line = line[len(_BOM) :]
+        return line, end + 1
+
+    def skip(self, behind: int, lines: int = 1) -> None:
+        """Go on with a line further down."""
+        self.at = behind
+        self.line += lines
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """The next line of the original that must be in the written file."""
+
+    line: int
+    code: bytes
+    kind: Kind
+    mask: int
+    array: NDArray[np.uint8]
+
+
+_NONE = np.zeros(0, np.uint8)
+
+
+class LastCheck:
+    """A file to write to, which reads along and compares with the original.
+
+    Parameters
+    ----------
+    target : file
+        Where to hand on what is written.
+    original : binary file
+        Text of the original; is read from its beginning.
+    machine : Machine
+    step_mm : tuple of float
+        Grid of the firmware's x, y, z; 0: none. Where streams end the written file may be one off.
+
+    Attributes
+    ----------
+    cpu_s : float
+        CPU time that reading and comparing took.
+    """
+
+    def __init__(
+        self,
+        target: SupportsWrite[bytes],
+        original: BinaryIO,
+        machine: Machine,
+        step_mm: tuple[float, ...] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._target, self._source = target, original
+        original.seek(0)
+        rules = rules_of(machine.firmware)
+        self._before, self._after = Reader(rules), Reader(rules)
+        self._original, self._written = _Text(), _Text()
+        self._rest: list[bytes] = []
+        self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
+        self._words = np.zeros(5)
+        self._streaming = False
+        self._begun: tuple[Any, ...] = ()
+        """Where the original was behind the last line of it within the stream."""
+        self._wanted: _Wanted | None = None
+        self._perhaps: deque[bytes] = deque(maxlen=1 << 12)
+        self._given_up = False
+        self._kept = self._compared = 0
+        self._gap_line = 0
+        self._gaps: list[str] = []
+        self._more_gaps = 0
+        self.cpu_s = 0.0
+
+    def write(self, data: bytes) -> int:
+        """Hand on what is written, and compare it.
+
+        Raises
+        ------
+        LastCheckError
+        """
+        self._target.write(data)
+        began = time.process_time()
+        cut = data.rfind(b"\n") + 1
+        if cut:
+            self._written.take(b"".join((*self._rest, data[:cut])))
+            self._rest = []
+            self._follow()
+        if cut < len(data):
+            self._rest.append(data[cut:])
+        self.cpu_s += time.process_time() - began
+        return len(data)
+
+    def finish(self) -> LastCheckFigures:
+        """Compare the end, and tell what was compared.
+
+        Raises
+        ------
+        LastCheckError
+        """
+        began = time.process_time()
+        if self._rest:
+            self._written.take(b"".join((*self._rest, b"\n")))
+            self._rest = []
+            self._follow()
+        expected = None if self._given_up else self._expected()
+        if expected is not None:
+            raise self._missing(self._original.line, expected)
+        if self._gap_line:
+            self._close_gap("the end")
+        gaps = list(self._gaps)
+        if self._more_gaps:
+            gaps.append(f"... and {self._more_gaps} more")
+        self.cpu_s += time.process_time() - began
+        return LastCheckFigures(
+            kept_lines=self._kept, compared_lines=self._compared, not_compared=gaps
+        )
+
+    # The written file
+
+    def _follow(self) -> None:
+        written = self._written
+        while not written.is_read:
+            if self._given_up:
+                written.at = len(written.data)
+            elif self._streaming:
+                self._stream()
+            else:
+                self._lines()
+
+    def _lines(self) -> None:
+        """Follow what stands outside of streams: moves of both, and another line."""
+        written, original = self._written, self._original
+        if original.is_read:
+            self._read_on()
+        before, after = original.line, written.at
+        original.at, written.at, lines, unknown, found = at.compare_moves(
+            original.array,
+            original.at,
+            len(original.data),
+            written.array,
+            written.at,
+            len(written.data),
+            self._before.state,
+            self._after.state,
+            self._words,
+            self._place_mm,
+            _FILAMENT_MM,
+        )
+        original.line += lines
+        written.line += lines
+        if found != at.SAME:
+            end = written.at - 1
+            start = written.data.rfind(b"\n", after, end) + 1
+            raise self._differs(found, written.data[max(start, after) : end], -1)
+        self._note(lines, unknown, before)
+        if written.is_read or (lines and original.is_read):
+            return
+        line, behind = written.peek()
+        code = code_of(line)
+        if not code:
+            written.skip(behind)
+            if line.startswith(_ON):
+                self._streaming, self._wanted = True, None
+                self._begin()
+            return
+        expected = self._expected()
+        if expected is not None and _is_same(code, expected):
+            _, mask = self._before.carry_out(expected)
+            self._after.carry_out(code)
+            self._compare(mask, code)
+            self._skip_original()
+        elif self._given_up:
+            return
+        elif _ANYWHERE.match(code):
+            self._after.carry_out(code)
+        else:
+            raise self._strange(code, expected)
+        written.skip(behind)
+
+    def _stream(self) -> None:
+        """Follow a stream: moves of ours, and another line."""
+        written = self._written
+        if self._wanted is None:
+            self._find_wanted()
+            if self._given_up:
+                return
+        wanted = self._wanted
+        written.at, lines = at.ours(
+            written.array,
+            written.at,
+            len(written.data),
+            self._after.state,
+            self._words,
+            _NONE if wanted is None else wanted.array,
+        )
+        written.line += lines
+        if written.is_read:
+            return
+        line, behind = written.peek()
+        code = code_of(line)
+        if code:
+            if not self._takes(code, held_back=False):
+                if _IN_STREAM.match(code) is None:
+                    raise self._strange(code, wanted.code if wanted else None)
+                self._after.carry_out(code)
+        elif line.startswith(_HELD):
+            if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
+                raise self._strange(line, wanted.code if wanted else None)
+        elif line.startswith(_OWN) and (off := _OFF.match(line)) is not None:
+            self._leave(int(off[1]) if off[1] else _ALL)
+        written.skip(behind)
+
+    def _takes(self, code: bytes, *, held_back: bool) -> bool:
+        """Take a line of a stream for one of the original, if it is one."""
+        wanted = self._wanted
+        if wanted is not None and _is_same(code, wanted.code):
+            if not held_back:
+                self._after.carry_out(code)
+            if wanted.kind is Kind.RESTS and not held_back:
+                self._compare(wanted.mask, code, wanted.line)
+            else:
+                self._kept += 1
+            self._perhaps.clear()
+            self._wanted = None
+            self._begin()
+            return True
+        if code in self._perhaps:
+            while self._perhaps.popleft() != code:
+                pass
+            if not held_back:
+                self._after.carry_out(code)
+            self._kept += 1
+            return True
+        return False
+
+    def _leave(self, number: int) -> None:
+        """Leave a stream behind which the file goes on with a line of the original."""
+        wanted = self._wanted
+        if wanted is None:
+            self._find_wanted()
+            wanted = self._wanted
+        if wanted is not None and wanted.line < number:
+            raise self._missing(wanted.line, wanted.code)
+        self._streaming, self._wanted = False, None
+        self._perhaps.clear()
+        if number == _ALL or self._given_up:
+            return
+        # What is wanted may lie behind: go back, and again up to the line.
+        bytes_before, line, kept = self._begun
+        self._before.restore(kept)
+        original = self._original
+        if original.bytes_before <= bytes_before < original.bytes_before + len(original.data):
+            original.at = bytes_before - original.bytes_before
+        else:
+            self._source.seek(bytes_before)
+            original.take(b"")
+            original.bytes_before = bytes_before
+        original.line = line
+        while original.line < number and (line_left := self._next_original(number)) is not None:
+            self._before.carry_out(line_left)
+            self._skip_original()
+        if original.line != number:
+            raise LastCheckError(
+                f"a stream ends before line {number} of the original, of which this was written "
+                "already",
+                original.line,
+                self._written.line,
+            )
+
+    # The original
+
+    def _read_on(self) -> bool:
+        """Read the next lines of the original; tell whether there are any."""
+        original = self._original
+        parts = []
+        while block := self._source.read(_BLOCK_BYTES):
+            cut = block.rfind(b"\n") + 1
+            if cut:
+                parts.append(block[:cut])
+                if cut < len(block):
+                    self._source.seek(cut - len(block), 1)
+                break
+            parts.append(block)
+        data = b"".join(parts)
+        if data and not data.endswith(b"\n"):
+            data += b"\n"
+        if data:
+            original.take(data)
+        return bool(data)
+
+    def _begin(self) -> None:
+        original = self._original
+        self._begun = (
+            original.bytes_before + original.at,
+            original.line,
+            self._before.keep(),
+        )
+
+    def _expected(self) -> bytes | None:
+        """Return the next line of the original that holds a command; None at its end."""
+        original = self._original
+        while not original.is_read or self._read_on():
+            line, behind = original.peek()
+            if line.startswith(_OWN):
+                # A mark that is not ours: where streams begin and end can no longer be told.
+                self._given_up = True
+                self._gap(f"it looks like one of Stillpath's own ({_shown(line)})")
+                self._close_gap("the end")
+                return None
+            code = code_of(line)
+            if code:
+                return code
+            original.skip(behind)
+        return None
+
+    def _skip_original(self) -> None:
+        original = self._original
+        original.skip(original.data.index(b"\n", original.at) + 1)
+
+    def _next_original(self, before_line: int = _ALL) -> bytes | None:
+        """Carry out moves of X and Y; return the line behind them, to be carried out."""
+        original = self._original
+        while original.line < before_line:
+            if original.is_read and not self._read_on():
+                return None
+            behind, lines = at.carry_out_moves(
+                original.array,
+                original.at,
+                len(original.data),
+                before_line - original.line,
+                self._before.state,
+                self._words,
+            )
+            original.skip(behind, lines)
+            if original.is_read or original.line >= before_line:
+                continue
+            line, behind = original.peek()
+            if code_of(line) or line.startswith(_OWN):
+                return self._expected()
+            original.skip(behind)
+        return None
+
+    def _find_wanted(self) -> None:
+        """Carry out the original up to the next line that must be in the written file."""
+        while (code := self._next_original()) is not None:
+            line = self._original.line
+            kind, mask = self._before.carry_out(code)
+            self._skip_original()
+            if kind is Kind.PERHAPS:
+                self._perhaps.append(code)
+            elif kind is not Kind.MOVES:
+                self._wanted = _Wanted(line, code, kind, mask, np.frombuffer(code, np.uint8))
+                return
+
+    # What is found
+
+    def _compare(self, mask: int, code: bytes, line: int | None = None) -> None:
+        before, after = self._before.state, self._after.state
+        found = at.compare(before, after, mask, self._place_mm, _FILAMENT_MM)
+        if found != at.SAME:
+            raise self._differs(found, code, 0, line)
+        unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
+        self._note(1, int(unknown != unknown), line or self._original.line)
+
+    def _note(self, lines: int, unknown: int, line: int) -> None:
+        """Count lines that were compared, the first of them without a place."""
+        self._kept += lines
+        self._compared += lines - unknown
+        if unknown and not self._gap_line:
+            self._gap_line = line
+        if lines > unknown and self._gap_line:
+            self._close_gap(f"line {line + unknown}")
+
+    def _gap(self, why: str) -> None:
+        self._gap_line = self._gap_line or self._original.line
+        self._before.lost = why.encode()
+
+    def _close_gap(self, until: str) -> None:
+        line, self._gap_line = self._gap_line, 0
+        why = _shown(self._before.lost) or "no line has named one yet"
+        if len(self._gaps) < _SHOWN:
+            self._gaps.append(
+                f"lines {line} to {until}: filament and modes only, because the position is not "
+                f"known ({why})"
+            )
+        else:
+            self._more_gaps += 1
+
+    def _differs(
+        self, found: int, code: bytes, offset: int, line: int | None = None
+    ) -> LastCheckError:
+        one, other = float(self._before.state[found]), float(self._after.state[found])
+        limit = {at.F: 1e-4, at.RELATIVE: 0.0, at.RELATIVE_E: 0.0}.get(found, _FILAMENT_MM)
+        if found < 3:
+            limit = float(self._place_mm[found])
+        unit = _UNITS[found] and " " + _UNITS[found]
+        return LastCheckError(
+            f"behind {_shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
+            f"{one:.7g}{unit}; they may differ by {limit:.3g}{unit}",
+            line or self._original.line + offset,
+            self._written.line + offset,
+        )
+
+    def _missing(self, line: int, code: bytes) -> LastCheckError:
+        return LastCheckError(
+            f"a line of the original is missing ({_shown(code)!r})", line, self._written.line
+        )
+
+    def _strange(self, code: bytes, expected: bytes | None) -> LastCheckError:
+        wanted = "the end of the file" if expected is None else repr(_shown(expected))
+        return LastCheckError(
+            f"{_shown(code)!r} is not what comes next in the original ({wanted}), and no line that "
+            "Stillpath adds there",
+            self._original.line,
+            self._written.line,
+        )
+
+
+def _is_same(code: bytes, expected: bytes) -> bool:
+    """Whether a line is that of the original; the times of M73 are new."""
+    return code == expected or (tells_times(code) and tells_times(expected))
+
+
+def _shown(line: bytes) -> str:
+    text = line.strip().decode("utf-8", "replace")
+    return text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."
