@@ -23,8 +23,6 @@ SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
 _POWERS = 10.0 ** np.arange(16)
 _LONGEST = 90
 """Marlin's buffer takes 95 characters."""
-_MOVES_MM = 1e-6
-"""Whoever travels less stands still, but for rounding."""
 _FEED_MM_MIN, _FEED_SHARE = 1e-4, 2e-6
 
 
@@ -159,13 +157,16 @@ def ours(text: Any, at: int, stop: int, state: Any, words: Any, wanted: Any) -> 
 
 @kernel(allocates=False)
 def carry_out_moves(
-    text: Any, at: int, stop: int, most: int, state: Any, words: Any
+    text: Any, at: int, stop: int, most: int, shortest_mm: float, state: Any, words: Any
 ) -> tuple[int, int]:
-    """Carry out plain moves as long as they move X or Y, and `most` at most; else as `ours`."""
+    """Carry out plain moves while each is longer than the shortest in X and Y; else as `ours`.
+
+    At most so many lines.
+    """
     lines = 0
     while at < stop and lines < most:
         behind, mask = _words(text, at, words)
-        if behind < 0 or not way_xy_mm(state, words, mask) > _MOVES_MM:
+        if behind < 0 or not way_xy_mm(state, words, mask) > shortest_mm:
             break
         move(state, words, mask)
         at = behind
@@ -182,7 +183,8 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
     one, other : float array
         Of the original and of the written file. Filament counts anew where one does not know it.
     mask : int
-        Words of the move behind which they stand; 0: no move, and F does not count.
+        Words of the move behind which they stand; 0: no move, and F does not count. Bit 5: within
+        a stream, where what E reads is set right before lines that depend on it only.
     place_mm : float array, shape (3,)
     filament_mm : float
         By how much they may differ.
@@ -198,7 +200,7 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
         return MODES
     if fabs(one[RELATIVE_E] - other[RELATIVE_E]) > 0.0:
         return MODES + 1
-    if one[RELATIVE_E] == 0.0 and fabs(one[E] - other[E]) > filament_mm:
+    if not mask & 32 and one[RELATIVE_E] == 0.0 and fabs(one[E] - other[E]) > filament_mm:
         return E
     if mask & 15 and fabs(one[F] - other[F]) > _FEED_MM_MIN + _FEED_SHARE * fabs(one[F]):
         return FEED

@@ -141,6 +141,8 @@ class LastCheck:
     machine : Machine
     step_mm : tuple of float
         Grid of the firmware's x, y, z; 0: none. Where streams end the written file may be one off.
+    shortest_mm : float
+        The firmware joins shorter moves with the next one; 0: it does not.
 
     Attributes
     ----------
@@ -154,18 +156,19 @@ class LastCheck:
         original: BinaryIO,
         machine: Machine,
         step_mm: tuple[float, ...] = (0.0, 0.0, 0.0),
+        shortest_mm: float = 0.0,
     ) -> None:
         self._target, self._source = target, original
         original.seek(0)
         rules = rules_of(machine.firmware)
-        self._before, self._after = Reader(rules), Reader(rules)
+        self._before, self._after = Reader(rules, shortest_mm), Reader(rules)
         self._original, self._written = _Text(), _Text()
         self._rest: list[bytes] = []
         self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
         self._words = np.zeros(5)
         self._streaming = False
-        self._begun: tuple[Any, ...] = ()
-        """Where the original was behind the last line of it within the stream."""
+        self._begun: deque[tuple[int, int, tuple[Any, ...]]] = deque(maxlen=16)
+        """Where the original was behind its last lines within the stream: bytes, line, reader."""
         self._wanted: _Wanted | None = None
         self._perhaps: deque[bytes] = deque(maxlen=1 << 12)
         self._given_up = False
@@ -265,6 +268,7 @@ class LastCheck:
             written.skip(behind)
             if line.startswith(_ON):
                 self._streaming, self._wanted = True, None
+                self._begun.clear()
                 self._begin()
             return
         expected = self._expected()
@@ -321,7 +325,7 @@ class LastCheck:
             if not held_back:
                 self._after.carry_out(code)
             if wanted.kind is Kind.RESTS and not held_back:
-                self._compare(wanted.mask, code, wanted.line)
+                self._compare(wanted.mask | 32, code, wanted.line)
             else:
                 self._kept += 1
             self._perhaps.clear()
@@ -349,8 +353,12 @@ class LastCheck:
         self._perhaps.clear()
         if number == _ALL or self._given_up:
             return
-        # What is wanted may lie behind: go back, and again up to the line.
-        bytes_before, line, kept = self._begun
+        # Go back to before the line: what is wanted may lie behind it, and lines of ours that set
+        # modes or F may have been taken for such.
+        while len(self._begun) > 1 and self._begun[-1][1] > number:
+            self._begun.pop()
+            self._kept -= 1
+        bytes_before, line, kept = self._begun[-1]
         self._before.restore(kept)
         original = self._original
         if original.bytes_before <= bytes_before < original.bytes_before + len(original.data):
@@ -394,11 +402,8 @@ class LastCheck:
 
     def _begin(self) -> None:
         original = self._original
-        self._begun = (
-            original.bytes_before + original.at,
-            original.line,
-            self._before.keep(),
-        )
+        place = original.bytes_before + original.at
+        self._begun.append((place, original.line, self._before.keep()))
 
     def _expected(self) -> bytes | None:
         """Return the next line of the original that holds a command; None at its end."""
@@ -432,6 +437,7 @@ class LastCheck:
                 original.at,
                 len(original.data),
                 before_line - original.line,
+                self._before.shortest_mm,
                 self._before.state,
                 self._words,
             )

@@ -21,6 +21,7 @@ __all__ = ["Kind", "Reader", "code_of", "tells_times"]
 
 NAN = float("nan")
 _STILL_MM = 1e-6
+_BEHIND_NAME = re.compile(rb"[ \t]*(?:[A-Z_*].*)?")
 _NUMBER = rb"-?(?:\d+\.?\d*|\.\d+)"
 _WORD = re.compile(rb"[ \t]*([A-Z])(" + _NUMBER + rb")")
 _WORDS = re.compile(rb"(?:" + _WORD.pattern + rb")*[ \t]*")
@@ -60,6 +61,8 @@ class Reader:
     Parameters
     ----------
     rules : Rules
+    shortest_mm : float
+        A move of X and Y that is shorter may be joined with the next one and stay as it is.
 
     Attributes
     ----------
@@ -69,8 +72,8 @@ class Reader:
         The last line behind which the position was not known.
     """
 
-    def __init__(self, rules: Rules) -> None:
-        self.rules = rules
+    def __init__(self, rules: Rules, shortest_mm: float = 0.0) -> None:
+        self.rules, self.shortest_mm = rules, max(shortest_mm, _STILL_MM)
         self.state = np.full(at.SIZE, NAN)
         self.state[[at.E, at.FED, at.RELATIVE]] = 0.0
         self.state[at.UNIT] = 1.0
@@ -165,7 +168,7 @@ class Reader:
         at.move.py_func(self.state, values, mask)  # type: ignore[attr-defined]
         if way_mm == 0.0:
             return Kind.RESTS if mask & 15 else Kind.STAYS, mask
-        return Kind.MOVES if way_mm > _STILL_MM else Kind.PERHAPS, mask
+        return Kind.MOVES if way_mm > self.shortest_mm else Kind.PERHAPS, mask
 
     def _arc(self, code: bytes, rest: bytes) -> Kind:
         words = _plain_words(rest, self.rules)
@@ -176,6 +179,8 @@ class Reader:
                 values = _NO_WORDS.copy()
                 values[k] = words[letter]
                 at.move.py_func(self.state, values, 1 << k)  # type: ignore[attr-defined]
+        if self.rules.divides_extruder and ord("E") in words and self.state[at.RELATIVE_E] != 1.0:
+            self.state[[at.E, at.FED]] = NAN
         return Kind.PERHAPS
 
     def _is_plain_arc(self, words: dict[int, float]) -> bool:
@@ -249,7 +254,10 @@ class Reader:
             self.state[at.RELATIVE] = self._says_relative_e = NAN
             self._settle()
         self.lost = code
-        return Kind.PERHAPS if _MAY_MOVE.match(code.lstrip(b" \t").upper()) else Kind.STAYS
+        code = code.strip(b" \t\r").upper()
+        found = _cut(code, self.rules)
+        is_odd = found is not None and not found[0]
+        return Kind.PERHAPS if is_odd or _MAY_MOVE.match(code) else Kind.STAYS
 
     def _modes(self) -> tuple[float, ...]:
         state = self.state
@@ -306,7 +314,7 @@ def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
     if len(code) > rules.longest or b"\\" in code or b"\r" in code or b"\x00" in code:
         return b"", begin
     found = _NAME.match(code)
-    if found is not None:
+    if found is not None and rules.leading_zeros | bool(_BEHIND_NAME.fullmatch(code, found.end())):
         number = found[2]
         if rules.leading_zeros:
             number = number.lstrip(b"0") or b"0"

@@ -42,7 +42,8 @@ class Rules:
     harmless : frozenset of bytes
         Commands that leave place, modes and F as they are.
     folds_case, leading_zeros : bool
-        ``g1`` is G1; ``G01`` is G1.
+        ``g1`` is G1; ``G01`` is G1, and G91 ends where its number does: Klipper's name goes on to
+        the next letter.
     inches : bool
         G20 changes the unit.
     arcs : frozenset of bytes
@@ -51,6 +52,8 @@ class Rules:
         G90 and G91 are of E too (Marlin).
     relative_rules_extruder : bool
         Behind G91 E is relative whatever M82 said (Klipper).
+    divides_extruder : bool
+        An arc gives each of its pieces a part of E, as if that were relative (Klipper).
     bare_set_position : bool
         G92 without words sets all to 0 (Klipper).
     skips_low_feed : bool
@@ -78,6 +81,7 @@ class Rules:
     arcs: frozenset[bytes] = frozenset()
     positioning_sets_extruder: bool = False
     relative_rules_extruder: bool = False
+    divides_extruder: bool = False
     bare_set_position: bool = False
     skips_low_feed: bool = False
     restores: bool = False
@@ -98,6 +102,7 @@ def rules_of(firmware: Firmware) -> Rules:
             leading_zeros=False,
             arcs=arcs,
             relative_rules_extruder=True,
+            divides_extruder=True,
             bare_set_position=True,
             restores=True,
         )
