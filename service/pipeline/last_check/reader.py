@@ -124,6 +124,8 @@ class Reader:
         if rules.several and not self._holds(code):
             return self._forget(code, modes=True), 0
         code = code.strip(b" \t\r")
+        if rules.checks_sums and b"*" in code and code != code.upper():
+            return self._forget(code), 0  # the sum is of what stands there
         if rules.folds_case:
             code = code.upper()
         elif code[:1].islower():
@@ -303,8 +305,10 @@ def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
         code = code[numbered.end() :]
     if b"*" in code and not code.startswith(_TEXT):
         code, _, given = code.partition(b"*")
+        if not given.strip().isdigit():
+            return b"", begin
         if rules.checks_sums:
-            if numbered is None or not given.strip().isdigit() or len(given.strip()) > 3:
+            if numbered is None or len(given.strip()) > 3:
                 return b"", begin
             value = 0
             for byte in begin.partition(b"*")[0]:
