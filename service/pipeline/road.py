@@ -328,9 +328,7 @@ class _Job:
             self.retiming.copy(self._target, text, self.delay_s)
             return result
         shortest_mm = 2.0 * self._kit.shortest_move_mm
-        check = LastCheck(
-            text, self._source, self._machine, self._kit.step_mm, shortest_mm
-        )
+        check = LastCheck(text, self._source, self._machine, self._kit.step_mm, shortest_mm)
         self.retiming.copy(self._target, check, self.delay_s)
         figures = check.finish()
         stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))

@@ -19,6 +19,8 @@ X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, SIZE = range(10)
 mm of the file's unit; 1 where coordinates, or those of E, are relative."""
 SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
 """What `compare` finds: nothing, or the first of a state's numbers that differs."""
+WORDS, WITHIN = 15, 32
+"""For the mask of `compare`: words that make a move, and whether it is one within a stream."""
 
 _POWERS = 10.0 ** np.arange(16)
 _LONGEST = 90
@@ -183,7 +185,7 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
     one, other : float array
         Of the original and of the written file. Filament counts anew where one does not know it.
     mask : int
-        Words of the move behind which they stand; 0: no move, and F does not count. Bit 5: within
+        Words of the move behind which they stand; 0: no move, and F does not count. With `WITHIN`
         a stream, where what E reads is set right before lines that depend on it only.
     place_mm : float array, shape (3,)
     filament_mm : float
@@ -200,9 +202,9 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
         return MODES
     if fabs(one[RELATIVE_E] - other[RELATIVE_E]) > 0.0:
         return MODES + 1
-    if not mask & 32 and one[RELATIVE_E] == 0.0 and fabs(one[E] - other[E]) > filament_mm:
+    if not mask & WITHIN and one[RELATIVE_E] == 0.0 and fabs(one[E] - other[E]) > filament_mm:
         return E
-    if mask & 15 and fabs(one[F] - other[F]) > _FEED_MM_MIN + _FEED_SHARE * fabs(one[F]):
+    if mask & WORDS and fabs(one[F] - other[F]) > _FEED_MM_MIN + _FEED_SHARE * fabs(one[F]):
         return FEED
     return SAME
 

@@ -2,6 +2,7 @@
 
 Outside of streams the written file holds every line of the original. Within one, straight lines of
 ours stand for its moves of X and Y; all other lines are there in order, or held back as comments.
+The original holds no marks of ours: such files are refused.
 """
 
 from __future__ import annotations
@@ -32,7 +33,6 @@ _ALL = 1 << 60
 _SHOWN = 5
 _SHOWN_CHARACTERS = 60
 _BOM = b"\xef\xbb\xbf"
-_OWN = b"; stillpath"
 _ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
 _OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
 _NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
@@ -124,6 +124,8 @@ class _Wanted:
     kind: Kind
     mask: int
     array: NDArray[np.uint8]
+    before: NDArray[np.float64]
+    """State of the original before it."""
 
 
 _NONE = np.zeros(0, np.uint8)
@@ -171,7 +173,6 @@ class LastCheck:
         """Where the original was behind its last lines within the stream: bytes, line, reader."""
         self._wanted: _Wanted | None = None
         self._perhaps: deque[bytes] = deque(maxlen=1 << 12)
-        self._given_up = False
         self._kept = self._compared = 0
         self._gap_line = 0
         self._gaps: list[str] = []
@@ -209,7 +210,7 @@ class LastCheck:
             self._written.take(b"".join((*self._rest, b"\n")))
             self._rest = []
             self._follow()
-        expected = None if self._given_up else self._expected()
+        expected = self._expected()
         if expected is not None:
             raise self._missing(self._original.line, expected)
         if self._gap_line:
@@ -227,9 +228,7 @@ class LastCheck:
     def _follow(self) -> None:
         written = self._written
         while not written.is_read:
-            if self._given_up:
-                written.at = len(written.data)
-            elif self._streaming:
+            if self._streaming:
                 self._stream()
             else:
                 self._lines()
@@ -258,7 +257,9 @@ class LastCheck:
         if found != at.SAME:
             end = written.at - 1
             start = written.data.rfind(b"\n", after, end) + 1
-            raise self._differs(found, written.data[max(start, after) : end], -1)
+            code = written.data[max(start, after) : end]
+            place = original.line - 1, written.line - 1
+            raise self._differs(found, self._before.state, "behind", code, *place)
         self._note(lines, unknown, before)
         if written.is_read or (lines and original.is_read):
             return
@@ -275,10 +276,9 @@ class LastCheck:
         if expected is not None and _is_same(code, expected):
             _, mask = self._before.carry_out(expected)
             self._after.carry_out(code)
-            self._compare(mask, code)
+            self._check(self._before.state, mask, code, original.line)
+            self._count(original.line)
             self._skip_original()
-        elif self._given_up:
-            return
         elif _ANYWHERE.match(code):
             self._after.carry_out(code)
         else:
@@ -290,8 +290,6 @@ class LastCheck:
         written = self._written
         if self._wanted is None:
             self._find_wanted()
-            if self._given_up:
-                return
         wanted = self._wanted
         written.at, lines = at.ours(
             written.array,
@@ -314,7 +312,7 @@ class LastCheck:
         elif line.startswith(_HELD):
             if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
                 raise self._strange(line, wanted.code if wanted else None)
-        elif line.startswith(_OWN) and (off := _OFF.match(line)) is not None:
+        elif (off := _OFF.match(line)) is not None:
             self._leave(int(off[1]) if off[1] else _ALL)
         written.skip(behind)
 
@@ -322,12 +320,16 @@ class LastCheck:
         """Take a line of a stream for one of the original, if it is one."""
         wanted = self._wanted
         if wanted is not None and _is_same(code, wanted.code):
-            if not held_back:
-                self._after.carry_out(code)
             if wanted.kind is Kind.RESTS and not held_back:
-                self._compare(wanted.mask | 32, code, wanted.line)
+                # Before it too: where E is absolute, what was fed too much comes back with it.
+                self._check(wanted.before, at.WITHIN, code, wanted.line, "before")
+                self._after.carry_out(code)
+                self._check(self._before.state, wanted.mask | at.WITHIN, code, wanted.line)
+                self._count(wanted.line)
             else:
                 self._kept += 1
+                if not held_back:
+                    self._after.carry_out(code)
             self._perhaps.clear()
             self._wanted = None
             self._begin()
@@ -351,7 +353,8 @@ class LastCheck:
             raise self._missing(wanted.line, wanted.code)
         self._streaming, self._wanted = False, None
         self._perhaps.clear()
-        if number == _ALL or self._given_up:
+        if number == _ALL:
+            self._check(self._before.state, at.WORDS, b"the last stream", self._original.line)
             return
         # Go back to before the line: what is wanted may lie behind it, and lines of ours that set
         # modes or F may have been taken for such.
@@ -378,6 +381,7 @@ class LastCheck:
                 original.line,
                 self._written.line,
             )
+        self._check(self._before.state, at.WORDS, b"a stream", number)
 
     # The original
 
@@ -410,12 +414,6 @@ class LastCheck:
         original = self._original
         while not original.is_read or self._read_on():
             line, behind = original.peek()
-            if line.startswith(_OWN):
-                # A mark that is not ours: where streams begin and end can no longer be told.
-                self._given_up = True
-                self._gap(f"it looks like one of Stillpath's own ({_shown(line)})")
-                self._close_gap("the end")
-                return None
             code = code_of(line)
             if code:
                 return code
@@ -445,8 +443,8 @@ class LastCheck:
             if original.is_read or original.line >= before_line:
                 continue
             line, behind = original.peek()
-            if code_of(line) or line.startswith(_OWN):
-                return self._expected()
+            if code := code_of(line):
+                return code
             original.skip(behind)
         return None
 
@@ -454,23 +452,31 @@ class LastCheck:
         """Carry out the original up to the next line that must be in the written file."""
         while (code := self._next_original()) is not None:
             line = self._original.line
+            before = self._before.state.copy()
             kind, mask = self._before.carry_out(code)
             self._skip_original()
             if kind is Kind.PERHAPS:
                 self._perhaps.append(code)
             elif kind is not Kind.MOVES:
-                self._wanted = _Wanted(line, code, kind, mask, np.frombuffer(code, np.uint8))
+                array = np.frombuffer(code, np.uint8)
+                self._wanted = _Wanted(line, code, kind, mask, array, before)
                 return
 
     # What is found
 
-    def _compare(self, mask: int, code: bytes, line: int | None = None) -> None:
-        before, after = self._before.state, self._after.state
-        found = at.compare(before, after, mask, self._place_mm, _FILAMENT_MM)
+    def _check(
+        self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "behind"
+    ) -> None:
+        """Compare a state of the original with where the written file is."""
+        found = at.compare(before, self._after.state, mask, self._place_mm, _FILAMENT_MM)
         if found != at.SAME:
-            raise self._differs(found, code, 0, line)
+            raise self._differs(found, before, where, code, line, self._written.line)
+
+    def _count(self, line: int) -> None:
+        """Count a line that was compared."""
+        before, after = self._before.state, self._after.state
         unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
-        self._note(1, int(unknown != unknown), line or self._original.line)
+        self._note(1, int(unknown != unknown), line)
 
     def _note(self, lines: int, unknown: int, line: int) -> None:
         """Count lines that were compared, the first of them without a place."""
@@ -481,34 +487,36 @@ class LastCheck:
         if lines > unknown and self._gap_line:
             self._close_gap(f"line {line + unknown}")
 
-    def _gap(self, why: str) -> None:
-        self._gap_line = self._gap_line or self._original.line
-        self._before.lost = why.encode()
-
     def _close_gap(self, until: str) -> None:
         line, self._gap_line = self._gap_line, 0
         why = _shown(self._before.lost) or "no line has named one yet"
         if len(self._gaps) < _SHOWN:
             self._gaps.append(
-                f"lines {line} to {until}: filament and modes only, because the position is not "
-                f"known ({why})"
+                f"from line {line} up to {until}: filament and modes only, since the position is "
+                f"not known there ({why})"
             )
         else:
             self._more_gaps += 1
 
     def _differs(
-        self, found: int, code: bytes, offset: int, line: int | None = None
+        self,
+        found: int,
+        before: NDArray[np.float64],
+        where: str,
+        code: bytes,
+        line: int,
+        written_line: int,
     ) -> LastCheckError:
-        one, other = float(self._before.state[found]), float(self._after.state[found])
+        one, other = float(before[found]), float(self._after.state[found])
         limit = {at.F: 1e-4, at.RELATIVE: 0.0, at.RELATIVE_E: 0.0}.get(found, _FILAMENT_MM)
         if found < 3:
             limit = float(self._place_mm[found])
         unit = _UNITS[found] and " " + _UNITS[found]
         return LastCheckError(
-            f"behind {_shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
+            f"{where} {_shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
             f"{one:.7g}{unit}; they may differ by {limit:.3g}{unit}",
-            line or self._original.line + offset,
-            self._written.line + offset,
+            line,
+            written_line,
         )
 
     def _missing(self, line: int, code: bytes) -> LastCheckError:

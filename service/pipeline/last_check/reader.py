@@ -29,7 +29,7 @@ _NAME = re.compile(rb"([GMT])(\d+)((?:\.\d+)?)(?![\d.])")
 _LONG_NAME = re.compile(rb"[A-Z_]{2,}[A-Z0-9_]*")
 _LINE_NUMBER = re.compile(rb"N[ \t]*\d+[ \t]*(?![\d.])")
 _SUM = re.compile(rb"\*(\d+)[ \t]*")
-_FURTHER = re.compile(rb"[GMT]-?\d|\{|\x00")
+_FURTHER = re.compile(rb"[GM]-?\d|\{|\x00")
 _CONDITION = re.compile(rb"(?:IF|ELIF|ELSE|WHILE)(?![A-Z0-9_])")
 _STATE_NAME = re.compile(rb"NAME=([A-Z0-9_]+)(?!\S)")
 _MAY_MOVE = re.compile(

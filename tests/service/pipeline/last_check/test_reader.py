@@ -138,6 +138,6 @@ def test_any_bytes_are_read() -> None:
     for firmware in (KLIPPER, MARLIN, REPRAP):
         reader = Reader(rules_of(firmware))
         for _ in range(3000):
-            line = bytes(dice.choices(b"GMXYZEF0123. -;*N(\"{\x00\xff\\\t", k=dice.randrange(12)))
+            line = bytes(dice.choices(b'GMXYZEF0123. -;*N("{\x00\xff\\\t', k=dice.randrange(12)))
             if code_of(line):
                 reader.carry_out(line)
