@@ -55,7 +55,9 @@ def main() -> int:
         )
     )
     line = np.concatenate([p.line for p in parts])
-    print("| line | written place to file's | command to path | nozzle to path |\n|---|---|---|---|")
+    print(
+        "| line | written place to file's | command to path | nozzle to path |\n|---|---|---|---|"
+    )
     table = []
     for (number, code, asked), (place, on) in zip(file, written, strict=True):
         behind = np.flatnonzero(line > number)
@@ -74,7 +76,7 @@ def main() -> int:
 
 
 def _places(data: bytes, machine: Machine) -> list[tuple[int, bytes, np.ndarray, bool]]:
-    """Number and code of each line that asks something, its place, and whether it is in a stream."""
+    """Number, code and place of each line that asks something, and whether it is in a stream."""
     reader, on, found = Reader(rules_of(machine.firmware)), False, []
     for number, line in enumerate(data.split(b"\n"), 1):
         if line.startswith(b"; stillpath: stream o"):
