@@ -84,6 +84,26 @@ def _words(text: Any, at: int, words: Any) -> tuple[int, int]:
 
 
 @kernel(force_inline=True, allocates=False)
+def _comments(text: Any, at: int, stop: int, marks: bool) -> tuple[int, int]:
+    """Pass over empty lines and comments; return where the next line begins, and how many.
+
+    With `marks` a comment that may be a mark of ours is none.
+    """
+    lines = 0
+    while at < stop:
+        if text[at] == 59:
+            if marks and text[at + 1] == 32 and text[at + 2] == 115:  # "; s"
+                break
+        elif text[at] != 10:
+            break
+        while text[at] != 10:
+            at += 1
+        at += 1
+        lines += 1
+    return at, lines
+
+
+@kernel(force_inline=True, allocates=False)
 def way_xy_mm(state: Any, words: Any, mask: int) -> float:
     """Return how far a move goes in X and Y [mm]; nan where that is not known."""
     squares = 0.0
@@ -122,61 +142,6 @@ def move(state: Any, words: Any, mask: int) -> None:
 
 
 @kernel(allocates=False)
-def ours(text: Any, at: int, stop: int, state: Any, words: Any, wanted: Any) -> tuple[int, int]:
-    """Carry out plain moves until one is the line that is waited for, or up to another line.
-
-    Parameters
-    ----------
-    text : uint8 array
-    at, stop : int
-        Where to begin, and behind the last newline.
-    state, words : float array
-    wanted : uint8 array
-        A line of the original, without its end; may be empty.
-
-    Returns
-    -------
-    (int, int)
-        Where the next line begins, and how many were carried out.
-    """
-    lines = 0
-    length = len(wanted)
-    while at < stop:
-        if length:
-            k = 0
-            while k < length and text[at + k] == wanted[k]:
-                k += 1
-            if k == length and (text[at + k] == 10 or text[at + k] == 13):
-                break
-        behind, mask = _words(text, at, words)
-        if behind < 0:
-            break
-        move(state, words, mask)
-        at = behind
-        lines += 1
-    return at, lines
-
-
-@kernel(allocates=False)
-def carry_out_moves(
-    text: Any, at: int, stop: int, most: int, shortest_mm: float, state: Any, words: Any
-) -> tuple[int, int]:
-    """Carry out plain moves while each is longer than the shortest in X and Y; else as `ours`.
-
-    At most so many lines.
-    """
-    lines = 0
-    while at < stop and lines < most:
-        behind, mask = _words(text, at, words)
-        if behind < 0 or not way_xy_mm(state, words, mask) > shortest_mm:
-            break
-        move(state, words, mask)
-        at = behind
-        lines += 1
-    return at, lines
-
-
-@kernel(allocates=False)
 def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) -> int:
     """Compare two states; what one of them does not know is passed over.
 
@@ -210,6 +175,129 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
 
 
 @kernel(allocates=False)
+def ours(
+    text: Any,
+    at: int,
+    stop: int,
+    state: Any,
+    words: Any,
+    wanted: Any,
+    rests: bool,
+    before: Any,
+    behind: Any,
+    place_mm: Any,
+    filament_mm: float,
+) -> tuple[int, int, bool, int]:
+    """Carry out plain moves of a stream, up to the line that is waited for or an odd one.
+
+    Parameters
+    ----------
+    text : uint8 array
+    at, stop : int
+        Where to begin, and behind the last newline.
+    state, words : float array
+    wanted : uint8 array
+        A line of the original, without its end; may be empty. It is carried out if it is plain.
+    rests : bool
+        The states before it and behind it are compared with those of the original.
+    before, behind : float array
+        States of the original.
+    place_mm, filament_mm
+        As of `compare`.
+
+    Returns
+    -------
+    (int, int, bool, int)
+        Where the next line begins, how many were carried out, whether the last was the one that is
+        waited for, and what differs there.
+    """
+    lines = 0
+    length = len(wanted)
+    while at < stop:
+        at, passed = _comments(text, at, stop, True)
+        lines += passed
+        if at >= stop:
+            break
+        is_wanted = False
+        if length:
+            k = 0
+            while k < length and text[at + k] == wanted[k]:
+                k += 1
+            is_wanted = k == length and (text[at + k] == 10 or text[at + k] == 13)
+        next_at, mask = _words(text, at, words)
+        if next_at < 0:
+            break
+        if is_wanted and rests:
+            found = compare(before, state, WITHIN, place_mm, filament_mm)
+            if found != SAME:
+                return at, lines, True, found
+        move(state, words, mask)
+        at = next_at
+        lines += 1
+        if is_wanted:
+            found = SAME
+            if rests:
+                found = compare(behind, state, mask | WITHIN, place_mm, filament_mm)
+            return at, lines, True, found
+    return at, lines, False, SAME
+
+
+@kernel(allocates=False)
+def carry_out_moves(
+    text: Any,
+    at: int,
+    stop: int,
+    most: int,
+    shortest_mm: float,
+    state: Any,
+    words: Any,
+    before: Any,
+) -> tuple[int, int, int]:
+    """Carry out plain moves of the original that move X or Y, and one behind them that does not.
+
+    Parameters
+    ----------
+    text, at, stop, state, words
+        As of `ours`.
+    most : int
+        So many lines at most.
+    shortest_mm : float
+        What is no longer than this in X and Y is left to others, unless it stands still there.
+    before : float array
+        Takes the state before the one that does not move X or Y.
+
+    Returns
+    -------
+    (int, int, int)
+        Where the next line begins, how many were carried out, and which words the last has if it
+        does not move X or Y; else -1.
+    """
+    lines = 0
+    while at < stop and lines < most:
+        if text[at] == 59 or text[at] == 10:
+            while text[at] != 10:
+                at += 1
+            at += 1
+            lines += 1
+            continue
+        behind, mask = _words(text, at, words)
+        if behind < 0:
+            break
+        way_mm = way_xy_mm(state, words, mask)
+        if not (way_mm == 0.0 or way_mm > shortest_mm):
+            break
+        if way_mm == 0.0:
+            for k in range(SIZE):
+                before[k] = state[k]
+        move(state, words, mask)
+        at = behind
+        lines += 1
+        if way_mm == 0.0:
+            return at, lines, mask
+    return at, lines, -1
+
+
+@kernel(allocates=False)
 def compare_moves(
     before: Any,
     at: int,
@@ -222,7 +310,7 @@ def compare_moves(
     words: Any,
     place_mm: Any,
     filament_mm: float,
-) -> tuple[int, int, int, int, int]:
+) -> tuple[int, int, int, int, int, int, int]:
     """Carry out plain moves that both texts share, and compare the states behind each.
 
     Parameters
@@ -238,12 +326,18 @@ def compare_moves(
 
     Returns
     -------
-    (int, int, int, int, int)
-        Where both texts go on, how many lines were carried out, how many of these without X and Y
-        known, and what differs behind the last.
+    (int, int, int, int, int, int, int)
+        Where both texts go on, how many lines of each were passed, how many moves were carried
+        out, how many of these without X and Y known, and what differs behind the last.
     """
-    lines, unknown = 0, 0
-    while at < stop and written_at < written_stop:
+    lines, written_lines, moves, unknown = 0, 0, 0, 0
+    while True:
+        at, passed = _comments(before, at, stop, False)
+        written_at, written_passed = _comments(after, written_at, written_stop, True)
+        lines += passed
+        written_lines += written_passed
+        if at >= stop or written_at >= written_stop:
+            break
         behind, mask = _words(before, at, words)
         length = behind - at
         if behind < 0 or written_at + length > written_stop:
@@ -258,9 +352,11 @@ def compare_moves(
         at = behind
         written_at += length
         lines += 1
+        written_lines += 1
+        moves += 1
         if isnan(one[X] + one[Y] + other[X] + other[Y]):
             unknown += 1
         found = compare(one, other, mask, place_mm, filament_mm)
         if found != SAME:
-            return at, written_at, lines, unknown, found
-    return at, written_at, lines, unknown, SAME
+            return at, written_at, lines, written_lines, moves, unknown, found
+    return at, written_at, lines, written_lines, moves, unknown, SAME

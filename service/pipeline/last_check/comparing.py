@@ -30,6 +30,7 @@ __all__ = ["LastCheck", "LastCheckError"]
 _PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
 _BLOCK_BYTES = 1 << 18
 _ALL = 1 << 60
+_MOST_IDLE = 1 << 10
 _SHOWN = 5
 _SHOWN_CHARACTERS = 60
 _BOM = b"\xef\xbb\xbf"
@@ -89,16 +90,17 @@ class _Text:
     bytes_before: int = 0
     """Where `data` begins in the file."""
     array: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    stop: int = 0
 
     @property
     def is_read(self) -> bool:
         """Nothing is left."""
-        return self.at >= len(self.data)
+        return self.at >= self.stop
 
     def take(self, data: bytes) -> None:
         """Go on with other lines, behind those that were at hand."""
         self.bytes_before += len(self.data)
-        self.data, self.at = data, 0
+        self.data, self.at, self.stop = data, 0, len(data)
         self.array = np.frombuffer(data, np.uint8)
 
     def peek(self) -> tuple[bytes, int]:
@@ -128,7 +130,8 @@ class _Wanted:
     """State of the original before it."""
 
 
-_NONE = np.zeros(0, np.uint8)
+_NOTHING = _Wanted(0, b"", Kind.STAYS, 0, np.zeros(0, np.uint8), np.zeros(at.SIZE))
+"""Nothing of the original is left."""
 
 
 class LastCheck:
@@ -168,6 +171,10 @@ class LastCheck:
         self._rest: list[bytes] = []
         self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
         self._words = np.zeros(5)
+        self._still = np.zeros(at.SIZE)
+        """State of the original before the last line that stood still in X and Y."""
+        self._idle: set[bytes] = set()
+        """Lines of ours that leave place and modes as they are."""
         self._streaming = False
         self._begun: deque[tuple[int, int, tuple[Any, ...]]] = deque(maxlen=16)
         """Where the original was behind its last lines within the stream: bytes, line, reader."""
@@ -239,13 +246,13 @@ class LastCheck:
         if original.is_read:
             self._read_on()
         before, after = original.line, written.at
-        original.at, written.at, lines, unknown, found = at.compare_moves(
+        original.at, written.at, lines, written_lines, moves, unknown, found = at.compare_moves(
             original.array,
             original.at,
-            len(original.data),
+            original.stop,
             written.array,
             written.at,
-            len(written.data),
+            written.stop,
             self._before.state,
             self._after.state,
             self._words,
@@ -253,14 +260,14 @@ class LastCheck:
             _FILAMENT_MM,
         )
         original.line += lines
-        written.line += lines
+        written.line += written_lines
         if found != at.SAME:
             end = written.at - 1
             start = written.data.rfind(b"\n", after, end) + 1
             code = written.data[max(start, after) : end]
             place = original.line - 1, written.line - 1
             raise self._differs(found, self._before.state, "behind", code, *place)
-        self._note(lines, unknown, before)
+        self._note(moves, unknown, before)
         if written.is_read or (lines and original.is_read):
             return
         line, behind = written.peek()
@@ -290,49 +297,69 @@ class LastCheck:
         written = self._written
         if self._wanted is None:
             self._find_wanted()
-        wanted = self._wanted
-        written.at, lines = at.ours(
+        wanted = self._wanted or _NOTHING
+        written.at, lines, taken, found = at.ours(
             written.array,
             written.at,
-            len(written.data),
+            written.stop,
             self._after.state,
             self._words,
-            _NONE if wanted is None else wanted.array,
+            wanted.array,
+            wanted.kind is Kind.RESTS,
+            wanted.before,
+            self._before.state,
+            self._place_mm,
+            _FILAMENT_MM,
         )
         written.line += lines
-        if written.is_read:
+        if taken:
+            if found != at.SAME:
+                is_before = written.data.startswith(wanted.code, written.at)
+                raise self._differs(
+                    found,
+                    wanted.before if is_before else self._before.state,
+                    "before" if is_before else "behind",
+                    wanted.code,
+                    wanted.line,
+                    written.line - (not is_before),
+                )
+            self._take(wanted, compared=wanted.kind is Kind.RESTS)
             return
-        line, behind = written.peek()
+        if written.at >= written.stop:
+            return
+        end = written.data.index(b"\n", written.at)
+        line = written.data[written.at : end]
+        if line in self._idle and line != wanted.code:
+            written.skip(end + 1)
+            return
         code = code_of(line)
         if code:
             if not self._takes(code, held_back=False):
                 if _IN_STREAM.match(code) is None:
-                    raise self._strange(code, wanted.code if wanted else None)
+                    raise self._strange(code, wanted.code if wanted.code else None)
                 self._after.carry_out(code)
+                if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
+                    self._idle.add(line)
         elif line.startswith(_HELD):
             if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
-                raise self._strange(line, wanted.code if wanted else None)
+                raise self._strange(line, wanted.code if wanted.code else None)
         elif (off := _OFF.match(line)) is not None:
             self._leave(int(off[1]) if off[1] else _ALL)
-        written.skip(behind)
+        written.skip(end + 1)
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
         wanted = self._wanted
         if wanted is not None and _is_same(code, wanted.code):
-            if wanted.kind is Kind.RESTS and not held_back:
+            compared = wanted.kind is Kind.RESTS and not held_back
+            if compared:
                 # Before it too: where E is absolute, what was fed too much comes back with it.
                 self._check(wanted.before, at.WITHIN, code, wanted.line, "before")
+            if not held_back:
                 self._after.carry_out(code)
+            if compared:
                 self._check(self._before.state, wanted.mask | at.WITHIN, code, wanted.line)
-                self._count(wanted.line)
-            else:
-                self._kept += 1
-                if not held_back:
-                    self._after.carry_out(code)
-            self._perhaps.clear()
-            self._wanted = None
-            self._begin()
+            self._take(wanted, compared=compared)
             return True
         if code in self._perhaps:
             while self._perhaps.popleft() != code:
@@ -342,6 +369,16 @@ class LastCheck:
             self._kept += 1
             return True
         return False
+
+    def _take(self, wanted: _Wanted, *, compared: bool) -> None:
+        """Go on behind a line that was waited for."""
+        if compared:
+            self._count(wanted.line)
+        else:
+            self._kept += 1
+        self._perhaps.clear()
+        self._wanted = None
+        self._begin()
 
     def _leave(self, number: int) -> None:
         """Leave a stream behind which the file goes on with a line of the original."""
@@ -371,9 +408,10 @@ class LastCheck:
             original.take(b"")
             original.bytes_before = bytes_before
         original.line = line
-        while original.line < number and (line_left := self._next_original(number)) is not None:
-            self._before.carry_out(line_left)
-            self._skip_original()
+        while (found := self._next_original(number))[0]:
+            if found[1] < 0:
+                self._before.carry_out(found[0])
+                self._skip_original()
         if original.line != number:
             raise LastCheckError(
                 f"a stream ends before line {number} of the original, of which this was written "
@@ -424,37 +462,51 @@ class LastCheck:
         original = self._original
         original.skip(original.data.index(b"\n", original.at) + 1)
 
-    def _next_original(self, before_line: int = _ALL) -> bytes | None:
-        """Carry out moves of X and Y; return the line behind them, to be carried out."""
+    def _next_original(self, before_line: int = _ALL) -> tuple[bytes, int]:
+        """Carry out moves of X and Y, and go on to what is behind them.
+
+        Returns
+        -------
+        (bytes, int)
+            The line behind them, to be carried out, and -1; or one that stands still in X and Y and
+            was carried out, with its words. Nothing at the end of the file, and before the line.
+        """
         original = self._original
         while original.line < before_line:
             if original.is_read and not self._read_on():
-                return None
-            behind, lines = at.carry_out_moves(
+                return b"", -1
+            behind, lines, mask = at.carry_out_moves(
                 original.array,
                 original.at,
-                len(original.data),
+                original.stop,
                 before_line - original.line,
                 self._before.shortest_mm,
                 self._before.state,
                 self._words,
+                self._still,
             )
             original.skip(behind, lines)
+            if mask >= 0:
+                begin = original.data.rfind(b"\n", 0, behind - 1) + 1
+                return original.data[begin : behind - 1].rstrip(), mask
             if original.is_read or original.line >= before_line:
                 continue
             line, behind = original.peek()
             if code := code_of(line):
-                return code
+                return code, -1
             original.skip(behind)
-        return None
+        return b"", -1
 
     def _find_wanted(self) -> None:
         """Carry out the original up to the next line that must be in the written file."""
-        while (code := self._next_original()) is not None:
-            line = self._original.line
-            before = self._before.state.copy()
-            kind, mask = self._before.carry_out(code)
-            self._skip_original()
+        while (found := self._next_original())[0]:
+            (code, mask), before = found, self._still
+            line, kind = self._original.line - 1, Kind.RESTS if mask & 15 else Kind.STAYS
+            if mask < 0:
+                before = self._before.state.copy()
+                kind, mask = self._before.carry_out(code)
+                self._skip_original()
+                line += 1
             if kind is Kind.PERHAPS:
                 self._perhaps.append(code)
             elif kind is not Kind.MOVES:

@@ -33,7 +33,7 @@ _REPRAPFIRMWARE = frozenset(b"M3 M4 M5 M17 M92 M101 M103 M116 M563 M568 M581".sp
 _ARCS = frozenset((b"G2", b"G3"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rules:
     """How a firmware reads.
 
