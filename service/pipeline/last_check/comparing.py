@@ -10,14 +10,14 @@ from __future__ import annotations
 import re
 import time
 from collections import deque
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.machine import Machine
 from service.pipeline.last_check import _reader_kernels as at
+from service.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
 from service.pipeline.last_check.reader import Kind, Reader, code_of, tells_times
 from service.pipeline.last_check.rules import rules_of
 from service.pipeline.result import LastCheckFigures
@@ -28,12 +28,9 @@ if TYPE_CHECKING:
 __all__ = ["LastCheck", "LastCheckError"]
 
 _PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
-_BLOCK_BYTES = 1 << 18
-_ALL = 1 << 60
 _MOST_IDLE = 1 << 10
 _SHOWN = 5
 _SHOWN_CHARACTERS = 60
-_BOM = b"\xef\xbb\xbf"
 _ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
 _OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
 _NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
@@ -79,61 +76,6 @@ def _rebuilt(text: str, line: int, written_line: int) -> LastCheckError:
     return error
 
 
-@dataclass(slots=True)
-class _Text:
-    """Whole lines of a file that are at hand."""
-
-    data: bytes = b""
-    at: int = 0
-    line: int = 1
-    """Number of the line at `at`."""
-    bytes_before: int = 0
-    """Where `data` begins in the file."""
-    array: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
-    stop: int = 0
-
-    @property
-    def is_read(self) -> bool:
-        """Nothing is left."""
-        return self.at >= self.stop
-
-    def take(self, data: bytes) -> None:
-        """Go on with other lines, behind those that were at hand."""
-        self.bytes_before += len(self.data)
-        self.data, self.at, self.stop = data, 0, len(data)
-        self.array = np.frombuffer(data, np.uint8)
-
-    def peek(self) -> tuple[bytes, int]:
-        """Return the next line without its end, and where the one behind it begins."""
-        end = self.data.index(b"\n", self.at)
-        line = self.data[self.at : end]
-        if self.line == 1 and line.startswith(_BOM):
-            line = line[len(_BOM) :]
-        return line, end + 1
-
-    def skip(self, behind: int, lines: int = 1) -> None:
-        """Go on with a line further down."""
-        self.at = behind
-        self.line += lines
-
-
-@dataclass(frozen=True, slots=True)
-class _Wanted:
-    """The next line of the original that must be in the written file."""
-
-    line: int
-    code: bytes
-    kind: Kind
-    mask: int
-    array: NDArray[np.uint8]
-    before: NDArray[np.float64]
-    """State of the original before it."""
-
-
-_NOTHING = _Wanted(0, b"", Kind.STAYS, 0, np.zeros(0, np.uint8), np.zeros(at.SIZE))
-"""Nothing of the original is left."""
-
-
 class LastCheck:
     """A file to write to, which reads along and compares with the original.
 
@@ -163,23 +105,19 @@ class LastCheck:
         step_mm: tuple[float, ...] = (0.0, 0.0, 0.0),
         shortest_mm: float = 0.0,
     ) -> None:
-        self._target, self._source = target, original
-        original.seek(0)
+        self._target = target
         rules = rules_of(machine.firmware)
         self._before, self._after = Reader(rules, shortest_mm), Reader(rules)
-        self._original, self._written = _Text(), _Text()
+        self._original, self._written = Original(original, self._before), Text()
         self._rest: list[bytes] = []
         self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
         self._words = np.zeros(5)
-        self._still = np.zeros(at.SIZE)
-        """State of the original before the last line that stood still in X and Y."""
         self._idle: set[bytes] = set()
         """Lines of ours that leave place and modes as they are."""
         self._streaming = False
-        self._begun: deque[tuple[int, int, tuple[Any, ...]]] = deque(maxlen=16)
-        """Where the original was behind its last lines within the stream: bytes, line, reader."""
-        self._wanted: _Wanted | None = None
-        self._perhaps: deque[bytes] = deque(maxlen=1 << 12)
+        self._begun: deque[Place] = deque(maxlen=16)
+        """Where the original was behind its last lines within the stream."""
+        self._wanted: Wanted | None = None
         self._kept = self._compared = 0
         self._gap_line = 0
         self._gaps: list[str] = []
@@ -217,9 +155,8 @@ class LastCheck:
             self._written.take(b"".join((*self._rest, b"\n")))
             self._rest = []
             self._follow()
-        expected = self._expected()
-        if expected is not None:
-            raise self._missing(self._original.line, expected)
+        if expected := self._original.peek():
+            raise self._missing(self._original.text.line, expected)
         if self._gap_line:
             self._close_gap("the end")
         gaps = list(self._gaps)
@@ -242,9 +179,9 @@ class LastCheck:
 
     def _lines(self) -> None:
         """Follow what stands outside of streams: moves of both, and another line."""
-        written, original = self._written, self._original
+        written, original = self._written, self._original.text
         if original.is_read:
-            self._read_on()
+            self._original.read_on()
         before, after = original.line, written.at
         original.at, written.at, lines, written_lines, moves, unknown, found = at.compare_moves(
             original.array,
@@ -277,15 +214,15 @@ class LastCheck:
             if line.startswith(_ON):
                 self._streaming, self._wanted = True, None
                 self._begun.clear()
-                self._begin()
+                self._begun.append(self._original.place())
             return
-        expected = self._expected()
-        if expected is not None and _is_same(code, expected):
+        expected = self._original.peek()
+        if _is_same(code, expected):
             _, mask = self._before.carry_out(expected)
             self._after.carry_out(code)
             self._check(self._before.state, mask, code, original.line)
             self._count(original.line)
-            self._skip_original()
+            self._original.skip()
         elif _ANYWHERE.match(code):
             self._after.carry_out(code)
         else:
@@ -296,8 +233,8 @@ class LastCheck:
         """Follow a stream: moves of ours, and another line."""
         written = self._written
         if self._wanted is None:
-            self._find_wanted()
-        wanted = self._wanted or _NOTHING
+            self._wanted = self._original.wanted()
+        wanted = self._wanted
         written.at, lines, taken, found = at.ours(
             written.array,
             written.at,
@@ -336,20 +273,20 @@ class LastCheck:
         if code:
             if not self._takes(code, held_back=False):
                 if _IN_STREAM.match(code) is None:
-                    raise self._strange(code, wanted.code if wanted.code else None)
+                    raise self._strange(code, wanted.code)
                 self._after.carry_out(code)
                 if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
                     self._idle.add(line)
         elif line.startswith(_HELD):
             if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
-                raise self._strange(line, wanted.code if wanted.code else None)
+                raise self._strange(line, wanted.code)
         elif (off := _OFF.match(line)) is not None:
-            self._leave(int(off[1]) if off[1] else _ALL)
+            self._leave(int(off[1]) if off[1] else ALL)
         written.skip(end + 1)
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
-        wanted = self._wanted
+        wanted, perhaps = self._wanted, self._original.perhaps
         if wanted is not None and _is_same(code, wanted.code):
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
@@ -361,8 +298,8 @@ class LastCheck:
                 self._check(self._before.state, wanted.mask | at.WITHIN, code, wanted.line)
             self._take(wanted, compared=compared)
             return True
-        if code in self._perhaps:
-            while self._perhaps.popleft() != code:
+        if code in perhaps:
+            while perhaps.popleft() != code:
                 pass
             if not held_back:
                 self._after.carry_out(code)
@@ -370,149 +307,45 @@ class LastCheck:
             return True
         return False
 
-    def _take(self, wanted: _Wanted, *, compared: bool) -> None:
+    def _take(self, wanted: Wanted, *, compared: bool) -> None:
         """Go on behind a line that was waited for."""
         if compared:
             self._count(wanted.line)
         else:
             self._kept += 1
-        self._perhaps.clear()
+        self._original.perhaps.clear()
+        self._original.forget_ahead()
         self._wanted = None
-        self._begin()
+        self._begun.append(self._original.place())
 
     def _leave(self, number: int) -> None:
         """Leave a stream behind which the file goes on with a line of the original."""
-        wanted = self._wanted
-        if wanted is None:
-            self._find_wanted()
-            wanted = self._wanted
-        if wanted is not None and wanted.line < number:
+        original = self._original
+        wanted = self._wanted or original.wanted()
+        if wanted.code and wanted.line < number:
             raise self._missing(wanted.line, wanted.code)
         self._streaming, self._wanted = False, None
-        self._perhaps.clear()
-        if number == _ALL:
-            self._check(self._before.state, at.WORDS, b"the last stream", self._original.line)
+        if number == ALL:
+            self._check(self._before.state, at.WORDS, b"the last stream", original.text.line)
             return
         # Go back to before the line: what is wanted may lie behind it, and lines of ours that set
         # modes or F may have been taken for such.
-        while len(self._begun) > 1 and self._begun[-1][1] > number:
+        original.look_ahead(wanted)
+        original.perhaps.clear()
+        while len(self._begun) > 1 and self._begun[-1].line > number:
             self._begun.pop()
             self._kept -= 1
-        bytes_before, line, kept = self._begun[-1]
-        self._before.restore(kept)
-        original = self._original
-        if original.bytes_before <= bytes_before < original.bytes_before + len(original.data):
-            original.at = bytes_before - original.bytes_before
-        else:
-            self._source.seek(bytes_before)
-            original.take(b"")
-            original.bytes_before = bytes_before
-        original.line = line
-        while (found := self._next_original(number))[0]:
-            if found[1] < 0:
-                self._before.carry_out(found[0])
-                self._skip_original()
-        if original.line != number:
+            original.forget_ahead()
+        original.go_to(self._begun[-1])
+        original.go_up_to(number)
+        if original.text.line != number:
             raise LastCheckError(
                 f"a stream ends before line {number} of the original, of which this was written "
                 "already",
-                original.line,
+                original.text.line,
                 self._written.line,
             )
         self._check(self._before.state, at.WORDS, b"a stream", number)
-
-    # The original
-
-    def _read_on(self) -> bool:
-        """Read the next lines of the original; tell whether there are any."""
-        original = self._original
-        parts = []
-        while block := self._source.read(_BLOCK_BYTES):
-            cut = block.rfind(b"\n") + 1
-            if cut:
-                parts.append(block[:cut])
-                if cut < len(block):
-                    self._source.seek(cut - len(block), 1)
-                break
-            parts.append(block)
-        data = b"".join(parts)
-        if data and not data.endswith(b"\n"):
-            data += b"\n"
-        if data:
-            original.take(data)
-        return bool(data)
-
-    def _begin(self) -> None:
-        original = self._original
-        place = original.bytes_before + original.at
-        self._begun.append((place, original.line, self._before.keep()))
-
-    def _expected(self) -> bytes | None:
-        """Return the next line of the original that holds a command; None at its end."""
-        original = self._original
-        while not original.is_read or self._read_on():
-            line, behind = original.peek()
-            code = code_of(line)
-            if code:
-                return code
-            original.skip(behind)
-        return None
-
-    def _skip_original(self) -> None:
-        original = self._original
-        original.skip(original.data.index(b"\n", original.at) + 1)
-
-    def _next_original(self, before_line: int = _ALL) -> tuple[bytes, int]:
-        """Carry out moves of X and Y, and go on to what is behind them.
-
-        Returns
-        -------
-        (bytes, int)
-            The line behind them, to be carried out, and -1; or one that stands still in X and Y and
-            was carried out, with its words. Nothing at the end of the file, and before the line.
-        """
-        original = self._original
-        while original.line < before_line:
-            if original.is_read and not self._read_on():
-                return b"", -1
-            behind, lines, mask = at.carry_out_moves(
-                original.array,
-                original.at,
-                original.stop,
-                before_line - original.line,
-                self._before.shortest_mm,
-                self._before.state,
-                self._words,
-                self._still,
-            )
-            original.skip(behind, lines)
-            if mask >= 0:
-                begin = original.data.rfind(b"\n", 0, behind - 1) + 1
-                return original.data[begin : behind - 1].rstrip(), mask
-            if original.is_read or original.line >= before_line:
-                continue
-            line, behind = original.peek()
-            if code := code_of(line):
-                return code, -1
-            original.skip(behind)
-        return b"", -1
-
-    def _find_wanted(self) -> None:
-        """Carry out the original up to the next line that must be in the written file."""
-        while (found := self._next_original())[0]:
-            (code, mask), before = found, self._still
-            line, kind = self._original.line - 1, Kind.RESTS if mask & 15 else Kind.STAYS
-            if mask < 0:
-                before = self._before.state.copy()
-                kind, mask = self._before.carry_out(code)
-                self._skip_original()
-                line += 1
-            if kind is Kind.PERHAPS:
-                self._perhaps.append(code)
-            elif kind is not Kind.MOVES:
-                array = np.frombuffer(code, np.uint8)
-                self._wanted = _Wanted(line, code, kind, mask, array, before)
-                return
 
     # What is found
 
@@ -576,12 +409,12 @@ class LastCheck:
             f"a line of the original is missing ({_shown(code)!r})", line, self._written.line
         )
 
-    def _strange(self, code: bytes, expected: bytes | None) -> LastCheckError:
-        wanted = "the end of the file" if expected is None else repr(_shown(expected))
+    def _strange(self, code: bytes, expected: bytes) -> LastCheckError:
+        wanted = repr(_shown(expected)) if expected else "the end of the file"
         return LastCheckError(
             f"{_shown(code)!r} is not what comes next in the original ({wanted}), and no line that "
             "Stillpath adds there",
-            self._original.line,
+            self._original.text.line,
             self._written.line,
         )
 

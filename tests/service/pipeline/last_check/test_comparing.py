@@ -238,6 +238,24 @@ def test_what_it_cannot_follow_is_said(tmp_path: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_many_streams_without_a_line_that_stays(kind: str, tmp_path: Path, cache: Path) -> None:
+    """Behind each stream the same moves come again, and nothing but their number tells them."""
+    square = "G1 X70 Y50 E1\nG1 Y70 E1\nG1 X50 E1\nG1 Y50 E1\n"
+    parts = f"; STILLPATH_OFF\n{square}; STILLPATH_ON\n{square}"
+    data = ("G28\nM83\nG90\nG1 X50 Y50 Z.2 F6000\n" + 5 * parts).encode()
+    machine = machine_of(kind)
+    result, written = make(data, machine, tmp_path, cache)
+    assert written.count(b"; stillpath: stream off") >= 5
+    assert result.last_check is not None
+    assert result.last_check.compared_lines >= 20
+    end = written.rindex(b"; stillpath: stream off, line")
+    line = written.index(b"G1 X70 Y50 E1\n", end) if kind == "klipper" else end
+    twice = written[:line] + b"G1 X70 Y50 E1\n" + written[line:]
+    with pytest.raises(LastCheckError):
+        check(data, twice, machine)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_pass(kind: str, path: Path, tmp_path: Path, cache: Path) -> None:
     data = b"".join(path.read_bytes().splitlines(keepends=True)[:1500])
