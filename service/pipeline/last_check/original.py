@@ -41,7 +41,7 @@ class Text:
     at: int = 0
     line: int = 1
     bytes_before: int = 0
-    array: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    array: NDArray[np.uint8] = field(default_factory=lambda: np.frombuffer(b"", np.uint8))
     stop: int = 0
 
     @property
@@ -89,7 +89,7 @@ class Wanted:
     code: bytes = b""
     kind: Kind = Kind.STAYS
     mask: int = 0
-    array: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    array: NDArray[np.uint8] = field(default_factory=lambda: np.frombuffer(b"", np.uint8))
     before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(at.SIZE))
 
 

@@ -128,7 +128,7 @@ def test_kernels_read_as_the_slow_way_does(lines: list[str]) -> None:
     text = np.frombuffer("".join(f"{line}\n" for line in moves).encode(), np.uint8)
     slow = after("\n".join(["M83", *moves]), MARLIN)
     quick = after("M83", MARLIN)
-    nothing, states = np.zeros(0, np.uint8), np.zeros((2, at.SIZE))
+    nothing, states = np.frombuffer(b"", np.uint8), np.zeros((2, at.SIZE))
     found = at.ours(
         text, 0, len(text), quick.state, np.zeros(5), nothing, False, *states, np.zeros(3), 0.0
     )
