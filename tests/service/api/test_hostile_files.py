@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -33,6 +35,20 @@ How quick the API is on a quiet one, says `benchmarks/hostile_service.py`."""
 STUCK_S = 5.0
 """What an API takes to answer that waits for something, or computes elsewhere and holds the
 interpreter."""
+
+
+BUSY = """
+import sys, time, uvicorn
+async def app(scope, receive, send):
+    if scope["path"] == "/busy":
+        until = time.thread_time() + 1.0
+        while time.thread_time() < until:
+            pass
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": b""})
+uvicorn.run(app, port=int(sys.argv[1]), lifespan="off", log_level="error")
+"""
+"""An API that computes in its own thread, for a second."""
 
 
 def answer_to(ask: Callable[[], httpx2.Response]) -> httpx2.Response:
@@ -103,3 +119,28 @@ def test_a_caller_who_hangs_up_ends_the_computation(tmp_path: Path) -> None:
 
 def family(process: subprocess.Popen[str]) -> set[int]:
     return {child.pid for child in psutil.Process(process.pid).children(recursive=True)}
+
+
+def test_an_api_that_computes_is_seen() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with (
+        subprocess.Popen([sys.executable, "-c", BUSY, str(port)], text=True) as process,
+        httpx2.Client(base_url=f"http://127.0.0.1:{port}", timeout=60) as client,
+    ):
+
+        def answers() -> bool:
+            with contextlib.suppress(httpx2.TransportError):
+                return client.get("/healthz").status_code == 200
+            return False
+
+        try:
+            assert until(answers, 30)
+            with watched(client, process) as seen:
+                for _ in range(3):
+                    client.get("/busy")
+        finally:
+            process.terminate()
+    assert seen.failures == []
+    assert seen.busiest_s > HELD_UP_S
