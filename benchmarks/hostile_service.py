@@ -29,13 +29,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import httpx2
 import psutil
 
-from tests.service.api.test_hostile_files import (
-    CONTROLLERS,
+from tests.service.api.hostile_requests import (
     MEASUREMENTS,
     SENDER,
     Seen,
-    deep,
-    loop,
+    hostile_requests,
     spectrum,
     watched,
 )
@@ -100,18 +98,7 @@ def _routes(data: Path, _: argparse.Namespace) -> Line:
         resource.prlimit(process.pid, resource.RLIMIT_DATA, (_LIMIT_MIB * _MIB,) * 2)
         with watched(client, process) as seen:
             job = post(client, b"nap 5")
-            asked: list[Callable[[], httpx2.Response]] = [
-                lambda: client.post(MEASUREMENTS, **spectrum(1_000_000)),
-                lambda: client.post(MEASUREMENTS, **spectrum(20_000)),
-                lambda: client.post(MEASUREMENTS, **deep(100_000)),
-                lambda: client.post(CONTROLLERS, **loop(400)),
-                lambda: client.post(CONTROLLERS, **loop(60_000)),
-                lambda: client.get(
-                    "/v1/machines/ender3/design?axis=x&robust=minimax&basis=bspline"
-                ),
-                lambda: client.get("/v1/machines/ender3/design?axis=y&robust=ensemble"),
-                lambda: client.get(done["links"]["trajectories"]),
-            ]
+            asked = hostile_requests(client, done["links"]["trajectories"])
             codes = sorted(a.result().status_code for a in [pool.submit(one) for one in asked])
             other = finished(client, job)["state"]
     kept = set(codes) <= {200, 202, 422} and other == "done" and not seen.failures

@@ -85,6 +85,11 @@ class Passage:
     modal_before: ModalState
     modal_after: ModalState
 
+    @property
+    def first_line(self) -> int:
+        """Number of its first line in the file, from 1; it must hold one."""
+        return min(int(rows.line[0]) for rows in (self.moves, self.events) if len(rows))
+
     def line_text(self, byte_start: int, byte_end: int) -> bytes:
         """Return the bytes of a line by its absolute offsets."""
         return self.text[byte_start - self.text_offset : byte_end - self.text_offset]

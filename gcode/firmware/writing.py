@@ -413,7 +413,8 @@ class StreamWriter:
         limits = passage.limits_before
         if self._shaper_off and self._shaper_is_known:
             self._marked, limits = limits, self._voice.in_stream(limits)
-        text = stop + self._stream_off(limits, passage.modal_before, extruder_mm)
+        behind = b", line %d of the original" % passage.first_line
+        text = stop + self._stream_off(limits, passage.modal_before, extruder_mm, behind)
         return text + shaper
 
     def _unmarked(self) -> bytes:
@@ -439,16 +440,19 @@ class StreamWriter:
         text = b""
         if self._streaming and self._behind is not None:
             text = b"" if self._at_rest else self._voice.stand_still
-            text += self._stream_off(*self._behind, extruder_mm)
+            text += self._stream_off(*self._behind, extruder_mm, b"")
         shaper = self._shaper_on()
         return text + self._unmarked() + shaper
 
-    def _stream_off(self, limits: Limits, state: ModalState, extruder_mm: float) -> bytes:
+    def _stream_off(
+        self, limits: Limits, state: ModalState, extruder_mm: float, behind: bytes
+    ) -> bytes:
         self._streaming = False
         text = self._voice.limits(limits) + self._file_modes(state)
         text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
-        return text + _feed_line(self._file_feed_mm_min) + b"; stillpath: stream off\n"
+        mark = b"; stillpath: stream off" + behind + b"\n"
+        return text + _feed_line(self._file_feed_mm_min) + mark
 
     def _shaper_before(self, passage: Passage) -> bytes:
         """Set the firmware's shaper again before lines that print on their own.

@@ -13,7 +13,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from heapq import merge
-from typing import BinaryIO, Literal
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from gcode.pieces import Passage
 from gcode.slicers.marks import MarkKind, read_mark
 from gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 __all__ = ["Retiming", "behind_last_command", "retimed"]
 
@@ -83,14 +86,14 @@ class Retiming:
             self._note(text, item, np.broadcast_to(delay_s, (len(item.moves) + 1,)))
         self._size += len(text)
 
-    def copy(self, source: BinaryIO, target: BinaryIO, delay_s: float) -> int:
+    def copy(self, source: BinaryIO, target: SupportsWrite[bytes], delay_s: float) -> int:
         """Copy the text, with the new times in it.
 
         Parameters
         ----------
         source : BinaryIO
             What was pushed, at its beginning.
-        target : BinaryIO
+        target : file to write to
         delay_s : float
             How much later the print ends.
 
@@ -110,9 +113,12 @@ class Retiming:
         ):
             written += _copy(source, target, offset - done)
             if isinstance(what, bytes):
-                written += target.write(what)
+                target.write(what)
+                written += len(what)
             else:
-                written += target.write(times.line(source.read(length), offset, what))
+                line = times.line(source.read(length), offset, what)
+                target.write(line)
+                written += len(line)
             done = offset + length
         return written + _copy(source, target, self._size - done)
 
@@ -270,7 +276,7 @@ def _find_line(text: bytes, line: bytes, at: int) -> int:
         at = found + 1
 
 
-def _copy(source: BinaryIO, target: BinaryIO, count: int) -> int:
+def _copy(source: BinaryIO, target: SupportsWrite[bytes], count: int) -> int:
     left = count
     while left > 0:
         data = source.read(min(left, _COPIED_BYTES))

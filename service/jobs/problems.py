@@ -48,12 +48,14 @@ def problem(status: int, title: str, detail: str, **extra: Any) -> dict[str, Any
 def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> dict[str, Any]:
     """Return the problem document for an error of a job's work.
 
-    The three error roots of the house are the input's fault (422) and are told in full; anything
-    else is ours (500), and the details stay in the log.
+    The three error roots of the house are the input's fault (422) and are told in full, as is a
+    written file that the last check refuses (500); anything else is ours, and the details stay in
+    the log.
     """
     from compensation.base import DesignError
     from gcode.errors import GcodeError
     from models.errors import ModelError
+    from service.pipeline.last_check.comparing import LastCheckError
 
     match error:
         case GcodeError() | ModelError() | DesignError() if kind in _REFUSED:
@@ -67,6 +69,9 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
             return problem(422, "The machine model cannot be used", str(error))
         case DesignError():
             return problem(422, "No compensator can be designed", str(error))
+        case LastCheckError():
+            place = {"line": error.line, "written_line": error.written_line}
+            return problem(500, "The last check failed", str(error), **place)
         case MemoryError():
             return problem(500, "Out of memory", "The worker ran out of memory; give it more.")
         case OSError() if error.errno in DISK_FULL:

@@ -14,6 +14,7 @@ __all__ = [
     "Channel",
     "ErrorFigures",
     "GroupFigures",
+    "LastCheckFigures",
     "LayerView",
     "PutBack",
     "Result",
@@ -221,6 +222,18 @@ class AdviceFigures(_Figures):
     """Lines that were added."""
 
 
+class LastCheckFigures(_Figures):
+    """How the written file was compared with the original, by a reader of its own."""
+
+    kept_lines: int
+    """Lines with commands that both files share."""
+    compared_lines: int
+    """Those at which place, filament and modes were compared; within streams the head is on its
+    way, and only the file's own retractions and Z hops are."""
+    not_compared: list[str]
+    """Where the place was not compared, and why."""
+
+
 class Result(_Figures):
     """Report of one job; `service.reports` turns it into HTML, the API returns it as JSON."""
 
@@ -309,3 +322,5 @@ class Result(_Figures):
     """What the budget bought, where there was one."""
     advice: AdviceFigures | None = None
     """What is advised, by method `advise`."""
+    last_check: LastCheckFigures | None = None
+    """What the last check compared; null where nothing was compensated."""

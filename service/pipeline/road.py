@@ -47,6 +47,7 @@ from service.pipeline.compensating import (
     deviation,
 )
 from service.pipeline.files import default_cache_dir, replacing
+from service.pipeline.last_check.comparing import LastCheck
 from service.pipeline.layer_files import LayerWriter, written_layers
 from service.pipeline.length import LengthGuard
 from service.pipeline.measure import Measurement, channel_names
@@ -174,7 +175,7 @@ def compensate_file(
                 spool.truncate()
                 writer = writer.anew() if writer is not None else None
             spool.seek(0)
-            job.retiming.copy(spool, text, job.delay_s)
+            result = job.deliver(result, text)
             if options.times == "new":
                 container.delay(job.delay_s)
         sizes = {
@@ -346,6 +347,18 @@ class _Job:
         if self.milder is None:
             self._say("done", 1.0)
         return self._result(name, size, facts)
+
+    def deliver(self, result: Result, text: BinaryIO) -> Result:
+        """Write the file with its new times; it is compared with the original meanwhile."""
+        if not self._changes:
+            self.retiming.copy(self._target, text, self.delay_s)
+            return result
+        shortest_mm = 2.0 * self._kit.shortest_move_mm
+        check = LastCheck(text, self._source, self._machine, self._kit.step_mm, shortest_mm)
+        self.retiming.copy(self._target, check, self.delay_s)
+        figures = check.finish()
+        stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
+        return result.model_copy(update={"last_check": figures, "stages": [*result.stages, stage]})
 
     def _chosen_paces(self, size: int) -> SpeedBudget:
         """Find how quick the print may be."""
