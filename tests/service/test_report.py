@@ -38,7 +38,8 @@ def test_both_files_are_written_whole(result: Result, tmp_path: Path):
         "report.json",
     ]
     text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
-    text = text.replace('"contour_range_um":"nan"', '"contour_range_um":null')
+    for name in ("contour_range_um", "selected_rms_um"):
+        text = text.replace(f'"{name}":"nan"', f'"{name}":null')
     read = Result.model_validate(
         json.loads(text) | {"budget": None, "advice": None, "last_check": None}
     )
