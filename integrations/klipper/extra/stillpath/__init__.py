@@ -84,10 +84,10 @@ class Stillpath:
             )
         if self.printer.lookup_object("dual_carriage", None) is not None:
             raise Refused("printers with a dual carriage were not tried")
-        for name, ours, theirs in zip(
-            ("max_velocity", "max_accel"),
-            (export.max_velocity, export.max_accel),
-            toolhead.get_max_velocity(),
+        velocity, accel = toolhead.get_max_velocity()
+        for name, ours, theirs in (
+            ("max_velocity", export.max_velocity, velocity),
+            ("max_accel", export.max_accel, accel),
         ):
             if abs(ours - theirs) > LIMIT_TOLERANCE * theirs:
                 raise Refused(

@@ -112,7 +112,7 @@ class Filter:
 
     def late_move(self, t):
         """Forget samples at and after a time; return whether there were any."""
-        keep = max(int(math.ceil(t / self.sample_s)) - self.base, 2 * self.reach + 2)
+        keep = max(math.ceil(t / self.sample_s) - self.base, 2 * self.reach + 2)
         if keep >= len(self.x):
             return False
         for values, ahead in ((self.x, 0), (self.y, 0), (self.dx, 1), (self.dy, 1)):

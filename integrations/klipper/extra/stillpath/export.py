@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
+from pathlib import Path
 
 SCHEMA = "stillpath-klipper/1"
 MOST_BYTES, MOST_TAPS, MOST_PREVIEW_S, MOST_GAIN = 200_000, 401, 0.2, 50.0
@@ -39,10 +39,10 @@ class Export:
 def read_export(path):
     """Return the export in a file, or say what is wrong with it."""
     try:
-        with open(os.path.expanduser(path), "rb") as file:
+        with Path(path).expanduser().open("rb") as file:
             data = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise Refused("cannot read %s: %s" % (path, error.strerror))
+        raise Refused("cannot read %s: %s" % (path, error.strerror)) from None
     if len(data) > MOST_BYTES:
         raise Refused("%s is larger than any export" % (path,))
     try:
@@ -54,8 +54,10 @@ def read_export(path):
         return Export(content)
     except Refused:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        raise Refused("%s is not a whole export: %s" % (path, error or type(error).__name__))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, RuntimeError) as error:
+        raise Refused(
+            "%s is not a whole export: %s" % (path, error or type(error).__name__)
+        ) from None
 
 
 def digest(content):

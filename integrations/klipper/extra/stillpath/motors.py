@@ -60,14 +60,14 @@ class Motor:
 class Queue2025:
     """Motion queues and flushing of Klipper since 2025: the object motion_queuing."""
 
-    NEEDS = [
+    NEEDS = (
         "allocate_trapq",
         "wipe_trapq",
         "register_flush_callback",
         "unregister_flush_callback",
         "check_step_generation_scan_windows",
         "kin_flush_delay",
-    ]
+    )
 
     def __init__(self, toolhead, queuing, _ffi):
         self.toolhead, self.queuing = toolhead, queuing
@@ -104,13 +104,13 @@ class Queue2025:
 class Queue2023:
     """Motion queues and flushing of Klipper until 2025: the toolhead itself."""
 
-    NEEDS = [
+    NEEDS = (
         "register_step_generator",
         "step_generators",
         "note_step_generation_scan_time",
         "trapq_finalize_moves",
         "reactor",
-    ]
+    )
 
     def __init__(self, toolhead, _queuing, ffi):
         self.toolhead, self.ffi = toolhead, ffi
