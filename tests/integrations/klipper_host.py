@@ -14,7 +14,7 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -137,10 +137,13 @@ class Steps:
         Of each motor.
     place_mm : list of ndarray
         Behind each step, from where the motor stood at first.
+    others_s : list of ndarray
+        When the motors of Z and the extruder step.
     """
 
     time_s: list[NDArray[np.float64]]
     place_mm: list[NDArray[np.float64]]
+    others_s: list[NDArray[np.float64]] = field(default_factory=list)
 
     def sampled(self, sample_s: float, corexy: bool = False) -> NDArray[np.float64]:
         """Places of X and Y at even times from 0 to the end, (2, n), straight between steps."""
@@ -296,11 +299,9 @@ def _read(data: bytes) -> Steps:
                 motors[values[0]] = _Motor()
             else:
                 assert kind != reset, "nothing takes a homed motor's clock back in batch mode"
-    first = [motors[oid] for oid in sorted(motors)][:2]
-    return Steps(
-        [np.concatenate(m.clocks) / _CLOCK_HZ for m in first],
-        [np.concatenate(m.places) * _STEP_MM for m in first],
-    )
+    found = [motors[oid] for oid in sorted(motors)]
+    times = [np.concatenate([np.zeros(0), *m.clocks]) / _CLOCK_HZ for m in found]
+    return Steps(times[:2], [np.concatenate(m.places) * _STEP_MM for m in found[:2]], times[2:])
 
 
 def _blocks(data: bytes) -> list[bytes]:

@@ -130,7 +130,7 @@ def both(
     """Print without and with the extra."""
     plain = "\n".join(line for line in text.split("\n") if not line.startswith("STILLPATH"))
     first = steps_of(plain, printer_cfg(machine, more), place, klipper)
-    text = text + "STILLPATH_STATUS\n"
+    text = text + "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"  # the first of them makes all steps
     second = print_with(text, machine, export, place, klipper, more)
     return Pair(first, second, (place / "klippy.log").read_text())
 
@@ -151,7 +151,7 @@ def stands(steps: Steps, least_s: float = 0.6) -> list[tuple[float, ...]]:
     return found
 
 
-def shifted(wanted: Array, found: Array, about: int = 0) -> tuple[float, Array]:
+def shifted(wanted: Array, found: Array, about: float) -> tuple[float, Array]:
     """Return by how many samples `found` is late, and its difference, both (2, n)."""
     n = wanted.shape[1]
     at = np.arange(n)
@@ -160,8 +160,8 @@ def shifted(wanted: Array, found: Array, about: int = 0) -> tuple[float, Array]:
     def off(late: float) -> Array:
         return np.stack([np.interp(at + late, known, row) for row in found]) - wanted
 
-    late = float(about)
-    for reach, step in ((4000, 40), (40, 4), (4, 0.5), (0.5, 0.05)):
+    late = about
+    for reach, step in ((400, 20), (20, 2), (2, 0.25), (0.25, 0.05)):
         late = min(
             late + np.arange(-reach, reach + step, step), key=lambda d: float(np.mean(off(d) ** 2))
         )

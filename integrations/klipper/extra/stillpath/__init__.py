@@ -17,11 +17,6 @@ from __future__ import annotations
 import logging
 import time
 
-try:
-    from ... import chelper  # Klipper as a package
-except (ImportError, ValueError):
-    import chelper  # Klipper as everybody has it
-
 from .command import Filter
 from .export import Refused, read_export
 from .motors import Motor, queue_of
@@ -29,6 +24,7 @@ from .motors import Motor, queue_of
 KINEMATICS = {"cartesian": "CartKinematics", "corexy": "CoreXYKinematics"}
 ASIDE = ("TEST_RESONANCES", "SHAPER_CALIBRATE", "SET_INPUT_SHAPER", "FORCE_MOVE", "STEPPER_BUZZ")
 """Commands during which the motors follow Klipper's plan itself."""
+SHAPER = "input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
 LIMIT_TOLERANCE = 0.01
 MOST_LOAD, LOAD_S = 0.5, 5.0
 
@@ -73,7 +69,7 @@ class Stillpath:
     def _start(self):
         export = read_export(self.path)
         self.toolhead = toolhead = self.printer.lookup_object("toolhead")
-        ffi = chelper.get_ffi()
+        ffi = _chelper().get_ffi()
         self.queue = queue_of(self.printer, toolhead, ffi)
         kinematics = toolhead.get_kinematics()
         wants = KINEMATICS.get(export.kinematics)
@@ -159,8 +155,9 @@ class Stillpath:
         if self.engaged or self.export is None or not self.wanted or self.aside:
             return
         if self._shaper_on():
-            self.reason = "input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
-            self._say("off: %s" % (self.reason,))
+            if self.reason != SHAPER:
+                self.reason = SHAPER
+                self._say("off: %s" % (SHAPER,))
             return
         self.reason = ""
         self.toolhead.flush_step_generation()
@@ -314,6 +311,15 @@ class Stillpath:
             self._state(), self.busy_s, self.moved_s,
             self.filter.limited if self.filter else 0, self.late,
         )  # fmt: skip
+
+
+def _chelper():
+    """Return Klipper's helper in C."""
+    try:
+        from ... import chelper  # Klipper as a package
+    except (ImportError, ValueError):
+        import chelper  # Klipper as everybody has it
+    return chelper
 
 
 def load_config(config):
