@@ -7,6 +7,7 @@ than the shaper; the shaper itself is always among them, for a shaper is such a 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,8 +33,10 @@ Array = NDArray[np.float64]
 
 DT_S = 1e-3
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
+_REACHES = (80, 160)
+"""Samples on either side; the longer one is for axes whose slowest mode rings below 25 Hz or so."""
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
-_STRIDE = 5
+_STRIDE, _NOTHING = 5, 1e-12
 _AS_GOOD = 1.05
 """Of two filters as good as that the one with less bandwidth: it asks for less acceleration."""
 
@@ -113,6 +116,16 @@ def filter_of(machine: Machine, cache_dir: Path | None = None) -> LiveFilter:
     return live_filter(machine, design_live(machine, shaper).taps)
 
 
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A filter, and its contour error against the shaper's, geometric mean over the members."""
+
+    ratio: float
+    corner_hz: float
+    taps: Array
+    shares: tuple[float, float]
+
+
 class _Trial:
     """Filters on the reference motion, answered by every member."""
 
@@ -125,12 +138,8 @@ class _Trial:
         self._distances = PathDistances(self._path, DT_S)
         self._pairs = member_pairs(machine, DT_S)
         self._weights = pair_weights(machine, len(self._pairs))
-        self._smooth_taps = np.stack(
-            [
-                shaper_taps(shaper_pulses(shaper.type, f_hz, shaper.zeta), DT_S)
-                for f_hz in (shaper.fx_hz, shaper.fy_hz)
-            ]
-        )
+        pulses = [shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)]
+        self._smooth_taps = np.stack([shaper_taps(p, DT_S, _REACHES[-1]) for p in pulses])
         self._smooth = self._command(self._smooth_taps)
         self._smooth_mm = self._answers(self._smooth)
         self._shaped = np.array([self._rms(y) for y in self._smooth_mm])
@@ -138,19 +147,16 @@ class _Trial:
     def chosen(self) -> LiveDesign:
         """Return the best that keeps the promise."""
         found = list(self._candidates())
-        least = min(ratio for ratio, *_ in found)
-        good = [one for one in found if one[0] <= _AS_GOOD * least]
-        _, corner_hz, exact, shares = min(good, key=lambda one: (one[1], one[0]))
-        a = np.array(shares)[:, None]
-        mixed = a * exact + (1.0 - a) * self._smooth_taps
-        taps = np.stack([exact_moments(row) for row in mixed])
-        command = self._command(taps)
+        least = min(one.ratio for one in found)
+        good = [one for one in found if one.ratio <= _AS_GOOD * least]
+        best = min(good, key=lambda one: (one.taps.shape[1], one.corner_hz, one.ratio))
+        command = self._command(best.taps)
         ours = np.array([self._rms(y) for y in self._answers(command)])
         channels = {"before": self._path, "live": command, "shaper": self._smooth}
         return LiveDesign(
-            taps,
-            shares,
-            corner_hz,
+            best.taps,
+            best.shares,
+            best.corner_hz,
             self._shaper,
             float((ours / self._shaped).max()),
             float(np.exp(self._weights @ np.log(ours / self._shaped))),
@@ -158,13 +164,13 @@ class _Trial:
             _peak(command),
         )
 
-    def _candidates(self) -> Iterator[tuple[float, float, Array, tuple[float, float]]]:
-        """Yield mean ratio, bandwidth, taps and shares of what keeps promise and limits."""
+    def _candidates(self) -> Iterator[_Candidate]:
+        """Yield what keeps promise and limits; the shaper first."""
         sets = [plant_set(self._machine.axes[a].without_delay(), DT_S) for a in ("x", "y")]
         most = [most_share(self._machine.axes[a]) for a in ("x", "y")]
-        yield 1.0, 0.0, self._smooth_taps, (0.0, 0.0)
-        for corner_hz in _CORNERS_HZ:
-            exact = np.stack([design_taps(s.members, s.weights, corner_hz) for s in sets])
+        yield _Candidate(1.0, 0.0, _shortened(self._smooth_taps), (0.0, 0.0))
+        for reach, corner_hz in itertools.product(_REACHES, _CORNERS_HZ):
+            exact = np.stack([design_taps(s.members, s.weights, corner_hz, reach) for s in sets])
             command = self._command(exact)
             if _peak(command) > self._machine.command.accel_mm_s2:
                 continue
@@ -179,9 +185,16 @@ class _Trial:
                     one = (share, best[1]) if axis == 0 else (best[0], share)
                     if share <= most[axis] and one not in tried:
                         tried[one] = self._ratio(exact_mm, one)
-            for shares, ratio in tried.items():
-                if shares != (0.0, 0.0) and np.isfinite(ratio):
-                    yield ratio, corner_hz, exact, shares
+            shares = min(tried, key=tried.__getitem__)
+            if shares != (0.0, 0.0) and np.isfinite(tried[shares]):
+                yield _Candidate(tried[shares], corner_hz, self._mixed(exact, shares), shares)
+
+    def _mixed(self, exact: Array, shares: tuple[float, float]) -> Array:
+        """Return taps with some of the shaper's, as long as either needs."""
+        a = np.array(shares)[:, None]
+        more = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
+        exact = np.pad(exact, ((0, 0), (more, more)))
+        return _shortened(a * exact + (1.0 - a) * self._smooth_taps)
 
     def _ratio(self, exact_mm: list[Array], shares: tuple[float, float]) -> float:
         """Return the mean against the shaper; infinite where any member is worse."""
@@ -213,6 +226,17 @@ class _Trial:
             usual = 1e3 * self._rms(response(plants, command)[:, self._at])
             out[name] = (usual, usual * spread[name][0], usual * spread[name][1])
         return out
+
+
+def _shortened(taps: Array) -> Array:
+    """Return the shortest of the lengths that loses nothing."""
+    for reach in _REACHES:
+        more = taps.shape[1] // 2 - reach
+        lost = np.delete(taps, np.s_[more : taps.shape[1] - more], axis=1)
+        if not np.any(np.abs(lost) > _NOTHING):
+            kept = taps[:, more : taps.shape[1] - more]
+            return np.stack([exact_moments(row) for row in kept])
+    raise ValueError(f"{taps.shape[1]} taps are more than any filter has")
 
 
 def _peak(command: Array) -> float:

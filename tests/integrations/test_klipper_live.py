@@ -15,7 +15,9 @@ from compensation.live_filter import LiveFilter
 from models.machine import Machine
 from models.store import load_machine
 from service.live.export import export_digest, write_export
-from tests.integrations.interrupted import asked, homed, two_objects
+from service.pipeline.options import Options
+from service.pipeline.road import compensate_file
+from tests.integrations.interrupted import MACROS, USERS, asked, homed, two_objects
 from tests.integrations.klipper_host import (
     NO_KLIPPER,
     PYTHON,
@@ -143,6 +145,25 @@ def test_limits_bring_the_plan_back(
     # The prediction takes the plan from steps, whose edges look like acceleration at the limit.
     assert np.sqrt(np.mean(off_mm**2)) < 3e-3
     assert np.abs(off_mm).max() < 20e-3
+
+
+def test_a_compensated_file_is_not_compensated_twice(
+    klipper: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    (tmp_path / "in.gcode").write_text(two_objects())
+    made = tmp_path / "out.gcode"
+    compensate_file(tmp_path / "in.gcode", made, machine, Options(robust="off"))
+    more = f"{USERS}\n{MACROS}"
+    prints = both(made.read_text(), machine, export("ender3"), tmp_path, klipper, more)
+    assert stands(prints.live) == stands(prints.plain)
+    begin, later = (_print_begins(s.time_s) for s in (prints.plain, prints.live))
+    first = (round(begin * 1e3) - 500) * _FINE
+    plan, found = (s.sampled(1e-3 / _FINE)[:, first:] for s in (prints.plain, prints.live))
+    _, off_mm = shifted(plan, found, (later - begin) * 1e3 * _FINE)
+    assert np.sqrt(np.mean(off_mm**2)) < 3e-3
+    # Moves before and behind the streams are compensated, within what they deviate.
+    assert np.abs(off_mm).max() < 0.1
 
 
 def _unsigned(change: Callable[[dict[str, Any]], None]) -> Callable[[dict[str, Any]], str]:

@@ -117,6 +117,9 @@ class Stillpath:
             if self.engaged and trapq == toolhead.trapq:
                 if self.filter.late_move(move[0]):
                     self._was_late()
+                if move[-1] >= self.export.accel_mm_s2:
+                    # Planned with all that the motors bear, as compensated files are.
+                    self.filter.block(move[0], move[0] + sum(move[1:4]))
                 self.filter.plan.add(*move)
             return klippers_append(trapq, *move)
 

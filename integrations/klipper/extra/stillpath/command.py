@@ -13,6 +13,8 @@ FADE = 24
 MARGIN = 6
 """Samples from the end of a batch of steps to the last one that is asked for."""
 BLOCK = 256
+PAUSE = 500
+"""Samples between two moves that pass, so few that the filter does not come back for them."""
 STILL_MM = 1e-10
 
 
@@ -88,6 +90,7 @@ class Filter:
         self.most_turn = export.accel_mm_s2 * export.sample_s**2
         self.bounds = bounds
         self.passing = False
+        self.blocked = deque()
         self.limited = 0
         ramp = list(range(1, FADE + 2)) + list(range(FADE, 0, -1))
         self.ramp = [r / float(sum(ramp)) for r in ramp]
@@ -109,6 +112,14 @@ class Filter:
         self.allowed = [1.0] * (devs - 1)
         self.changed = self.limit_at = -(1 << 62)
         self.out = [(x, y), (x, y)]
+
+    def block(self, begin_s, end_s):
+        """Let the plan pass between two times that lie ahead."""
+        first, last = (math.floor(t / self.sample_s) for t in (begin_s, end_s))
+        if self.blocked and first - self.blocked[-1][1] < PAUSE:
+            self.blocked[-1][1] = last
+        else:
+            self.blocked.append([first, last])
 
     def late_move(self, t):
         """Forget samples at and after a time; return whether there were any."""
@@ -154,9 +165,12 @@ class Filter:
             for i in range(len(devs), size - reach):
                 near = values[i - reach : i - reach + width]
                 devs.append(sum(map(mul, taps, near)) - values[i])
-        allowed = self.allowed
+        allowed, blocked = self.allowed, self.blocked
         for i in range(len(allowed), size - reach - 1):
-            share = 0.0 if self.passing else self._share(i)
+            while blocked and blocked[0][1] < self.base + i:
+                blocked.popleft()
+            passing = self.passing or (blocked and blocked[0][0] <= self.base + i)
+            share = 0.0 if passing else self._share(i)
             if share < 1.0:
                 self.limit_at = self.base + i
             allowed.append(share)
