@@ -99,7 +99,7 @@ class LiveFilter:
             too_much = np.abs(own + more) > most
             room = np.maximum(most - own * np.sign(more), 0.0)
             size = np.maximum(np.abs(more), 1e-300)
-            np.minimum(share, np.where(too_much, np.minimum(room / size, 1.0), 1.0), out=share)
+            np.minimum(share, np.where(too_much, np.minimum(room, size) / size, 1.0), out=share)
 
         for own, more, (least, most) in zip(plan, away, self.bounds_mm, strict=True):
             keep(np.diff(own, 2), np.diff(more, 2), self.accel_mm_s2 * self.dt_s**2)

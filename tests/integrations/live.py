@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.machine import Machine
-from tests.integrations.interrupted import asked
 from tests.integrations.klipper_host import Steps, printer_cfg, steps_of
 
 __all__ = ["EVENTS", "Pair", "both", "print_with", "shifted", "stands"]
@@ -151,21 +150,7 @@ def stands(steps: Steps, least_s: float = 0.6) -> list[tuple[float, ...]]:
     return found
 
 
-def shifted(wanted: Array, found: Array, about: float) -> tuple[float, Array]:
-    """Return by how many samples `found` is late, and its difference, both (2, n)."""
-    n = wanted.shape[1]
-    at = np.arange(n)
-    known = np.arange(found.shape[1])
-
-    def off(late: float) -> Array:
-        return np.stack([np.interp(at + late, known, row) for row in found]) - wanted
-
-    late = about
-    for reach, step in ((400, 20), (20, 2), (2, 0.25), (0.25, 0.05)):
-        late = min(
-            late + np.arange(-reach, reach + step, step), key=lambda d: float(np.mean(off(d) ** 2))
-        )
-    return late, off(late)
-
-
-__all__ += ["asked"]
+def shifted(found: Array, late: float, count: int) -> Array:
+    """Return a motion (2, n) so many samples earlier, (2, count)."""
+    at = np.arange(count) + late
+    return np.stack([np.interp(at, np.arange(len(row)), row) for row in found])
