@@ -154,7 +154,9 @@ def test_a_compensated_file_is_not_compensated_twice(
     compensate_file(tmp_path / "in.gcode", made, machine, Options(robust="off"))
     more = f"[force_move]\nenable_force_move: True\n{USERS}\n{MACROS}"
     prints = both(made.read_text(), machine, export("ender3"), tmp_path, klipper, more)
-    assert stands(prints.live) == stands(prints.plain)
+    # It stands aside for SET_INPUT_SHAPER, so that there the head stands a little longer.
+    wanted = stands(prints.plain)
+    assert [place for place in stands(prints.live) if place in wanted] == wanted
     # Step by step the same order of places, but for the few moves outside of the streams.
     for ours, theirs in zip(prints.live.place_mm, prints.plain.place_mm, strict=True):
         assert len(ours) == pytest.approx(len(theirs), rel=2e-3)
