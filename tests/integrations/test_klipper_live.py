@@ -271,7 +271,7 @@ def _with_event(event: str) -> str:
     if event == "CANCEL_PRINT":
         return "\n".join([*lines[: fast[12] + 1], *script, ""])
     for k in reversed(fast[3::9]):
-        lines[k + 1 : k + 2] = [*script, lines[k + 1], "G4 P900"]
+        lines[k + 1 : k + 2] = [*script, lines[k + 1], "G4 P1500"]
     return "\n".join(lines)
 
 
