@@ -37,6 +37,7 @@ from service.environment import prepare_environment
 from service.farm import commands as farm
 from service.identification import commands as identification
 from service.interruption import Interrupted
+from service.live import commands as live_commands
 from service.machines import commands as machines
 from service.proof import commands as proof
 from service.remote import KeyOption, ServerOption, compensate_on_server
@@ -54,6 +55,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(machines.app, name="machines")
+app.add_typer(live_commands.app, name="klipper")
 
 _INTERRUPTED = 130
 _WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
@@ -247,6 +249,10 @@ def simulate(
             help="Folder for report.html and .json, layers.json and .bin.",
         ),
     ],
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="With the compensation inside Klipper (klipper export)."),
+    ] = False,
     plate: PlateOption = None,
     dialect: DialectOption = None,
 ) -> None:
@@ -259,6 +265,11 @@ def simulate(
     from service.console import print_result, progress_shown
     from service.pipeline.road import simulate_file
 
+    found_filter = None
+    if live:
+        from service.live.design import filter_of
+
+        found_filter = filter_of(found.machine)
     with progress_shown("stillpath") as progress:
         result = simulate_file(
             source,
@@ -267,6 +278,7 @@ def simulate(
             dialect=read_as,
             progress=progress,
             layers=report,
+            live=found_filter,
         )
     result.warnings.extend(found.warnings)
     _write_report(result, report)

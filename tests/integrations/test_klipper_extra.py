@@ -1,0 +1,168 @@
+"""The parts of the extra that need no Klipper: filter, memory, installer."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from compensation.live_filter import FADE, LiveFilter, design_taps
+from tests.compensation.test_live_filter import mode
+
+EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"
+DT_S = 1e-3
+
+
+@pytest.fixture(scope="module")
+def extra() -> ModuleType:
+    spec = importlib.util.spec_from_file_location(
+        "klipper_extra_stillpath", EXTRA / "stillpath/__init__.py",
+        submodule_search_locations=[str(EXTRA / "stillpath")],
+    )  # fmt: skip
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def zigzag(count: int, accel: float = 5e3, size: float = 40.0) -> list[tuple[float, ...]]:
+    """Moves as `trapq_append` gets them: there and back along X and a little Y."""
+    moves, t, x, y, v = [], 1.0, 50.0, 50.0, 200.0
+    for k in range(count):
+        way = size if k % 2 == 0 else -size
+        ramp = v / accel
+        cruise = (size - v * ramp) / v
+        norm = float(np.hypot(way, 1.0))
+        moves.append((t, ramp, cruise, ramp, x, y, 0.0, way / norm, 1.0 / norm, 0.0, 0.0, v, accel))
+        gone = v * ramp + v * cruise
+        x, y = x + way / norm * gone, y + gone / norm
+        t += 2 * ramp + cruise
+        if k % 5 == 4:
+            t += 0.3
+    return moves
+
+
+def given(taps: np.ndarray, accel: float = 1e5) -> Any:
+    return SimpleNamespace(
+        taps=[list(row) for row in taps], reach=taps.shape[1] // 2, sample_s=DT_S,
+        velocity_mm_s=1e3, accel_mm_s2=accel,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("accel", "batch"), [(1e5, 250), (5200.0, 250), (5200.0, 37)])
+def test_it_filters_as_the_prediction_does(extra: ModuleType, accel: float, batch: int) -> None:
+    taps = np.stack([design_taps([mode(f, 0.05)], np.ones(1), 150.0) for f in (45.0, 30.0)])
+    bounds = [(-1e3, 1e3)] * 2
+    ours = extra.Filter(given(taps, accel), bounds)
+    ours.rest_at(50.0, 50.0)
+    moves = zigzag(40)
+    end = round(moves[-1][0] / DT_S) + 1500
+    command: dict[int, tuple[float, ...]] = {}
+    waiting = list(moves)
+    for until in range(0, end, batch):
+        while waiting and waiting[0][0] <= until * DT_S + ours.preview_s + 0.3:
+            assert not ours.late_move(waiting[0][0])
+            ours.plan.add(*waiting.pop(0))
+        for k, before, now, after in ours.push(until + 2):
+            command[k] = tuple(
+                (a + 6 * b + c) / 8 for a, b, c in zip(before, now, after, strict=True)
+            )
+
+    plan = extra.command.Plan()
+    plan.rest_at(50.0, 50.0)
+    for move in moves:
+        plan.add(*move)
+    x: list[float] = []
+    y: list[float] = []
+    plan.sample(0, end, DT_S, x, y)
+    live = LiveFilter(taps, DT_S, 1e3, accel, np.array(bounds))
+    padded = np.pad(np.array([x, y]), ((0, 0), (live.margin, live.margin)), mode="edge")
+    wanted = live.command(padded)
+    assert (ours.limited > 0) == (accel < 1e4)
+    for k, place in command.items():
+        assert place == pytest.approx(wanted[:, k], abs=1e-9) if k < end - batch else True
+    moving = np.flatnonzero(np.any(np.abs(np.diff(wanted[:, : end - batch])) > 1e-6, axis=0))
+    assert set(moving[1:].tolist()) <= command.keys()
+
+
+def test_memory_does_not_grow_with_the_print(extra: ModuleType) -> None:
+    taps = np.stack([design_taps([mode(45.0, 0.05)], np.ones(1), 150.0)] * 2)
+    ours = extra.Filter(given(taps), [(-1e3, 1e3)] * 2)
+    ours.rest_at(50.0, 50.0)
+    held = []
+    for moves in (zigzag(150), [(m[0] + 600.0, *m[1:]) for m in zigzag(600)]):
+        for move in moves:
+            ours.plan.add(*move)
+            ours.push(int((move[0] - 0.2) / DT_S))
+            held.append(len(ours.x) + len(ours.dx) + len(ours.plan.phases) + len(ours.blocked))
+    assert max(held[150:]) <= max(held[:150]) + 50
+    # A rest of ten hours costs nothing.
+    ours.push(36_000_000)
+    assert len(ours.x) < 2000
+
+
+def test_what_may_use_all_of_the_motors_passes(extra: ModuleType) -> None:
+    taps = np.stack([design_taps([mode(45.0, 0.05)], np.ones(1), 150.0)] * 2)
+    ours = extra.Filter(given(taps), [(-1e3, 1e3)] * 2)
+    ours.rest_at(50.0, 50.0)
+    moves = zigzag(20)
+    ours.block(moves[0][0] - 0.5, moves[-1][0] + 1.0)
+    for move in moves:
+        ours.plan.add(*move)
+    plan = extra.command.Plan()
+    plan.rest_at(50.0, 50.0)
+    for move in moves:
+        plan.add(*move)
+    end = int((moves[-1][0]) / DT_S)
+    x: list[float] = []
+    plan.sample(0, end + 10, DT_S, x, [])
+    for k, _, now, _ in ours.push(end - 2 * FADE):
+        assert now[0] == pytest.approx(x[k], abs=1e-12)
+
+
+def installed(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = ["sh", str(EXTRA / "install.sh"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def klipper(tmp_path: Path) -> Path:
+    (tmp_path / "klippy/extras").mkdir(parents=True)
+    (tmp_path / "klippy/klippy.py").touch()
+    (tmp_path / ".git/info").mkdir(parents=True)
+    return tmp_path
+
+
+def test_the_installer_links_and_takes_away(klipper: Path) -> None:
+    link, exclude = klipper / "klippy/extras/stillpath", klipper / ".git/info/exclude"
+    assert "would run: ln" in installed("-n", "-k", klipper).stdout
+    assert not link.exists()
+    assert not exclude.exists()
+    assert "Linked" in installed("-k", klipper).stdout
+    assert link.resolve() == EXTRA / "stillpath"
+    assert "Nothing to do" in installed("-k", klipper).stdout
+    assert exclude.read_text() == "klippy/extras/stillpath\n"
+    assert "would run: rm" in installed("-u", "-n", "-k", klipper).stdout
+    assert link.is_symlink()
+    assert "Taken away" in installed("-u", "-k", klipper).stdout
+    assert not link.is_symlink()
+    assert installed("-u", "-k", klipper).returncode == 0
+    assert (EXTRA / "stillpath/__init__.py").exists()
+
+
+def test_the_installer_refuses_what_is_no_klipper(tmp_path: Path, klipper: Path) -> None:
+    nowhere = installed("-k", tmp_path / "nothing")
+    assert nowhere.returncode == 2
+    assert "no Klipper in" in nowhere.stderr
+    (klipper / "klippy/extras/stillpath").mkdir()
+    own = installed("-k", klipper)
+    assert own.returncode == 2
+    assert "is no link" in own.stderr
