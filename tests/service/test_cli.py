@@ -36,9 +36,7 @@ def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
         target.write_bytes(b"; compensated\n" + source.read_bytes())
         return make_result(layers=2)
 
-    def simulate_file(
-        source, machine, *, plate=None, dialect=None, cache_dir=None, progress=None, layers=None
-    ):
+    def simulate_file(source, machine, *, plate=None, dialect=None, **_):
         seen.plate, seen.dialect = plate, dialect
         seen.behave()
         return make_result(channels=("before", "shaper"), layers=2)
