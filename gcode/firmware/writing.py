@@ -296,13 +296,13 @@ class StreamWriter:
         lead = self._limits_to(self._voice.in_stream(own))
         lead += self._file_modes(state)
         moves_on = self._is_move(code)
-        ends = self._extruder_word(code) if state.absolute_e else None
+        # Not G10 and G11, whatever words they have: what E reads does not see them.
+        ends = self._extruder_word(code) if state.absolute_e and moves_on else None
         if ends is not None:
             fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
             lead += self._file_extruder(ends - fed)
             self._reads(ends)
         elif self._far_mm is not None and moves_on:
-            # Not G10 and G11: what E reads does not see them.
             fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
             self._reads(self._far_mm + fed / state.extrude_factor)
         if moves_on and not _FEED.search(code):

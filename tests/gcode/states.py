@@ -187,9 +187,9 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
             problems.append("stops inside the stream")
         return problems
     problems += _differ("modal", old.modal, new.modal, 2e-5)
-    # Pressure advance is set again before X or Y moves; until then it makes no difference.
-    moves_xy = new.kind < 0 and (old.moves_xy or old.travels_xy)
-    hidden = () if moves_xy else ("pressure_advance_s",)
+    # Pressure advance is set again before something is printed; until then it makes no difference.
+    prints = new.kind < 0 and (old.moves_xy or old.travels_xy) and old.end_mm[3] > old.start_mm[3]
+    hidden = () if prints else ("pressure_advance_s",)
     problems += _differ("limits", old.limits, new.limits, 1e-6, hidden)
     return problems
 

@@ -41,6 +41,8 @@ _ANYWHERE = re.compile(
     re.IGNORECASE,
 )
 """Lines that we write outside of streams too: standing still, limits, the firmware's shaper."""
+_SHAPER = re.compile(rb"SET_INPUT_SHAPER|M593(?!\d)|M493(?!\d)", re.IGNORECASE)
+"""The file's own line for the shaper, which we repeat, may hold more than that."""
 _IN_STREAM = re.compile(
     _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
     re.IGNORECASE,
@@ -194,7 +196,7 @@ class LastCheck:
             self._after.state,
             self._words,
             self._place_mm,
-            _FILAMENT_MM,
+            self._filament_mm,
         )
         original.line += lines
         written.line += written_lines
@@ -223,7 +225,7 @@ class LastCheck:
             self._check(self._before.state, mask, code, original.line)
             self._count(original.line)
             self._original.skip()
-        elif _ANYWHERE.match(code):
+        elif _ANYWHERE.match(code) or _SHAPER.search(code):
             self._after.carry_out(code)
         else:
             raise self._strange(code, expected)
@@ -246,7 +248,7 @@ class LastCheck:
             wanted.before,
             self._before.state,
             self._place_mm,
-            _FILAMENT_MM,
+            self._filament_mm,
         )
         written.line += lines
         if taken:
@@ -272,7 +274,7 @@ class LastCheck:
         code = code_of(line)
         if code:
             if not self._takes(code, held_back=False):
-                if _IN_STREAM.match(code) is None:
+                if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
                     raise self._strange(code, wanted.code)
                 self._after.carry_out(code)
                 if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
@@ -353,9 +355,14 @@ class LastCheck:
         self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "behind"
     ) -> None:
         """Compare a state of the original with where the written file is."""
-        found = at.compare(before, self._after.state, mask, self._place_mm, _FILAMENT_MM)
+        found = at.compare(before, self._after.state, mask, self._place_mm, self._filament_mm)
         if found != at.SAME:
             raise self._differs(found, before, where, code, line, self._written.line)
+
+    @property
+    def _filament_mm(self) -> float:
+        """By how much E may differ: filament, in units of the file."""
+        return _FILAMENT_MM / self._before.least_flow
 
     def _count(self, line: int) -> None:
         """Count a line that was compared."""
@@ -393,7 +400,7 @@ class LastCheck:
         written_line: int,
     ) -> LastCheckError:
         one, other = float(before[found]), float(self._after.state[found])
-        limit = {at.F: 1e-4, at.RELATIVE: 0.0, at.RELATIVE_E: 0.0}.get(found, _FILAMENT_MM)
+        limit = {at.F: 1e-4, at.RELATIVE: 0.0, at.RELATIVE_E: 0.0}.get(found, self._filament_mm)
         if found < 3:
             limit = float(self._place_mm[found])
         unit = _UNITS[found] and " " + _UNITS[found]

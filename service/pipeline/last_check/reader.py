@@ -29,6 +29,7 @@ _NAME = re.compile(rb"([GMT])(\d+)((?:\.\d+)?)(?![\d.])")
 _LONG_NAME = re.compile(rb"[A-Z_]{2,}[A-Z0-9_]*")
 _LINE_NUMBER = re.compile(rb"N[ \t]*\d+[ \t]*(?![\d.])")
 _SUM = re.compile(rb"\*(\d+)[ \t]*")
+_FLOW = re.compile(rb"S(" + _NUMBER + rb")")
 _FURTHER = re.compile(rb"[GM]-?\d|\{|\x00")
 _CONDITION = re.compile(rb"(?:IF|ELIF|ELSE|WHILE)(?![A-Z0-9_])")
 _STATE_NAME = re.compile(rb"NAME=([A-Z0-9_]+)(?!\S)")
@@ -79,6 +80,8 @@ class Reader:
         self.state[at.UNIT] = 1.0
         self.state[at.RELATIVE_E] = self._says_relative_e = rules.relative_e
         self.lost = b""
+        self.least_flow = 1.0
+        """The smallest flow factor so far (M221): what E says may be many times what is fed."""
         self._saved: dict[bytes, tuple[float, ...]] = {}
         self._pushed: list[tuple[float, ...]] = []
         self._in_plane_xy = True
@@ -136,6 +139,8 @@ class Reader:
         name, rest = cut
         if name in (b"G0", b"G1"):
             return self._move(code, rest)
+        if name == b"M221" and (flow := _FLOW.search(rest)) is not None:
+            self.least_flow = min(self.least_flow, max(0.01 * float(flow[1]), 1e-9))
         if name in rules.harmless or name in _TEXT:
             return self._harmless(code, name, rest), 0
         return self._command(code, name, rest), 0

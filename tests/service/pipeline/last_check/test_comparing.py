@@ -311,3 +311,58 @@ def test_a_file_with_a_fault_is_not_delivered(
     assert run(command) == 1
     assert "stillpath: error: the last check refuses" in capsys.readouterr().err
     assert target.read_bytes() == b"kept"
+
+
+RETRACTED = """\
+G28
+M82
+G1 X117.575 Y125.912 E118.67659 F1500
+G1 X117.495 Y126.33 E118.69074
+G10 X117.425 Y125.912 E118.69352
+G1 X117.498 Y125.015 E118.69934
+G1 X115.557 Y124.761 E118.76445
+G1 X115.396 Y125.644 E118.7943
+G1 X114.774 Y124.437 E118.84481
+G1 X114.277 Y124.231 E3.4
+G1 X113.745 Y124.01 E118.88186
+"""
+SLOW_FLOW = """\
+M221 S0.001
+G1 X121.614 Y122.875 E320.84525
+G1 X120.976 Y123.519 E320.81484
+G1 X121.778 Y121.56 E320.89035
+G0 X118.639 Y120.626
+G0 X118.878 Y120.807
+G1 F1800 X118.606 Y121.167 E320.665
+M105
+G1 X118.38 Y122.034 E320.69506
+"""
+ODD_SHAPER = """\
+GM593 P"none"
+G28
+G1 X60 Y50 F6000
+G1 X80 Y60 E1 F3000
+M11
+G1 X70 Y80 E2
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        # G10 retracts, whatever words it has: they say nothing of where E is.
+        pytest.param("marlin", RETRACTED, id="words of G10"),
+        # What E says is a hundred thousand times what is fed.
+        pytest.param("reprapfirmware", SLOW_FLOW, id="slow flow"),
+        # Repeated as the file's own line for the shaper.
+        pytest.param("reprapfirmware", ODD_SHAPER, id="odd shaper"),
+    ],
+)
+def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache: Path) -> None:
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_text(text)
+    options = Options(method="shaper:mzv")
+    result = compensate_file(source, target, machine_of(kind), options, cache_dir=cache)
+    assert result.pieces > len(result.put_back)
+    assert result.last_check is not None
+    assert result.last_check.kept_lines > 2
