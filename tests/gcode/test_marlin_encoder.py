@@ -232,7 +232,10 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_behind_it(
     assert result.put_back == []
     text = target.read_bytes()
     lines = text.decode().splitlines()
-    on, off = (lines.index(f"; stillpath: stream {word}") for word in ("on", "off"))
+    on, off = (
+        next(i for i, line in enumerate(lines) if line.startswith(f"; stillpath: stream {word}"))
+        for word in ("on", "off")
+    )
     known = [(i, line) for i, line in enumerate(lines) if line.startswith("M900")]
     assert known[0][1] == "M900 K0.05"
     assert {line for i, line in known if on < i < off - 8} == {"M900 K0"}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from models.machine import Machine
 from service.pipeline.last_check import _reader_kernels as at
 from service.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
-from service.pipeline.last_check.reader import Kind, Reader, code_of, tells_times
+from service.pipeline.last_check.reader import NAN, Kind, Reader, code_of, tells_times
 from service.pipeline.last_check.rules import rules_of
 from service.pipeline.result import LastCheckFigures
 
@@ -120,6 +120,8 @@ class LastCheck:
         self._begun: deque[Place] = deque(maxlen=16)
         """Where the original was behind its last lines within the stream."""
         self._wanted: Wanted | None = None
+        self._earlier: deque[bytes] = deque(maxlen=64)
+        """Lines that were taken for the first of several with their text; perhaps they were not."""
         self._kept = self._compared = 0
         self._gap_line = 0
         self._gaps: list[str] = []
@@ -251,6 +253,9 @@ class LastCheck:
             self._filament_mm,
         )
         written.line += lines
+        if taken and wanted.code in self._original.perhaps:
+            self._take_earlier(wanted.code, carried_out=found == at.SAME)
+            return
         if taken:
             if found != at.SAME:
                 is_before = written.data.startswith(wanted.code, written.at)
@@ -275,12 +280,16 @@ class LastCheck:
         if code:
             if not self._takes(code, held_back=False):
                 if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
+                    if self._came_already():
+                        return
                     raise self._strange(code, wanted.code)
                 self._after.carry_out(code)
                 if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
                     self._idle.add(line)
         elif line.startswith(_HELD):
             if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
+                if self._came_already():
+                    return
                 raise self._strange(line, wanted.code)
         elif (off := _OFF.match(line)) is not None:
             self._leave(int(off[1]) if off[1] else ALL)
@@ -289,7 +298,7 @@ class LastCheck:
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
         wanted, perhaps = self._wanted, self._original.perhaps
-        if wanted is not None and _is_same(code, wanted.code):
+        if wanted is not None and _is_same(code, wanted.code) and code not in perhaps:
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
                 # Before it too: where E is absolute, what was fed too much comes back with it.
@@ -305,9 +314,46 @@ class LastCheck:
                 pass
             if not held_back:
                 self._after.carry_out(code)
+            if wanted is not None and _is_same(code, wanted.code):
+                self._earlier.append(wanted.code)
+                self._count_anew()
             self._kept += 1
             return True
         return False
+
+    def _take_earlier(self, code: bytes, *, carried_out: bool) -> None:
+        """Take a line for the first with its text that may be there, not for the one waited for.
+
+        Filament counts anew from the next line that is compared.
+        """
+        written, perhaps = self._written, self._original.perhaps
+        while perhaps.popleft() != code:
+            pass
+        if not carried_out and written.data.startswith(code, written.at):
+            self._after.carry_out(code)
+            written.skip(written.data.index(b"\n", written.at) + 1)
+        self._count_anew()
+        self._earlier.append(code)
+        self._kept += 1
+
+    def _came_already(self) -> bool:
+        """Whether the line that is waited for was taken for an earlier one; go on behind it then."""
+        wanted = self._wanted
+        if wanted is None or wanted.code not in self._earlier:
+            return False
+        self._earlier.remove(wanted.code)
+        self._take(wanted, compared=False)
+        self._kept -= 1
+        self._count_anew()
+        return True
+
+    def _count_anew(self) -> None:
+        """Count filament anew from the next line that is compared."""
+        states = [self._after.state, self._before.state]
+        if self._wanted is not None:
+            states.append(self._wanted.before)
+        for state in states:
+            state[at.FED] = NAN
 
     def _take(self, wanted: Wanted, *, compared: bool) -> None:
         """Go on behind a line that was waited for."""
@@ -324,6 +370,10 @@ class LastCheck:
         """Leave a stream behind which the file goes on with a line of the original."""
         original = self._original
         wanted = self._wanted or original.wanted()
+        while wanted.line < number and wanted.code in self._earlier:
+            self._wanted = wanted
+            self._came_already()
+            wanted = original.wanted()
         if wanted.code and wanted.line < number:
             raise self._missing(wanted.line, wanted.code)
         self._streaming, self._wanted = False, None

@@ -17,7 +17,7 @@ import numpy as np
 from service.pipeline.last_check import _reader_kernels as at
 from service.pipeline.last_check.rules import Rules
 
-__all__ = ["Kind", "Reader", "code_of", "tells_times"]
+__all__ = ["NAN", "Kind", "Reader", "code_of", "tells_times"]
 
 NAN = float("nan")
 _STILL_MM = 1e-6
