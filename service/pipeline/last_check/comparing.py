@@ -337,7 +337,7 @@ class LastCheck:
         self._kept += 1
 
     def _came_already(self) -> bool:
-        """Whether the line that is waited for was taken for an earlier one; go on behind it then."""
+        """Whether the line waited for was taken for an earlier one; go on behind it then."""
         wanted = self._wanted
         if wanted is None or wanted.code not in self._earlier:
             return False

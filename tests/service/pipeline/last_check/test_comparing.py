@@ -345,11 +345,18 @@ G1 X80 Y60 E1 F3000
 M11
 G1 X70 Y80 E2
 """
+REPEATED = (
+    "G28\nM83\nG1 X138 Y110 F2400\nG1 X127.478 Y120.501 E.51697\nG1 X127.478 Y120.501 E.516=7\n"
+    + 3 * ("G1 X138.727 Y109.816 E.5085\n" + 3 * "G1 X127.478 Y120.501 E.51697\n")
+    + "M105\n"
+)
 
 
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
+        # Several lines of one text, and nobody knows which of them moved.
+        pytest.param("marlin", REPEATED, id="repeated"),
         # G10 retracts, whatever words it has: they say nothing of where E is.
         pytest.param("marlin", RETRACTED, id="words of G10"),
         # What E says is a hundred thousand times what is fed.
