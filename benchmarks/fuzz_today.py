@@ -69,7 +69,9 @@ def main() -> int:
                 put_back += outcome.put_back
                 if spent_s[-1] > _MOST_CPU_S:
                     long.append(outcome.print_s)
-                if spent_s[-1] > _MOST_CPU_S + outcome.print_s / _PRINT_S_PER_CPU_S:
+                # A file is tried again without each line that is refused.
+                most_s = _MOST_CPU_S * max(1, len(outcome.refusals))
+                if spent_s[-1] > most_s + outcome.print_s / _PRINT_S_PER_CPU_S:
                     what = f"SLOW: more than {_MOST_CPU_S:g} s of CPU"
             if what is not None:
                 failures[what] = failures.get(what, 0) + 1

@@ -152,8 +152,8 @@ class StreamWriter:
             conflict = self._voice.conflict(line)
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
-            if events.kind[row] != EventKind.SHAPER:
-                continue
+            if events.kind[row] != EventKind.SHAPER or self._is_move(line.split(b";", 1)[0]):
+                continue  # a line that moves too cannot be said again
             self._note_shaper(line, int(events.line[row]))
             form = _VALUE.sub(b"", line.split(b";", 1)[0])
             others = {k: text for k, text in self._shaper_lines.items() if k != form}

@@ -287,8 +287,8 @@ class Reader:
 def code_of(line: bytes) -> bytes:
     """Return a line without blanks around it, or nothing if it holds no command."""
     code = line.strip()
-    if code[:1] == b";" or not code:
-        return b""
+    if code[:1] in (b"", b";", b"*"):
+        return b""  # a sum alone is of no line
     if code[:1] in (b"N", b"n"):
         found = _LINE_NUMBER.match(code.upper())
         if found is not None and code[found.end() : found.end() + 1] in (b"", b";"):
