@@ -41,16 +41,8 @@ if TYPE_CHECKING:
 
 PROGRAM = "stillpath-post"
 _OPTIONS = (
-    "method",
-    "basis",
-    "robust",
-    "along",
-    "tolerance_um",
-    "budget_um",
-    "where",
-    "max_mb",
-    "times",
-    "plate",
+    *("method", "basis", "robust", "along", "tolerance_um", "budget_um"),
+    *("where", "max_mb", "times", "plate"),
 )
 _SETTINGS = ("server", "key", "machine", "method", "reports", "log", "on_error", "timeout", "wait")
 # What slicers call a printer, the most particular name first.
