@@ -14,9 +14,10 @@ from models.jit import kernel
 
 __all__ = ["carry_out_moves", "compare", "compare_moves", "move", "ours", "way_xy_mm"]
 
-X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, SIZE = range(10)
+X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
 """Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
-mm of the file's unit; 1 where coordinates, or those of E, are relative."""
+mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 behind a move of X and Y
+so short that the firmware may carry it out with the next one."""
 SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
 """What `compare` finds: nothing, or the first of a state's numbers that differs."""
 WORDS, WITHIN = 15, 32
@@ -284,11 +285,13 @@ def carry_out_moves(
         if behind < 0:
             break
         way_mm = way_xy_mm(state, words, mask)
-        if not (way_mm == 0.0 or way_mm > shortest_mm):
+        if not (way_mm > shortest_mm or (way_mm == 0.0 and state[WAITS] == 0.0)):
             break
         if way_mm == 0.0:
             for k in range(SIZE):
                 before[k] = state[k]
+        else:
+            state[WAITS] = 0.0
         move(state, words, mask)
         at = behind
         lines += 1

@@ -76,7 +76,7 @@ class Reader:
     def __init__(self, rules: Rules, shortest_mm: float = 0.0) -> None:
         self.rules, self.shortest_mm = rules, max(shortest_mm, _STILL_MM)
         self.state = np.full(at.SIZE, NAN)
-        self.state[[at.E, at.FED, at.RELATIVE]] = 0.0
+        self.state[[at.E, at.FED, at.RELATIVE, at.WAITS]] = 0.0
         self.state[at.UNIT] = 1.0
         self.state[at.RELATIVE_E] = self._says_relative_e = rules.relative_e
         self.lost = b""
@@ -171,10 +171,18 @@ class Reader:
             if letter in words:
                 values[k] = words[letter]
                 mask |= 1 << k
+        z_mm, fed_mm = self.state[[at.Z, at.FED]]
         way_mm = float(at.way_xy_mm.py_func(self.state, values, mask))  # type: ignore[attr-defined]
         at.move.py_func(self.state, values, mask)  # type: ignore[attr-defined]
-        if way_mm == 0.0:
-            return Kind.RESTS if mask & 15 else Kind.STAYS, mask
+        if not mask & at.WORDS:
+            return Kind.STAYS, mask
+        others_mm = max(abs(self.state[at.Z] - z_mm), abs(self.state[at.FED] - fed_mm))
+        waited = self.state[at.WAITS] == 1.0
+        # What waits is carried out with the next move that is long enough, of whatever axis.
+        waits = waited if way_mm == 0.0 else way_mm <= self.shortest_mm
+        self.state[at.WAITS] = float(waits and not others_mm > self.shortest_mm)
+        if way_mm == 0.0 and not waited:
+            return Kind.RESTS, mask
         return Kind.MOVES if way_mm > self.shortest_mm else Kind.PERHAPS, mask
 
     def _arc(self, code: bytes, rest: bytes) -> Kind:

@@ -351,10 +351,19 @@ REPEATED = (
     + "M105\n"
 )
 
+SHORT = (
+    "G28\nM83\nG1 X100 Y100 F2400\nG1 X104 Y100 E.1\nG1 X104 Y104 E.1\n"
+    "G1 X104 Y104.001 E.00003\nG1 X103.999 Y104.002 E.00004\nG1 X103.999 Y104.002 E.00004\n"
+    "G1 X103.998 Y104.002 E.00004\nG1 X103.995 Y104 E.00017\nG1 X103 Y103.6 E.03\nG1 X98 E.1\n"
+    "M105\n"
+)
+
 
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
+        # A line that stands still moves what the short one before it left.
+        pytest.param("marlin", SHORT, id="short"),
         # Several lines of one text, and nobody knows which of them moved.
         pytest.param("marlin", REPEATED, id="repeated"),
         # G10 retracts, whatever words it has: they say nothing of where E is.
