@@ -136,6 +136,9 @@ class Voice(Protocol):
     def file_shaper_off(self) -> bytes:
         """Lines that switch off a shaper that the file has set, whatever the machine states."""
 
+    def advance(self, limits: Limits) -> bytes:
+        """Lines that set pressure advance of the tool in use, if `shaper_off` turns it off."""
+
     def conflict(self, line: bytes) -> str | None:
         """Return why a line must not stand in a file with a stream; None: it may."""
 

@@ -35,7 +35,7 @@ _E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
 _NUMBERED = re.compile(rb"^\s*N\d+\s*")
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
-_NO_SHAPER = "M572"
+_ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
 """Pressure advance, which a stream has off like the shaper (RepRapFirmware)."""
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
@@ -154,11 +154,12 @@ class StreamWriter:
                 raise GcodeError(conflict, line=int(events.line[row]))
             if events.kind[row] != EventKind.SHAPER or self._is_move(line.split(b";", 1)[0]):
                 continue  # a line that moves too cannot be said again
-            self._note_shaper(line, int(events.line[row]))
+            self._shaper_off = False
+            if not self._note_shaper(line, int(events.line[row])):
+                continue
             form = _VALUE.sub(b"", line.split(b";", 1)[0])
             others = {k: text for k, text in self._shaper_lines.items() if k != form}
             self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
-            self._shaper_off = False
         if len(moves):
             last_stop = events.move_index[stops(events)]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
@@ -379,13 +380,15 @@ class StreamWriter:
         self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
-    def _note_shaper(self, line: bytes, number: int) -> None:
+    def _note_shaper(self, line: bytes, number: int) -> bool:
+        """Note a line that sets the shaper; tell whether it does."""
         words = _NUMBERED.sub(b"", line).split()
         name = words[0].decode("ascii", "replace").upper() if words else ""
-        if name.startswith(_NO_SHAPER):
-            return
+        if name.startswith(_ADVANCE):
+            return _FURTHER_SHAPER.search(line) is not None
         first, count = self._shaper_names.get(name, (number, 0))
         self._shaper_names[name] = (first, count + 1)
+        return True
 
     def _on(self, piece: Piece, limits: Limits) -> bytes:
         """Lines before the first segment of a piece."""
@@ -441,7 +444,7 @@ class StreamWriter:
         if self._streaming and self._behind is not None:
             text = b"" if self._at_rest else self._voice.stand_still
             text += self._stream_off(*self._behind, extruder_mm, b"")
-        shaper = self._shaper_on()
+        shaper = self._shaper_on(self._behind[0]) if self._behind is not None else b""
         return text + self._unmarked() + shaper
 
     def _stream_off(
@@ -465,13 +468,14 @@ class StreamWriter:
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(passage.events.kind, _SHAPED)))
         aside = isinstance(passage, LeftOut)  # between streams again and again
-        return self._shaper_on() if (prints and not aside) or foreign else b""
+        on = (prints and not aside) or foreign
+        return self._shaper_on(passage.limits_before) if on else b""
 
     @property
     def _shaper_is_known(self) -> bool:
         return self._voice.shaper_on is not None or bool(self._shaper_lines)
 
-    def _shaper_on(self) -> bytes:
+    def _shaper_on(self, limits: Limits) -> bytes:
         if not self._shaper_off:
             return b""
         self._shaper_off = False
@@ -480,7 +484,9 @@ class StreamWriter:
             self.shaper_unknown = True
             self._shaper_off = True
             return b""
-        return (stated or b"") + b"".join(self._shaper_lines.values())
+        lines = (stated or b"") + b"".join(self._shaper_lines.values())
+        advance = self._voice.advance(limits)
+        return lines if lines.endswith(advance) else lines + advance
 
 
 def _held_back(line: bytes) -> bytes:

@@ -48,6 +48,10 @@ class KlipperVoice:
             f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
         ).encode()
 
+    def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
+        """Return nothing: a stream leaves pressure advance on."""
+        return b""
+
     def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
         """Return None: nothing of Klipper's own stands in the way."""
         return None

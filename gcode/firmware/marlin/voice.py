@@ -76,6 +76,10 @@ class MarlinVoice:
             f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\nM593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
         ).encode()
 
+    def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
+        """Return nothing: a stream leaves pressure advance on."""
+        return b""
+
     def conflict(self, line: bytes) -> str | None:
         """Return why not, for a line that switches fixed-time motion on."""
         if not _FIXED_TIME.match(line) or _FIXED_TIME_OFF.match(line):

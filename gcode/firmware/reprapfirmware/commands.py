@@ -13,6 +13,8 @@ import numpy as np
 from gcode import _slots as at
 from gcode._motion_kernels import set_feed
 from gcode.commands import retract
+from gcode.commands import tool as other_tool
+from gcode.firmware.marlin.commands import reset_limits
 from gcode.lexer import Command
 from gcode.state import MachineState, Saved
 from gcode.types import EventKind
@@ -29,11 +31,13 @@ __all__ = [
     "pop_state",
     "pressure_advance",
     "push_state",
+    "reset",
     "retract_or_offsets",
     "retract_settings",
     "select_plane",
     "special_move",
     "speeds",
+    "tool",
 ]
 
 _MODES = (at.I_ABS_XYZ, at.I_ABS_E)
@@ -93,18 +97,35 @@ def jerk(state: MachineState, command: Command) -> int:
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
-    """M572: S in seconds, D which extruders.
+    """M572: S in seconds, D which extruders, by default those of the tool in use.
 
-    It waits for standstill, and a stream has it off like the shaper.
+    It waits for standstill, and a stream has it off like the shaper. Tool n is taken to have
+    extruder n.
     """
     given = state.numbers(command, "S")
     if given.get("S", -1.0) < 0.0:
         return state.event(EventKind.HARMLESS)
-    drives = command.words.get("D")
-    if drives is not None and str(state.i[at.I_TOOL]) not in drives.strip("{}").split(":"):
-        return state.event(EventKind.SHAPER)
-    values = {"pressure_advance_s": given["S"]}
+    used = str(state.i[at.I_TOOL])
+    extruders = command.words.get("D", used).strip("{}").split(":")
+    state.factors.update((f"advance {extruder}", given["S"]) for extruder in extruders)
+    values = {"pressure_advance_s": given["S"]} if used in extruders else {}
     return state.set_limits(command, values, remember=False, kind=EventKind.SHAPER)
+
+
+def reset(state: MachineState, command: Command) -> int:
+    """M501 and M502, of all tools."""
+    state.factors = {k: v for k, v in state.factors.items() if not k.startswith("advance ")}
+    return reset_limits(state, command)
+
+
+def tool(state: MachineState, command: Command) -> int:
+    """T: another tool, whose extruder has a pressure advance of its own."""
+    found = other_tool(state, command)
+    row, column = state.initial_limits, state.limits_names.index("pressure_advance_s")
+    key = f"advance {state.i[at.I_TOOL]}"
+    state.f[at.F_LIMITS + column] = state.factors.get(key, row[column])
+    state.note_limits()
+    return found
 
 
 def extrude_factor(state: MachineState, command: Command) -> int:

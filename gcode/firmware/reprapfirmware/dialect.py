@@ -5,7 +5,7 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from gcode.commands import cancel_object, home, retract, tool
+from gcode.commands import cancel_object, home, retract
 from gcode.dialect import (
     Action,
     ArcRule,
@@ -16,7 +16,7 @@ from gcode.dialect import (
     Word,
     words,
 )
-from gcode.firmware.marlin.commands import filament_area, reset_limits, unheeded
+from gcode.firmware.marlin.commands import filament_area, unheeded
 from gcode.firmware.reprapfirmware import commands
 from gcode.types import EventKind
 from gcode.workspaces import machine_space, save_place, select_workspace
@@ -50,7 +50,7 @@ MOTION: dict[str, Word] = {
     "M452": commands.machine_mode,
     "M453": commands.machine_mode,
     "M486": cancel_object,
-    "T": tool,
+    "T": commands.tool,
 }
 
 ARCS: dict[str, Word] = {
@@ -108,7 +108,7 @@ STEPS: dict[str, Word] = {
             EventKind.UNKNOWN, "from here on the position is not known until the printer homes"
         ),
     ),
-    **words("M501 M502", reset_limits),
+    **words("M501 M502", commands.reset),
     "M563": commands.define_tool,
     "M92": unheeded(EventKind.STOP, "steps per mm are taken from the machine"),
     "M593": EventKind.SHAPER,

@@ -50,6 +50,10 @@ class RepRapVoice:
             restored = f'M593 P"{shaper.type}" F{shaper.freq_hz:g} S{shaper.damping:g}\n'
         self.shaper_on: bytes | None = restored.encode() + _advance(pressure_advance_s)
 
+    def advance(self, limits: Limits) -> bytes:
+        """Return M572 for the tool in use."""
+        return _advance(cast(RepRapLimits, limits).pressure_advance_s)
+
     def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
         """Return None: nothing of RepRapFirmware's own stands in the way."""
         return None
