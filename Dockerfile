@@ -10,11 +10,16 @@ WORKDIR /src
 COPY requirements.lock ./
 RUN /opt/stillpath/bin/pip install --require-hashes -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
+COPY src src
 COPY models models
 COPY gcode gcode
-COPY simulation simulation
 COPY compensation compensation
+COPY simulation simulation
+COPY pipeline pipeline
+COPY reports reports
+COPY applications applications
 COPY service service
+COPY cli cli
 COPY integrations/slicers integrations/slicers
 RUN python -m pip wheel --no-deps --wheel-dir /dist . \
     && /opt/stillpath/bin/pip install --no-deps /dist/stillpath-*.whl

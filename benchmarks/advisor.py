@@ -21,15 +21,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from gcode.errors import GcodeError
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.advising.inserting import MARK
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.result import Result
-from service.pipeline.road import compensate_file
-from service.pipeline.yardstick import cached_shaper
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.advising.inserting import MARK
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
 from tests.e2e.round_trip import corpus_files, corpus_folder, excerpt, made_to_fit, text_of
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -27,15 +27,15 @@ from numpy.typing import NDArray
 from readback import DT_S, WINDOW_S, Aligned, Motion, Own, Timed, forced_stops, read_motion
 from scipy.linalg import expm
 
-from models.machine import Machine
-from models.plants import Mode, ModesSpec, RelativeModesSpec
-from models.response_kernels import dense_response
-from models.schedule import AxisSchedule, MassSchedule
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from simulation.measures import Tally, distance_to_path
+from stillpath.models.machine import Machine
+from stillpath.models.plants import Mode, ModesSpec, RelativeModesSpec
+from stillpath.models.response_kernels import dense_response
+from stillpath.models.schedule import AxisSchedule, MassSchedule
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
+from stillpath.simulation.measures import Tally, distance_to_path
 
 Array = NDArray[np.float64]
 

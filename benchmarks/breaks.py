@@ -25,17 +25,17 @@ import numpy as np
 from firmwares import machine_with, without_macros
 from readback import find_input, plain_copy, shared_folder
 
-from gcode.errors import GcodeError
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.sampler import sample_phases
-from gcode.types import Limits, Moves, rows_of
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import Limits, Moves, rows_of
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.e2e.round_trip import corpus_files, corpus_folder, made_to_fit, text_of

@@ -43,13 +43,13 @@ from readback import (
     shared_folder,
 )
 
-from gcode.sampler import sample_phases
-from gcode.types import Phases
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.result import BudgetClass
-from service.pipeline.road import compensate_file
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import Phases
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import BudgetClass
 
 Array = NDArray[np.float64]
 

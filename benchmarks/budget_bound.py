@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from readback import find_input, plain_copy, shared_folder
 
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter
-from gcode.pieces import Piece, Splitter
-from gcode.quickening import AS_SLICED, FirstLayer, Pace, move_classes, quickened
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pacing import AS_SLICED, FirstLayer, Pace, move_classes, quickened
+from stillpath.gcode.pieces import Piece, Splitter
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 
 FILES = (
     "cura_ender3_gear24",

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from readback import shared_folder
 
-from models.identification.readers import ReadSettings
-from models.machine import Machine
-from models.store import load_machine
-from service.identification.run import InputFile, identify_files
+from stillpath.applications.identification.run import InputFile, identify_files
+from stillpath.models.identification.readers import ReadSettings
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 
 LIBRARY = Path(__file__).resolve().parent.parent / "models" / "library"
 TABLES = {

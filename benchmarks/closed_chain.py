@@ -41,24 +41,24 @@ from readback import (
 )
 from scipy.signal import ss2zpk
 
-from models.errors import ModelError
-from models.friction import DryFriction
-from models.identification.identify import Measured, identify
-from models.identification.readers import ReadSettings, read_content
-from models.identification.shaper_choice import choose_shaper_of
-from models.identification.types import AccelerationLog, Spectrum
-from models.machine import Machine
-from models.plants import PlantSetSpec, ZpkSpec, plant_set
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from service.pipeline.yardstick import tune_shaper
-from simulation.measures import distance_to_path
-from simulation.printers.bodies import Bodies
-from simulation.printers.drawing import KINDS, draw
-from simulation.printers.machines import Printer
-from simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
-from simulation.response import response
+from stillpath.models.errors import ModelError
+from stillpath.models.friction import DryFriction
+from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.shaper_choice import choose_shaper_of
+from stillpath.models.identification.types import AccelerationLog, Spectrum
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSetSpec, ZpkSpec, plant_set
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.measuring.reference_shaper import tune_shaper
+from stillpath.pipeline.options import Options
+from stillpath.simulation.measures import distance_to_path
+from stillpath.simulation.printers.bodies import Bodies
+from stillpath.simulation.printers.drawing import KINDS, draw
+from stillpath.simulation.printers.machines import Printer
+from stillpath.simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
+from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
 

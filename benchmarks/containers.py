@@ -17,9 +17,9 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from gcode.containers.bgcode import Encoding
-from gcode.containers.compression import Compression
-from gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.containers.bgcode import Encoding
+from stillpath.gcode.containers.compression import Compression
+from stillpath.gcode.containers.opening import open_text, rewriting
 
 _PRINT = b"G28\n"
 

@@ -16,11 +16,11 @@ import tempfile
 import time
 from pathlib import Path
 
-from gcode.errors import GcodeError
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.e2e.round_trip import corpus_files, corpus_folder, excerpt, flaws, made_to_fit, text_of
 
 

@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
 
-from gcode.pieces import Piece
-from gcode.sampler import sample_phases
-from gcode.slicers.facts import SlicerFacts
-from gcode.types import Phases
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline import road
-from service.pipeline.compensating import CompensatedPiece
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.passages import last_length_mm
-from service.pipeline.result import Result
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline import road
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.pass_through import last_length_mm
+from stillpath.pipeline.piece_compensator import CompensatedPiece
+from stillpath.pipeline.result import Result
 
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")

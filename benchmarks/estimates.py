@@ -17,15 +17,15 @@ from pathlib import Path
 
 from readback import shared_folder
 
-from gcode.containers.opening import open_text
-from gcode.errors import GcodeError
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.slicers.estimator import estimated_s, rules_of
-from gcode.slicers.facts import SlicerFacts, read_facts
-from models.firmware.marlin import Marlin, MarlinPlanner, PerAxis, PerAxisLimit
-from models.machine import AxisTravel, Machine
-from models.store import load_machine
+from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.slicers.estimator import estimated_s, rules_of
+from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
+from stillpath.models.firmware.marlin import Marlin, MarlinPlanner, PerAxis, PerAxisLimit
+from stillpath.models.machine import AxisTravel, Machine
+from stillpath.models.store import load_machine
 
 GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"
 _REASONS = {

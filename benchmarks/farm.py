@@ -59,12 +59,12 @@ def main() -> int:
 def here(
     files: Path, output: Path, machine: str, workers: int, limit: int | None = None
 ) -> tuple[float, float]:
-    from service.farm.batch import run_batch
-    from service.farm.crew import Here, crew
-    from service.farm.items import Group, items_of
-    from service.farm.output import OutputFolder
-    from service.machines.commands import open_machines
-    from service.pipeline.options import Options
+    from stillpath.cli.batch.batch import run_batch
+    from stillpath.cli.batch.items import Group, items_of
+    from stillpath.cli.batch.output import OutputFolder
+    from stillpath.cli.batch.worker_pool import Here, crew
+    from stillpath.cli.machines import open_machines
+    from stillpath.pipeline.options import Options
 
     options = Options()
     items = items_of([files], Group((machine,)), output=output)[:limit]
@@ -85,8 +85,8 @@ def here(
 
 
 def service(files: Path, output: Path, machine: str, workers: int) -> tuple[float, float]:
-    from service.client import Client
-    from service.farm.server import batch_name
+    from stillpath.cli.batch.server import batch_name
+    from stillpath.service.client import Client
 
     with server(output.with_suffix(".data"), workers) as (address, pid):
         command = ["batch", str(files), "-m", machine, "-o", str(output), "--server", address]
@@ -114,7 +114,7 @@ def server(data: Path, workers: int) -> Iterator[tuple[str, int]]:
 
 
 def stillpath(*arguments: str) -> list[str]:
-    return [sys.executable, "-c", "from service.cli import main; main()", *arguments]
+    return [sys.executable, "-c", "from cli.main import main; main()", *arguments]
 
 
 def environment() -> dict[str, str]:

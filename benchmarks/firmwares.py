@@ -20,13 +20,13 @@ from emission import watched
 from quality import FILES, MACHINES, Row, Task, judged
 from readback import find_input, plain_copy, shared_folder
 
-from models.firmware import Marlin, RepRapFirmware
-from models.firmware.marlin import MarlinPlanner, PerAxis, PerAxisLimit
-from models.firmware.reprapfirmware import Drive, RepRapExtruder
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
+from stillpath.models.firmware import Marlin, RepRapFirmware
+from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis, PerAxisLimit
+from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
 
 _LEAST_WITHIN = 0.99
 

@@ -31,8 +31,8 @@ if "--bounds-check" in sys.argv:
     os.environ["NUMBA_BOUNDSCHECK"] = "1"
     os.environ["NUMBA_CACHE_DIR"] = str(Path(tempfile.gettempdir()) / "stillpath-bounds-numba")
 
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 from tests.fuzz.checks import roomy, walk
 from tests.fuzz.mutations import excerpts
 

@@ -25,11 +25,11 @@ import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from gcode.errors import GcodeError
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.fuzz.hostile import HOSTILE, pieces
 from tests.fuzz.machines import KINDS, machine_of
 

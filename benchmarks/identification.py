@@ -30,11 +30,12 @@ from readback import (
     shared_folder,
 )
 
-from models.identification.identify import Measured, identify
-from models.identification.readers import excitation_for, read_measurements
-from models.identification.shaper_choice import choose_shaper_of
-from models.identification.spectrum_fit import fit_spectrum
-from models.identification.synthetic import (
+from stillpath.applications.identification.run import InputFile, identify_files
+from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.readers import excitation_for, read_measurements
+from stillpath.models.identification.shaper_choice import choose_shaper_of
+from stillpath.models.identification.spectrum_fit import fit_spectrum
+from stillpath.models.identification.synthetic import (
     ADXL345,
     LIS2DW,
     Sensor,
@@ -42,14 +43,13 @@ from models.identification.synthetic import (
     simulate_spectrum,
     write_raw_data,
 )
-from models.identification.types import Excitation, Fit, Spectrum
-from models.machine import Machine
-from models.plants import PairsSpec, PlantSpec, PolePair, ZeroPair, continuous
-from models.store import load_machine
-from service.identification.run import InputFile, identify_files
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.models.identification.types import Excitation, Fit, Spectrum
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PairsSpec, PlantSpec, PolePair, ZeroPair, continuous
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
 
 OLD = Excitation((1.0, 0.0), f_end_hz=10000 / 75, accel_per_hz_mm_s=75.0, sweeping_accel_mm_s2=0.0)
 NEW = Excitation((1.0, 0.0))

@@ -21,10 +21,10 @@ import time
 from pathlib import Path
 
 from benchmarks.readback import shared_folder
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from models.store import load_machine
-from service.environment import prepare_environment
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.models.store import load_machine
+from stillpath.service.environment import prepare_environment
 
 PIECE = 1 << 18
 ROUNDS = 3

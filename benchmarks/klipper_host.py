@@ -13,9 +13,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.integrations.interrupted import EVENTS, ONCE, asked, disturbed, homed, run, two_objects
 from tests.integrations.klipper_host import PYTHON
 

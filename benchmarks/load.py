@@ -117,7 +117,7 @@ def main() -> int:
 
 @contextlib.contextmanager
 def server(data: Path, workers: int) -> Iterator[Server]:
-    command = [sys.executable, "-c", "from service.cli import main; main()", "serve"]
+    command = [sys.executable, "-c", "from cli.main import main; main()", "serve"]
     command += ["--port", "0", "--data-dir", str(data), "--workers", str(workers)]
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
@@ -149,7 +149,7 @@ def wait_until_ready(address: str) -> None:
 
 def uploads(running: Server, table: Table, given: argparse.Namespace, folder: Path) -> None:
     """Hand in many different files at once, while the workers have all they can do."""
-    from service.client import Client
+    from stillpath.service.client import Client
 
     size = given.megabytes * MB
     text = (PART.read_bytes() * (size // PART.stat().st_size + 1))[: size - 64]
@@ -271,7 +271,7 @@ def huge(running: Server, table: Table, size: int) -> None:
 
 async def watchers(running: Server, table: Table, count: int) -> None:
     """Watch one job by many streams, and count the events that come."""
-    from service.client import Client
+    from stillpath.service.client import Client
 
     with Client(running.address) as client:
         job_id = client.submit(PART, machine="ender3", fresh=True, name="watched.gcode").id

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from readback import read_motion, shared_folder
 
-from gcode.types import Phases
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 
 GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.json"
 _COLUMNS = "t accel_t cruise_t decel_t start_x start_y start_z r_x r_y r_z start_v cruise_v accel"

@@ -38,17 +38,17 @@ from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.special import expit
 
-from compensation._preview_kernels import run_windows
-from compensation.base import DesignError
-from compensation.basis import BASES
-from compensation.fbf import PreviewFbf
-from compensation.lifted_window import lifted_window
-from compensation.preview import PreviewDesign
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
-from models.reference_motion import reference_motion
-from models.store import builtin_machines, load_machine
-from simulation.measures import contour_error, tracking_error
-from simulation.response import response
+from stillpath.compensation._preview_kernels import run_windows
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES
+from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.lifted_window import lifted_window
+from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import builtin_machines, load_machine
+from stillpath.simulation.measures import contour_error, tracking_error
+from stillpath.simulation.response import response
 
 __all__ = [
     "CASES",

@@ -11,13 +11,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-from models.machine import Machine
-from models.store import builtin_machines, load_machine
-from service.pipeline.files import default_cache_dir
-from service.proof.coupon import coupon_program, write_coupon
-from service.proof.drive import ringing_mode
-from service.proof.program import PrintSettings
-from service.proof.tower import write_tower
+from stillpath.applications.proof.coupon import coupon_program, write_coupon
+from stillpath.applications.proof.drive import ringing_mode
+from stillpath.applications.proof.program import PrintSettings
+from stillpath.applications.proof.tower import write_tower
+from stillpath.models.machine import Machine
+from stillpath.models.store import builtin_machines, load_machine
+from stillpath.pipeline.files import default_cache_dir
 
 _SHARE = 3.0
 

@@ -43,12 +43,12 @@ from readback import (
     shared_folder,
 )
 
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from service.pipeline.yardstick import BestShaper, tune_shaper
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_shaper
+from stillpath.pipeline.options import Options
 
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")

@@ -18,16 +18,16 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.shapers import shape, shaper_pulses
-from gcode.firmware.planning import STOPPING, intended, join_phases
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.sampler import sample_phases
-from gcode.types import Moves, Phases
-from models.machine import Machine
-from models.plants import plant_set
-from simulation.measures import Tally, distance_to_path
-from simulation.response import PlantStream
+from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.simulation.measures import Tally, distance_to_path
+from stillpath.simulation.response import PlantStream
 
 __all__ = [
     "DT_S",

@@ -27,11 +27,11 @@ from readback import (
     shared_folder,
 )
 
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
 
 FILES = (
     "cura_ender3_gear24",

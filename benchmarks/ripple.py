@@ -19,17 +19,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from compensation.base import DesignError
-from compensation.feedback.repetitive import InternalModel
-from compensation.ripple import PassThrough, RippleCompensator
-from models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
-from models.machine import CommandLimits, Machine
-from models.plants import Mode, ModesSpec, PlantSetSpec, continuous
-from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource, RippleTable
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from simulation.response import response
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.repetitive import InternalModel
+from stillpath.compensation.ripple import PassThrough, RippleCompensator
+from stillpath.models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
+from stillpath.models.ripple import (
+    AxisRipple,
+    RippleHarmonic,
+    RippleSide,
+    RippleSource,
+    RippleTable,
+)
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
 Row = tuple[str, str, str]

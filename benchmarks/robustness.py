@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_folder
 
-from compensation.base import DesignError
-from compensation.registry import compensator
-from compensation.shapers import SHAPERS, shape, shaper_pulses
-from models.machine import Machine
-from models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
-from models.reference_motion import reference_motion
-from models.store import load_machine
-from service.pipeline.yardstick import FREQUENCIES_HZ
-from simulation.measures import distance_to_path, tracking_error
-from simulation.response import response
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.models.machine import Machine
+from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
+from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.simulation.measures import distance_to_path, tracking_error
+from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
 Figure = Callable[[Array], float]

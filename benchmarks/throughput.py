@@ -25,12 +25,12 @@ from pathlib import Path
 
 from readback import find_input, plain_copy, shared_folder
 
-from models.store import load_machine
-from service.environment import prepare_environment
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from service.reports import write_report
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
+from stillpath.reports import write_report
+from stillpath.service.environment import prepare_environment
 
 _ROOT = Path(__file__).resolve().parent.parent
 _FILE, _SPARE = "ps_voron_klipper_ringing", _ROOT / "examples" / "cura_ender3_gear24.gcode"

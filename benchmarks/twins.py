@@ -35,12 +35,12 @@ from readback import (
     shared_folder,
 )
 
-from models.machine import Machine
-from models.plants import PlantSetSpec, RelativeModesSpec
-from models.store import load_machine
-from service.pipeline.files import default_cache_dir
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSetSpec, RelativeModesSpec
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.options import Options
 
 MACHINES = {
     "ender3": "ender3",

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from readback import find_input, plain_copy, shared_folder
 
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.options import Options, Where
-from service.pipeline.result import Result
-from service.pipeline.road import compensate_file
-from service.pipeline.selection import Selection
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options, Where
+from stillpath.pipeline.result import Result
+from stillpath.pipeline.selection import Selection
 
 FILES = (
     "cura_ender3_gear24",

@@ -2,9 +2,10 @@
 
     python benchmarks/yardsticks.py [--write]
 
-Prints machine, revision, shaper and error, and whether `service/pipeline/yardsticks.json` says
-the same; exits with 1 if it does not. With `--write` the file is made anew: after a change of a
-built-in machine, of the reference motion or of what the best shaper is.
+Prints machine, revision, shaper and error, and whether
+`pipeline/measuring/reference_shapers.json` says the same; exits with 1 if it does not. With
+`--write` the file is made anew: after a change of a built-in machine, of the reference motion or of
+what the best shaper is.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from models.reference_motion import reference_motion
-from models.store import builtin_machines, load_machine
-from service.pipeline import yardstick
-from service.pipeline.files import replacing
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import builtin_machines, load_machine
+from stillpath.pipeline import yardstick
+from stillpath.pipeline.files import replacing
 
 FILE = Path(yardstick.__file__).with_name("yardsticks.json")
 DT_S = 1e-3

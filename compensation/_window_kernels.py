@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._least_squares_kernels import (
+from stillpath.compensation._least_squares_kernels import (
     add_row,
     backward,
     factorise,
     forward,
     weighted_gram,
 )
-from compensation._preview_kernels import advance_window, run_windows
-from models.jit import kernel
+from stillpath.compensation._preview_kernels import advance_window, run_windows
+from stillpath.models.jit import kernel
 
 __all__ = [
     "Functions",

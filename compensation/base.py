@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from models.schedule import OperatingPoint
+from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Compensator", "DesignError", "Memoryless"]
 

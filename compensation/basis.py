@@ -14,9 +14,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.lifted import LiftedSet
-from compensation.operators import LiftedOperator
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted import LiftedSet
+from stillpath.compensation.operators import LiftedOperator
 
 __all__ = [
     "BASES",

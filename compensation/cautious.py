@@ -4,7 +4,7 @@ Where the members of a set disagree, inverting the plant that lies in the middle
 worse; a shaper, which is symmetric and only smooths, does little good and little harm to any. Plant
 and command are linear, so the error of a mixture of both commands is the mixture of their errors,
 member by member: how much to take of each is a question with a number for an answer
-(`service.pipeline.caution`).
+(`pipeline.caution`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.fbf import PreviewFbf
-from compensation.shapers import ShaperCompensator
-from models.machine import Machine
-from models.schedule import OperatingPoint
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Caution", "CautiousFbf"]
 

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.basis import BASES
-from compensation.minimax import guarded_weights
-from compensation.preview_axis import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES
+from stillpath.compensation.minimax import guarded_weights
+from stillpath.compensation.preview_axis import (
     GENTLE_RUNG,
     LADDER,
     WEIGHT_REST,
@@ -31,11 +31,11 @@ from compensation.preview_axis import (
     designs,
     functions_within,
 )
-from compensation.sliding import balanced_weights, slide
-from compensation.window_problem import Bounds, Extremes
-from models.machine import Machine
-from models.plants import DiscretePlant, PlantSet, plant_set
-from models.schedule import OperatingPoint
+from stillpath.compensation.sliding import balanced_weights, slide
+from stillpath.compensation.window_problem import Bounds, Extremes
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
+from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["LADDER", "ROBUST", "PreviewFbf", "Rung"]
 

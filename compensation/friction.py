@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import Compensator
-from compensation.holds import stand_still
-from compensation.overlay import Overlay
-from models.friction import bend_of
-from models.machine import Machine
+from stillpath.compensation.base import Compensator
+from stillpath.compensation.holds import stand_still
+from stillpath.compensation.overlay import Overlay
+from stillpath.models.friction import bend_of
+from stillpath.models.machine import Machine
 
 __all__ = ["FrictionCompensator", "against_friction"]
 

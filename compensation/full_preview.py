@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular, svdvals
 
-from compensation.base import DesignError
-from compensation.basis import TOLERANCE
-from compensation.lifted import LiftedSet, checked_weights, free_response, lift
-from compensation.operators import LiftedOperator
-from models.plants import DiscretePlant
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import TOLERANCE
+from stillpath.compensation.lifted import LiftedSet, checked_weights, free_response, lift
+from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.plants import DiscretePlant
 
 __all__ = [
     "RANK_TOLERANCE",

@@ -36,8 +36,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter, sosfilt, zpk2sos
 
-from compensation.base import DesignError
-from models.plants import DiscretePlant
+from stillpath.compensation.base import DesignError
+from stillpath.models.plants import DiscretePlant
 
 __all__ = ["KINDS", "NEAR_CIRCLE", "Inversion", "TwoSidedFilter", "invert"]
 

@@ -12,11 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError, Memoryless
-from compensation.holds import stand_still
-from compensation.inversion import Inversion, invert
-from models.machine import Machine
-from models.plants import DiscretePlant, plant_set
+from stillpath.compensation.base import DesignError, Memoryless
+from stillpath.compensation.holds import stand_still
+from stillpath.compensation.inversion import Inversion, invert
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, plant_set
 
 __all__ = ["InversionCompensator", "zero_phase_fir"]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from compensation.operators import LiftedOperator, TimeVaryingOperator, ToeplitzOperator
-from models.plants import DiscretePlant
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.operators import LiftedOperator, TimeVaryingOperator, ToeplitzOperator
+from stillpath.models.plants import DiscretePlant
 
 __all__ = [
     "LiftedSet",

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, toeplitz
 
-from compensation.base import DesignError
-from compensation.lifted import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted import (
     LiftedSet,
     check_stable,
     checked_weights,
@@ -24,7 +24,7 @@ from compensation.lifted import (
     integrated,
     lifted_set,
 )
-from models.plants import DiscretePlant
+from stillpath.models.plants import DiscretePlant
 
 __all__ = ["Condensed", "LiftedWindow", "condensed", "lifted_window"]
 

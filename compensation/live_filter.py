@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from models.plants import DiscretePlant
-from models.shaper_pulses import Pulses
+from stillpath.models.plants import DiscretePlant
+from stillpath.models.shaper_pulses import Pulses
 
 __all__ = ["FADE", "REACH", "LiveFilter", "design_taps", "shaper_taps"]
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from compensation.lifted import LiftedSet
-from compensation.operators import LiftedOperator
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted import LiftedSet
+from stillpath.compensation.operators import LiftedOperator
 
 __all__ = [
     "best_number",

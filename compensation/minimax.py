@@ -17,8 +17,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from models.plants import PlantSet
+from stillpath.compensation.base import DesignError
+from stillpath.models.plants import PlantSet
 
 __all__ = ["guarded_weights", "member_errors", "path_spectrum", "worst_case_weights"]
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.basis import TOLERANCE, orthonormal, robust_functions, spread_functions
-from compensation.lifted import LiftedSet
-from compensation.metrics import best_number
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import TOLERANCE, orthonormal, robust_functions, spread_functions
+from stillpath.compensation.lifted import LiftedSet
+from stillpath.compensation.metrics import best_number
 
 __all__ = ["PSEUDO_INVERSE_TOLERANCE", "TwoStep", "lifted_optimum", "spread_gram", "two_step"]
 

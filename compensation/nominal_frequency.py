@@ -30,10 +30,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from compensation.lifted import checked_weights
-from compensation.operators import ToeplitzOperator
-from models.plants import DiscretePlant
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted import checked_weights
+from stillpath.compensation.operators import ToeplitzOperator
+from stillpath.models.plants import DiscretePlant
 
 __all__ = [
     "CAUSAL_SHARE",

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import toeplitz
 
-from compensation._lifted_kernels import run_adjoint, run_forward
-from compensation.base import DesignError
+from stillpath.compensation._lifted_kernels import run_adjoint, run_forward
+from stillpath.compensation.base import DesignError
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import LinearOperator

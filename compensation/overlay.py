@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import Compensator
-from models.machine import Machine
-from models.schedule import OperatingPoint
+from stillpath.compensation.base import Compensator
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
 
 __all__ = ["Overlay"]
 

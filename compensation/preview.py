@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 
-from compensation._least_squares_kernels import BLOCK
-from compensation.base import DesignError
-from compensation.basis import BASES
-from compensation.lifted_window import LiftedWindow
+from stillpath.compensation._least_squares_kernels import BLOCK
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES
+from stillpath.compensation.lifted_window import LiftedWindow
 
 __all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "running_gram"]
 

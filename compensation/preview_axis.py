@@ -9,21 +9,21 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._preview_kernels import advance_state, advance_window
-from compensation._window_kernels import Functions, Memory, Stepping, solve_windows
-from compensation.base import DesignError
-from compensation.basis import BASES, ce_opt_basis, robust_basis
-from compensation.lifted_window import LiftedWindow, condensed, lifted_window
-from compensation.preview import PreviewDesign
-from compensation.window_problem import (
+from stillpath.compensation._preview_kernels import advance_state, advance_window
+from stillpath.compensation._window_kernels import Functions, Memory, Stepping, solve_windows
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES, ce_opt_basis, robust_basis
+from stillpath.compensation.lifted_window import LiftedWindow, condensed, lifted_window
+from stillpath.compensation.preview import PreviewDesign
+from stillpath.compensation.window_problem import (
     TRAVEL_SLACK_MM,
     Bounds,
     functions_of,
     refusing_singular,
     within_bounds,
 )
-from models.plants import DiscretePlant
-from models.response_kernels import dense_response
+from stillpath.models.plants import DiscretePlant
+from stillpath.models.response_kernels import dense_response
 
 __all__ = [
     "BAND_MARGIN",

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from compensation.base import Compensator, DesignError
-from models.machine import Machine
+from stillpath.compensation.base import Compensator, DesignError
+from stillpath.models.machine import Machine
 
 __all__ = ["COMPENSATORS", "INVERSIONS", "compensator"]
 
@@ -31,36 +31,36 @@ def compensator(name: str, machine: Machine, dt_s: float, **settings: Any) -> Co
         If there is no such compensator or it cannot be designed for this machine.
     """
     if name.endswith(_RIPPLE):
-        from compensation.ripple import PassThrough, RippleCompensator
+        from stillpath.compensation.ripple import PassThrough, RippleCompensator
 
         within = name.removesuffix(_RIPPLE)
         plain = within == "none"
         inner = PassThrough() if plain else compensator(within, machine, dt_s, **settings)
         return RippleCompensator(inner, machine, dt_s)
     if name == "fbf" and any(machine.friction_mm):
-        from compensation.friction import FrictionCompensator
+        from stillpath.compensation.friction import FrictionCompensator
 
         inner = compensator(name, machine.without_friction(), dt_s, **settings)
         return FrictionCompensator(inner, machine, dt_s)
     if machine.schedules:
-        from compensation.scheduled import ScheduledCompensator
+        from stillpath.compensation.scheduled import ScheduledCompensator
 
         return ScheduledCompensator(
             machine, lambda then: compensator(name, then, dt_s, **settings), dt_s
         )
     if name == "fbf":
-        from compensation.cautious import CautiousFbf
-        from compensation.fbf import PreviewFbf
+        from stillpath.compensation.cautious import CautiousFbf
+        from stillpath.compensation.fbf import PreviewFbf
 
         caution = settings.pop("caution", None)
         exact = PreviewFbf(machine, dt_s, **settings)
         return exact if caution is None else CautiousFbf(exact, machine, dt_s, caution)
     if name in INVERSIONS:
-        from compensation.inverting import InversionCompensator
+        from stillpath.compensation.inverting import InversionCompensator
 
         return InversionCompensator(machine, dt_s, kind=name, **settings)
     if name.startswith("shaper:"):
-        from compensation.shapers import ShaperCompensator
+        from stillpath.compensation.shapers import ShaperCompensator
 
         shaper = name.removeprefix("shaper:")
         return ShaperCompensator(machine, dt_s, shaper=shaper, **settings)

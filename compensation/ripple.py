@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import firwin
 
-from compensation.base import Compensator, DesignError, Memoryless
-from compensation.holds import stand_still
-from compensation.inversion import Inversion, invert
-from compensation.overlay import Overlay
-from models.machine import Machine
-from models.plants import DiscretePlant, plant_set
-from models.ripple import MachineRipple, RippleTable
+from stillpath.compensation.base import Compensator, DesignError, Memoryless
+from stillpath.compensation.holds import stand_still
+from stillpath.compensation.inversion import Inversion, invert
+from stillpath.compensation.overlay import Overlay
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, plant_set
+from stillpath.models.ripple import MachineRipple, RippleTable
 
 __all__ = [
     "PassThrough",

@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import Compensator, DesignError
-from models.machine import Machine
-from models.operating import OperatingGrid, machine_at
-from models.schedule import EMPTY, OperatingPoint
+from stillpath.compensation.base import Compensator, DesignError
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.schedule import EMPTY, OperatingPoint
 
 __all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "ScheduledCompensator"]
 

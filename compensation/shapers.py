@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._shaper_kernels import add_delayed
-from compensation.base import DesignError, Memoryless
-from compensation.holds import stand_still
-from models import shaper_pulses as firmware
-from models.errors import ModelError
-from models.machine import Machine
-from models.plants import plant_set
-from models.shaper_pulses import SHAPERS, Pulses
+from stillpath.compensation._shaper_kernels import add_delayed
+from stillpath.compensation.base import DesignError, Memoryless
+from stillpath.compensation.holds import stand_still
+from stillpath.models import shaper_pulses as firmware
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.shaper_pulses import SHAPERS, Pulses
 
 __all__ = ["SHAPERS", "ShaperCompensator", "shape", "shaper_pulses"]
 

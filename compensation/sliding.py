@@ -17,18 +17,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._sliding_kernels import contour_square, move_targets
-from compensation.lifted_window import lifted_window
-from compensation.preview_axis import (
+from stillpath.compensation._sliding_kernels import contour_square, move_targets
+from stillpath.compensation.lifted_window import lifted_window
+from stillpath.compensation.preview_axis import (
     WEIGHT_TRAVEL,
     AxisCommand,
     AxisTask,
     Designs,
     PreviewAxis,
 )
-from compensation.window_problem import Bounds
-from models.plants import DiscretePlant
-from models.reference_motion import reference_motion
+from stillpath.compensation.window_problem import Bounds
+from stillpath.models.plants import DiscretePlant
+from stillpath.models.reference_motion import reference_motion
 
 __all__ = ["balanced_weights", "slide"]
 

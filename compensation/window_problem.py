@@ -21,7 +21,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._window_kernels import (
+from stillpath.compensation._window_kernels import (
     Functions,
     Tied,
     command_of,
@@ -29,9 +29,9 @@ from compensation._window_kernels import (
     extremes,
     tied_window,
 )
-from compensation.base import DesignError
-from compensation.lifted_window import Condensed
-from compensation.preview import PreviewDesign, running_gram
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted_window import Condensed
+from stillpath.compensation.preview import PreviewDesign, running_gram
 
 __all__ = [
     "EFFORT_PRICE",

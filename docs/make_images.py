@@ -28,7 +28,7 @@ from PIL import Image
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from service.reports.charts import Chart, Line, draw  # noqa: E402
+from stillpath.reports.charts import Chart, Line, draw  # noqa: E402
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -248,9 +248,9 @@ def printers(benchmarks: str) -> str:
 
 def tutorial(folder: Path) -> None:
     """Go the way of docs/tutorials/bed-slinger.md: measurement, machine, model, file."""
-    from models.identification.synthetic import simulate_log, write_raw_data
-    from models.identification.types import Excitation
-    from models.plants import PairsSpec, PolePair
+    from stillpath.models.identification.synthetic import simulate_log, write_raw_data
+    from stillpath.models.identification.types import Excitation
+    from stillpath.models.plants import PairsSpec, PolePair
 
     folder.mkdir(exist_ok=True)
     (folder / "printer.cfg").write_text(PRINTER_CFG)
@@ -337,7 +337,7 @@ def _once(made: Path, *arguments: object, data_dir: Path | None = None) -> None:
     """Run `stillpath` if what it makes is not there yet."""
     if made.exists():
         return
-    code = "from service.cli import main; main()"
+    code = "from cli.main import main; main()"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     own = {} if data_dir is None else {"STILLPATH_DATA_DIR": str(data_dir)}
     subprocess.run(command, check=True, cwd=ROOT, env=os.environ | own)

@@ -92,7 +92,7 @@ def commands_page() -> str:
     """Return every command of `stillpath` with its options, and the help of `stillpath-post`."""
     from typer.main import get_command
 
-    from service.cli import app
+    from stillpath.cli.main import app
 
     parts = [
         "# Every command and option",
@@ -172,8 +172,8 @@ def openapi_file() -> str:
 
 
 def _openapi() -> dict[str, Any]:
-    from service.api.app import create_app
-    from service.settings import Settings
+    from stillpath.service.api.app import create_app
+    from stillpath.service.settings import Settings
 
     with tempfile.TemporaryDirectory() as folder:
         document: dict[str, Any] = create_app(Settings(data_dir=Path(folder))).openapi()

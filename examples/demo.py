@@ -19,8 +19,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-from service.console import print_result
-from service.pipeline.result import Result
+from stillpath.cli.console import print_result
+from stillpath.pipeline.result import Result
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "examples" / "cura_ender3_gear24.gcode"

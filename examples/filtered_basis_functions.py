@@ -11,19 +11,19 @@ Numbers in brackets are equations of K. S. Ramani's dissertation (see docs/fbf.m
 # %%
 import numpy as np
 
-from compensation.basis import BASES, bspline_basis, ce_opt_basis, dct_basis
-from compensation.full_preview import FullPreview, independence
-from compensation.lifted import LiftedSet, lift, lifted_set
-from compensation.metrics import (
+from stillpath.compensation.basis import BASES, bspline_basis, ce_opt_basis, dct_basis
+from stillpath.compensation.full_preview import FullPreview, independence
+from stillpath.compensation.lifted import LiftedSet, lift, lifted_set
+from stillpath.compensation.metrics import (
     effort_metric,
     error_metric,
     error_of_functions,
     robust_error_metric,
 )
-from compensation.nominal import two_step
-from compensation.operators import DenseOperator
-from models.plants import Mode, ModesSpec, discretise
-from models.store import load_machine
+from stillpath.compensation.nominal import two_step
+from stillpath.compensation.operators import DenseOperator
+from stillpath.models.plants import Mode, ModesSpec, discretise
+from stillpath.models.store import load_machine
 
 DT_S, M = 1e-3, 600
 

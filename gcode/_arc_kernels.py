@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gcode._motion_kernels import extruder_is_absolute, set_feed, travel
-from gcode._slots import (
+from stillpath.gcode._motion_kernels import extruder_is_absolute, set_feed, travel
+from stillpath.gcode._slots import (
     DONE,
     ERROR_ARC_CENTER,
     ERROR_ARC_ENDS,
@@ -45,8 +45,8 @@ from gcode._slots import (
     MAX_ARC_PIECES,
     OK,
 )
-from gcode._table_kernels import put_event
-from models.jit import kernel
+from stillpath.gcode._table_kernels import put_event
+from stillpath.models.jit import kernel
 
 _MODE = 1
 _X, _E, _F, _I, _P, _R = 23, 4, 5, 8, 15, 17

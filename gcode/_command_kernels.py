@@ -5,9 +5,9 @@ from __future__ import annotations
 from math import fabs
 from typing import Any
 
-from gcode._arc_kernels import arc, curve
-from gcode._motion_kernels import move
-from gcode._slots import (
+from stillpath.gcode._arc_kernels import arc, curve
+from stillpath.gcode._motion_kernels import move
+from stillpath.gcode._slots import (
     ERROR_INCHES,
     ERROR_POSITIVE,
     ERROR_RANGE,
@@ -35,8 +35,8 @@ from gcode._slots import (
     MIN_VALUE,
     OK,
 )
-from gcode._table_kernels import note_modal, put_event, settle
-from models.jit import kernel
+from stillpath.gcode._table_kernels import note_modal, put_event, settle
+from stillpath.models.jit import kernel
 
 _HARMLESS, _MODE, _STOP, _UNKNOWN, _STATE = 0, 1, 3, 4, 8
 _X, _E, _P, _S = 23, 4, 15, 18

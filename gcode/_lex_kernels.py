@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from gcode._command_kernels import execute
-from gcode._motion_kernels import move
-from gcode._plain_kernels import decimal, line_end, may_be_mark, plain
-from gcode._slots import (
+from stillpath.gcode._command_kernels import execute
+from stillpath.gcode._motion_kernels import move
+from stillpath.gcode._plain_kernels import decimal, line_end, may_be_mark, plain
+from stillpath.gcode._slots import (
     DONE,
     FULL,
     GROW,
@@ -55,7 +55,7 @@ from gcode._slots import (
     MEMO_STRIDE,
     OK,
 )
-from gcode._table_kernels import (
+from stillpath.gcode._table_kernels import (
     line_hash,
     memo_slot,
     put_event,
@@ -63,8 +63,8 @@ from gcode._table_kernels import (
     settle,
     settle_limits,
 )
-from models.bytes import byte_at
-from models.jit import kernel
+from stillpath.models.bytes import byte_at
+from stillpath.models.jit import kernel
 
 __all__ = ["PADDING", "run"]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import fabs
 from typing import Any
 
-from gcode._slots import (
+from stillpath.gcode._slots import (
     DONE,
     ERROR_FEED,
     ERROR_RANGE,
@@ -50,8 +50,8 @@ from gcode._slots import (
     OK,
     SMALLEST_MOVE_MM,
 )
-from gcode._table_kernels import put_event, settle
-from models.jit import kernel
+from stillpath.gcode._table_kernels import put_event, settle
+from stillpath.models.jit import kernel
 
 _MODE, _UNKNOWN = 1, 4
 _X, _E, _F = 23, 4, 5

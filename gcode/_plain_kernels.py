@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gcode._motion_kernels import extruder_is_absolute
-from gcode._slots import (
+from stillpath.gcode._motion_kernels import extruder_is_absolute
+from stillpath.gcode._slots import (
     E_KIND,
     E_LINE,
     E_MOVE,
@@ -52,8 +52,8 @@ from gcode._slots import (
     MIN_SPEED_MM_S,
     SMALLEST_MOVE_MM,
 )
-from models.bytes import byte_at, trailing_zeros, word_at
-from models.jit import kernel
+from stillpath.models.bytes import byte_at, trailing_zeros, word_at
+from stillpath.models.jit import kernel
 
 _HARMLESS, _MODE = 0, 1
 _POWERS = 10.0 ** np.arange(23)

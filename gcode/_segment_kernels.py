@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["LONGEST", "Answers", "Bounds", "fit_stretch", "path_directions", "rest_errors"]
 

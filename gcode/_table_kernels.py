@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode._slots import (
+from stillpath.gcode._slots import (
     E_KIND,
     E_LIMITS,
     E_LINE,
@@ -62,8 +62,8 @@ from gcode._slots import (
     M_STOP,
     M_TOOL,
 )
-from models.bytes import word_at
-from models.jit import kernel
+from stillpath.models.bytes import word_at
+from stillpath.models.jit import kernel
 
 
 class Rows(NamedTuple):

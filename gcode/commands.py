@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from gcode import _slots as at
-from gcode.lexer import Command
-from gcode.state import MachineState
-from gcode.types import EventKind
+from stillpath.gcode import _slots as at
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState
+from stillpath.gcode.types import EventKind
 
 __all__ = ["cancel_object", "home", "retract", "tool"]
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode._slots import (
+from stillpath.gcode._slots import (
     I_ARC_RULE,
     I_AXES_FACTORS,
     I_DWELL_RULE,
@@ -35,11 +35,11 @@ from gcode._slots import (
     ExtruderRule,
     OriginRule,
 )
-from gcode.types import EventKind
+from stillpath.gcode.types import EventKind
 
 if TYPE_CHECKING:
-    from gcode.lexer import Command
-    from gcode.state import MachineState
+    from stillpath.gcode.lexer import Command
+    from stillpath.gcode.state import MachineState
 
 __all__ = [
     "NEEDED",

@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.pieces import LeftOut, Passage, Piece
-from gcode.timeline import group_rows
-from gcode.types import Limits, ModalState, Phases, rows_of
-from models.machine import Machine
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import LeftOut, Passage, Piece
+from stillpath.gcode.timeline import group_rows
+from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
+from stillpath.models.machine import Machine
 
 __all__ = ["divided", "sections"]
 

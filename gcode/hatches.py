@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.lexer import split_classic
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.lexer import split_classic
 
 __all__ = ["Hatches", "ScanSamples", "Timing", "read_hatches", "sample_hatches"]
 

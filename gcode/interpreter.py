@@ -14,19 +14,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode import _slots as at
-from gcode._command_kernels import execute
-from gcode._lex_kernels import PADDING, run
-from gcode.dialect import Action, Dialect
-from gcode.errors import GcodeError
-from gcode.firmware.dialects import dialect_of
-from gcode.firmware.registry import kit
-from gcode.lexer import Command, split_line
-from gcode.meta import META_WORDS, held_back, meta_command
-from gcode.slicers.marks import MarkKind, read_mark
-from gcode.state import MachineState, nobody
-from gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
-from models.machine import Machine
+from stillpath.gcode import _slots as at
+from stillpath.gcode._command_kernels import execute
+from stillpath.gcode._lex_kernels import PADDING, run
+from stillpath.gcode.dialect import Action, Dialect
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.dialects import dialect_of
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.lexer import Command, split_line
+from stillpath.gcode.meta import META_WORDS, held_back, meta_command
+from stillpath.gcode.slicers.marks import MarkKind, read_mark
+from stillpath.gcode.state import MachineState, nobody
+from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
+from stillpath.models.machine import Machine
 
 __all__ = ["Interpreter", "interpret_bytes"]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
 
-from gcode.dialect import Dialect
-from gcode.errors import GcodeError
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.errors import GcodeError
 
 __all__ = ["Command", "extended_parameters", "split_classic", "split_line"]
 

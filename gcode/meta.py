@@ -7,11 +7,11 @@ Source: RepRapFirmware src/GCodes/GCodeBuffer/StringParser.cpp, 3.5.
 
 from __future__ import annotations
 
-from gcode import _slots as at
-from gcode.dialect import Action
-from gcode.lexer import Command
-from gcode.state import MachineState
-from gcode.types import EventKind
+from stillpath.gcode import _slots as at
+from stillpath.gcode.dialect import Action
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState
+from stillpath.gcode.types import EventKind
 
 __all__ = ["META_WORDS", "held_back", "meta_command"]
 

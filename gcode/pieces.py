@@ -17,9 +17,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.types import (
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.types import (
     KEPT,
     OF_STATE,
     EventKind,
@@ -31,7 +31,7 @@ from gcode.types import (
     ProgramBlock,
     rows_of,
 )
-from models.machine import Machine
+from stillpath.models.machine import Machine
 
 __all__ = ["LeftOut", "Passage", "Piece", "Splitter", "excerpt"]
 

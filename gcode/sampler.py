@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode import _sample_kernels as kernels
-from gcode.types import Phases
+from stillpath.gcode import _sample_kernels as kernels
+from stillpath.gcode.types import Phases
 
 __all__ = ["Sampler", "Samples", "distances", "sample_phases", "sample_until"]
 

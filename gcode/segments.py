@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode._segment_kernels import (
+from stillpath.gcode._segment_kernels import (
     LONGEST,
     Answers,
     Bounds,
@@ -24,9 +24,9 @@ from gcode._segment_kernels import (
     path_directions,
     rest_errors,
 )
-from gcode.timeline import Timeline
-from models.modal import modal_form
-from models.plants import DiscretePlant
+from stillpath.gcode.timeline import Timeline
+from stillpath.models.modal import modal_form
+from stillpath.models.plants import DiscretePlant
 
 __all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode import _slots as at
-from gcode._motion_kernels import travel
-from gcode._table_kernels import (
+from stillpath.gcode import _slots as at
+from stillpath.gcode._motion_kernels import travel
+from stillpath.gcode._table_kernels import (
     Rows,
     Tables,
     intern_row,
@@ -27,12 +27,12 @@ from gcode._table_kernels import (
     settle,
     settle_limits,
 )
-from gcode.dialect import Dialect
-from gcode.errors import GcodeError
-from gcode.lexer import Command, extended_parameters
-from gcode.types import OF_STATE, EventKind, Limits
-from models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
-from models.machine import Machine
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.lexer import Command, extended_parameters
+from stillpath.gcode.types import OF_STATE, EventKind, Limits
+from stillpath.models.firmware import FirmwareFacts, FirmwareRetraction, Marlin, RepRapFirmware
+from stillpath.models.machine import Machine
 
 __all__ = ["MachineState", "Names", "Retraction", "Saved", "nobody"]
 

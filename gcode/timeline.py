@@ -15,8 +15,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.sampler import sample_until
-from gcode.types import Phases
+from stillpath.gcode.sampler import sample_until
+from stillpath.gcode.types import Phases
 
 __all__ = ["Group", "Timeline", "build_timeline", "group_rows"]
 

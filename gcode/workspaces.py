@@ -7,10 +7,10 @@ workspace at power-on).
 
 from __future__ import annotations
 
-from gcode import _slots as at
-from gcode.lexer import Command, split_line
-from gcode.state import MachineState, Saved
-from gcode.types import KEPT, EventKind
+from stillpath.gcode import _slots as at
+from stillpath.gcode.lexer import Command, split_line
+from stillpath.gcode.state import MachineState, Saved
+from stillpath.gcode.types import KEPT, EventKind
 
 __all__ = ["machine_space", "move_to_saved", "save_place", "select_workspace", "set_workspace"]
 

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from models.document import Document, NonNegative
-from models.plant_specs import PlantSetSpec
-from models.provenance import SourceFile
+from stillpath.models.document import Document, NonNegative
+from stillpath.models.plant_specs import PlantSetSpec
+from stillpath.models.provenance import SourceFile
 
 if TYPE_CHECKING:
-    from models.machine import Machine
+    from stillpath.models.machine import Machine
 
 __all__ = ["Confirmation", "confirmation_text", "plants_digest"]
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = ["Block", "Diagram", "Running", "polynomial_response"]
 
@@ -267,7 +267,7 @@ class Running:
         records: Array,
     ) -> None:
         # With numba, slow to import; the API describes loops without running them.
-        from models.diagram_kernels import advance
+        from stillpath.models.diagram_kernels import advance
 
         advance(
             self._layout, self._wires, self._gains, self._num, self._den, self._shape,

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from models.document import Document, Finite, NonNegative, Positive
-from models.errors import ModelError
+from stillpath.models.document import Document, Finite, NonNegative, Positive
+from stillpath.models.errors import ModelError
 
 __all__ = [
     "DisturbanceSpec",

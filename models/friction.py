@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from models._friction_kernels import bent, received
+from stillpath.models._friction_kernels import bent, received
 
 __all__ = ["BEND_MM", "DryFriction", "bend_of"]
 

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError
 
-from models.diagrams import Block, polynomial_response
-from models.disturbances import SensorSpec
-from models.document import Document, Finite, Positive
-from models.errors import ModelError
+from stillpath.models.diagrams import Block, polynomial_response
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.document import Document, Finite, Positive
+from stillpath.models.errors import ModelError
 
 __all__ = [
     "Loop",

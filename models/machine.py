@@ -12,14 +12,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from models.confirmation import Confirmation
-from models.document import Document, Finite, NonNegative, Positive
-from models.errors import ModelError
-from models.firmware import Firmware, Klipper
-from models.plants import PlantSetSpec
-from models.provenance import ADDED
-from models.ripple import AxisRipple, MachineRipple, RippleAxis
-from models.schedule import AxisSchedule
+from stillpath.models.confirmation import Confirmation
+from stillpath.models.document import Document, Finite, NonNegative, Positive
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Firmware, Klipper
+from stillpath.models.plants import PlantSetSpec
+from stillpath.models.provenance import ADDED
+from stillpath.models.ripple import AxisRipple, MachineRipple, RippleAxis
+from stillpath.models.schedule import AxisSchedule
 
 __all__ = [
     "AxisTravel",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.plants import DiscretePlant
+from stillpath.models.plants import DiscretePlant
 
 __all__ = ["modal_form"]
 

@@ -15,8 +15,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
-from models.schedule import Coordinate, GridSchedule, MassSchedule, OperatingPoint, resonances_hz
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import (
+    Coordinate,
+    GridSchedule,
+    MassSchedule,
+    OperatingPoint,
+    resonances_hz,
+)
 
 __all__ = ["OperatingGrid", "machine_at", "mass_schedules"]
 

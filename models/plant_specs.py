@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from models.document import Document, Finite, Positive
-from models.errors import ModelError
-from models.provenance import Provenance
-from models.roots import Roots, check_stable, dc_gain, normalise_dc, scaled_roots
+from stillpath.models.document import Document, Finite, Positive
+from stillpath.models.errors import ModelError
+from stillpath.models.provenance import Provenance
+from stillpath.models.roots import Roots, check_stable, dc_gain, normalise_dc, scaled_roots
 
 __all__ = [
     "MOST_FRICTION_MM",

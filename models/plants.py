@@ -14,8 +14,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
-from models.plant_specs import (
+from stillpath.models.errors import ModelError
+from stillpath.models.plant_specs import (
     MOST_FRICTION_MM,
     FirSpec,
     Mode,
@@ -32,8 +32,8 @@ from models.plant_specs import (
     ZeroPair,
     ZpkSpec,
 )
-from models.realisation import balanced, cascade, transmission_zeros
-from models.roots import Roots, frequency_and_damping
+from stillpath.models.realisation import balanced, cascade, transmission_zeros
+from stillpath.models.roots import Roots, frequency_and_damping
 
 __all__ = [
     "MOST_FRICTION_MM",

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from models.document import Document, Finite, NonNegative, Positive
+from stillpath.models.document import Document, Finite, NonNegative, Positive
 
 __all__ = ["ADDED", "Kind", "MeasuredMode", "Phase", "Provenance", "SourceFile"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.roots import Roots
+from stillpath.models.roots import Roots
 
 __all__ = ["balanced", "cascade", "transmission_zeros"]
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = ["printed_decimals", "repair_rounded"]
 

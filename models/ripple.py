@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from models.document import Document, Finite, NonNegative
-from models.errors import ModelError
+from stillpath.models.document import Document, Finite, NonNegative
+from stillpath.models.errors import ModelError
 
 __all__ = [
     "AxisRipple",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = [
     "Roots",

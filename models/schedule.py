@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from models.document import Document, Finite, Positive
-from models.errors import ModelError
-from models.plant_specs import (
+from stillpath.models.document import Document, Finite, Positive
+from stillpath.models.errors import ModelError
+from stillpath.models.plant_specs import (
     FirSpec,
     Mode,
     ModesSpec,
@@ -37,7 +37,7 @@ from models.plant_specs import (
     ZeroPair,
     ZpkSpec,
 )
-from models.roots import frequency_and_damping, to_s
+from stillpath.models.roots import frequency_and_damping, to_s
 
 __all__ = [
     "EMPTY",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = ["SHAPERS", "Pulses", "shaper_pulses"]
 

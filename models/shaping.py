@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.shaper_pulses import SHAPERS, Pulses, shaper_pulses
+from stillpath.models.shaper_pulses import SHAPERS, Pulses, shaper_pulses
 
 __all__ = ["OFF", "AxisShaper", "Shaping"]
 

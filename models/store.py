@@ -10,10 +10,10 @@ from pathlib import Path
 from pydantic import ValidationError
 from pydantic_core import from_json
 
-from models.complaints import complaint
-from models.errors import ModelError
-from models.firmware import FIRMWARE_KINDS
-from models.machine import Machine
+from stillpath.models.complaints import complaint
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import FIRMWARE_KINDS
+from stillpath.models.machine import Machine
 
 __all__ = [
     "builtin_machines",

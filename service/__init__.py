@@ -1,1 +1,1 @@
-"""Everything with a user on the other side: command line, HTTP, jobs, reports, the road."""
+"""What listens, stores, schedules and authenticates: HTTP, jobs, database, deliveries."""

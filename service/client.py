@@ -22,12 +22,12 @@ from urllib.parse import quote, urlsplit
 import httpx2
 from pydantic import ValidationError
 
-from service.api.schemas import JobPage, JobView
-from service.pipeline.files import replacing
-from service.version import __version__
+from stillpath.pipeline.files import replacing
+from stillpath.service.api.schemas import JobPage, JobView
+from stillpath.version import __version__
 
 if TYPE_CHECKING:
-    from service.pipeline.options import Options
+    from stillpath.pipeline.options import Options
 
 __all__ = ["Client", "ClientError", "Submission"]
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from numba.core.event import Listener, install_listener
 
-from service.pipeline.progress import Progress, ProgressCallback
+from stillpath.pipeline.progress import Progress, ProgressCallback
 
 __all__ = ["STAGE", "compiling_told"]
 

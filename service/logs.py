@@ -8,7 +8,7 @@ from typing import TextIO, cast
 import structlog
 from structlog.typing import Processor
 
-from service.security.masking import mask_secrets
+from stillpath.service.security.masking import mask_secrets
 
 __all__ = ["configure_logging"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import gc
 import signal
 
-from service.environment import prepare_environment
+from stillpath.service.environment import prepare_environment
 
 # Ctrl-C goes to the whole terminal group; the first process ends the others itself.
 signal.signal(signal.SIGINT, signal.SIG_IGN)
 prepare_environment()  # before numpy and numba
 
-import service.pipeline.road  # noqa: E402
-import service.reports  # noqa: E402, F401
+import stillpath.pipeline.compensate  # noqa: E402
+import stillpath.reports  # noqa: E402, F401
 
 gc.freeze()  # so that the copies' collectors leave alone what they share

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = ["METHOD", "OF_THE_SERVICE", "limit_memory", "loaded_context", "quiet_tracker"]
 
-OF_THE_SERVICE = ("distributed", "service.jobs.worker", "service.computing.preloaded")
+OF_THE_SERVICE = (
+    "distributed",
+    "stillpath.service.jobs.worker",
+    "stillpath.service.computing.preloaded",
+)
 """Modules for the processes of a service; all of them are copies of the same one."""
 
 METHOD = "forkserver" if sys.platform == "linux" else "spawn"
@@ -37,7 +41,7 @@ def loaded_context(*more: str) -> ForkServerContext | SpawnContext:
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["service.preloaded", *more])
+    context.set_forkserver_preload(["stillpath.service.preloaded", *more])
     return context
 
 

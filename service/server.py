@@ -11,17 +11,17 @@ from collections.abc import Iterator
 import structlog
 import uvicorn
 
-from service.api import create_app
-from service.database.engine import DatabaseAway, database_url, open_database
-from service.exclusive import exclusive
-from service.jobs.task import Runner
-from service.jobs.worker import run_task
-from service.logs import configure_logging
-from service.machines.settings import EARLIER_DATA_DIR
-from service.private import private_folder
-from service.processes import quiet_tracker
-from service.security.keys import keys_needed
-from service.settings import Settings
+from stillpath.applications.machines.settings import EARLIER_DATA_DIR
+from stillpath.service.api import create_app
+from stillpath.service.database.engine import DatabaseAway, database_url, open_database
+from stillpath.service.exclusive import exclusive
+from stillpath.service.jobs.task import Runner
+from stillpath.service.jobs.worker import run_task
+from stillpath.service.logs import configure_logging
+from stillpath.service.private import private_folder
+from stillpath.service.processes import quiet_tracker
+from stillpath.service.security.keys import keys_needed
+from stillpath.service.settings import Settings
 
 __all__ = ["serve_forever"]
 

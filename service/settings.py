@@ -9,7 +9,7 @@ from typing import Annotated, Self
 from pydantic import AfterValidator, Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.machines.settings import (
+from stillpath.applications.machines.settings import (
     EARLIER_DATA_DIR,
     ENV_PREFIX,
     MachineSettings,

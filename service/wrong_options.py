@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from models.complaints import complaint
+from stillpath.models.complaints import complaint
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = [
     "BOX",

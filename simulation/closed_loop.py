@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.diagrams import Block, Diagram, Running
-from models.disturbances import SensorSpec
-from models.loops import Loop
+from stillpath.models.diagrams import Block, Diagram, Running
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import Loop
 
 __all__ = ["ClosedLoop", "Imperfections", "batch", "simulate"]
 

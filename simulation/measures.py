@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation._contour_kernels import (
+from stillpath.simulation._contour_kernels import (
     BOX,
     contour_distances,
     contour_errors,

@@ -8,9 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.modal import modal_form
-from models.plants import DiscretePlant
-from models.response_kernels import block_states, dense_response, in_blocks, modal_response
+from stillpath.models.modal import modal_form
+from stillpath.models.plants import DiscretePlant
+from stillpath.models.response_kernels import (
+    block_states,
+    dense_response,
+    in_blocks,
+    modal_response,
+)
 
 __all__ = ["PlantStream", "response"]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.friction import DryFriction
-from models.machine import Machine
-from models.operating import OperatingGrid, machine_at
-from models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
-from models.ripple import MachineRipple
-from models.schedule import EMPTY, OperatingPoint
-from simulation.response import PlantStream
+from stillpath.models.friction import DryFriction
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.plants import DiscretePlant, PlantSetSpec, discretise, plant_set
+from stillpath.models.ripple import MachineRipple
+from stillpath.models.schedule import EMPTY, OperatingPoint
+from stillpath.simulation.response import PlantStream
 
 __all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "MachineStream"]
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
-from service.machines.settings import ENV_PREFIX
-from service.settings import Settings
+from stillpath.applications.machines.settings import ENV_PREFIX
+from stillpath.service.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "compose.yaml").read_text()
@@ -86,7 +86,7 @@ def test_memory_and_processes_are_limited(name):
 def test_commands_exist(name):
     from typer.main import get_command
 
-    from service.cli import app
+    from stillpath.cli.main import app
 
     program, command, *arguments = SERVICES[name]["command"]
     assert program == "stillpath"

@@ -80,7 +80,7 @@ def test_every_picture_is_shown_and_small():
 def test_commands_in_new_pages_exist():
     from typer.main import get_command
 
-    from service.cli import app
+    from stillpath.cli.main import app
 
     commands = set(get_command(app).commands)  # type: ignore[attr-defined]
     for page in PAGES:
@@ -94,7 +94,7 @@ def test_commands_in_new_pages_exist():
 def test_the_page_of_the_command_line_names_every_command_and_no_option_that_is_missing():
     from typer.main import get_command
 
-    from service.cli import app
+    from stillpath.cli.main import app
 
     def options(command: Any) -> Iterator[str]:
         for parameter in command.params:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from service.machines.settings import ENV_PREFIX
-from service.settings import Settings
+from stillpath.applications.machines.settings import ENV_PREFIX
+from stillpath.service.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "running.md").read_text()
@@ -36,7 +36,7 @@ def test_no_variable_is_made_up():
 def test_commands_exist():
     from typer.main import get_command
 
-    from service.cli import app
+    from stillpath.cli.main import app
 
     commands = get_command(app).commands
     named = set(

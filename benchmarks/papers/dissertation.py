@@ -23,12 +23,12 @@ import numpy as np
 from records import SAMPLES, Array, Row, butterfly, plus_minus, rms, white
 from tables_4 import cost, robust
 
-from compensation.basis import bspline_basis, ce_opt_basis, ce_opt_basis_of, dct_basis
-from compensation.full_preview import FullPreview, independence
-from compensation.lifted import free_response, lift, lifted_set
-from compensation.metrics import error_of_functions
-from models.plants import DiscretePlant, PairsSpec, PolePair, ZeroPair, discretise
-from models.store import load_machine
+from stillpath.compensation.basis import bspline_basis, ce_opt_basis, ce_opt_basis_of, dct_basis
+from stillpath.compensation.full_preview import FullPreview, independence
+from stillpath.compensation.lifted import free_response, lift, lifted_set
+from stillpath.compensation.metrics import error_of_functions
+from stillpath.models.plants import DiscretePlant, PairsSpec, PolePair, ZeroPair, discretise
+from stillpath.models.store import load_machine
 
 LIMIT_MM = 10.0
 HERE = Path(__file__).resolve().parent

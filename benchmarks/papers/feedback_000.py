@@ -13,10 +13,10 @@ import numpy as np
 from feedback_records import Row, checked, rate, shown
 from numpy.typing import NDArray
 
-from compensation.feedback.adaptive import AdaptiveFmsdob
-from compensation.feedback.bandpass import LatticeBandPass
-from compensation.feedback.controller import Extreme, Prediction
-from compensation.feedback.fmsdob import (
+from stillpath.compensation.feedback.adaptive import AdaptiveFmsdob
+from stillpath.compensation.feedback.bandpass import LatticeBandPass
+from stillpath.compensation.feedback.controller import Extreme, Prediction
+from stillpath.compensation.feedback.fmsdob import (
     Around,
     QFilter,
     Shape,
@@ -25,11 +25,11 @@ from compensation.feedback.fmsdob import (
     forward_model,
     instant_check,
 )
-from compensation.feedback.inverse_dob import inverse_dob
-from models.diagrams import polynomial_response
-from models.disturbances import Switched, Tone, sample
-from models.loops import Loop, load_loop
-from simulation.closed_loop import ClosedLoop, Imperfections, simulate
+from stillpath.compensation.feedback.inverse_dob import inverse_dob
+from stillpath.models.diagrams import polynomial_response
+from stillpath.models.disturbances import Switched, Tone, sample
+from stillpath.models.loops import Loop, load_loop
+from stillpath.simulation.closed_loop import ClosedLoop, Imperfections, simulate
 
 Array = NDArray[np.float64]
 PRINTED = Loop((0, 0, 0.0282, 0.1504, 0.1146), (1, -1.319, 0.929, -0.6073, -0.0035), 2.5e-5)

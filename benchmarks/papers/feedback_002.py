@@ -16,23 +16,23 @@ from feedback_records import Row, checked, rate, shown
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from compensation.feedback.disturbance_observer import (
+from stillpath.compensation.feedback.disturbance_observer import (
     binomial_q,
     continuous_q,
     delay_limit_hz,
     design_disturbance_observer,
     observer_sensitivity,
 )
-from compensation.feedback.pd import Margins, inertia_pd, loop_margins, margins
-from compensation.feedback.zero_phase import design_prefilter
-from compensation.inversion import invert
-from compensation.inverting import zero_phase_fir
-from models.diagrams import Block, polynomial_response
-from models.disturbances import SensorSpec
-from models.loops import Loop, load_loop
-from models.plants import Mode, ModesSpec, continuous
-from simulation.closed_loop import ClosedLoop, Imperfections, simulate
-from simulation.response import response
+from stillpath.compensation.feedback.pd import Margins, inertia_pd, loop_margins, margins
+from stillpath.compensation.feedback.zero_phase import design_prefilter
+from stillpath.compensation.inversion import invert
+from stillpath.compensation.inverting import zero_phase_fir
+from stillpath.models.diagrams import Block, polynomial_response
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import Loop, load_loop
+from stillpath.models.plants import Mode, ModesSpec, continuous
+from stillpath.simulation.closed_loop import ClosedLoop, Imperfections, simulate
+from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

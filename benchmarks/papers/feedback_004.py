@@ -14,14 +14,14 @@ import numpy as np
 from feedback_records import Row, checked, rate, shown
 from numpy.typing import NDArray
 
-from compensation.feedback.controller import Refusal
-from compensation.feedback.multirate import (
+from stillpath.compensation.feedback.controller import Refusal
+from stillpath.compensation.feedback.multirate import (
     alias_spectra,
     design_multirate,
     fast_rate,
     multirate_factor,
 )
-from compensation.feedback.repetitive import (
+from stillpath.compensation.feedback.repetitive import (
     InternalModel,
     design_quasi,
     design_wide_band,
@@ -29,8 +29,8 @@ from compensation.feedback.repetitive import (
     periodic_residual,
     plug_in_factor,
 )
-from models.loops import Loop, ServoLoop, load_loop
-from simulation.closed_loop import ClosedLoop, simulate
+from stillpath.models.loops import Loop, ServoLoop, load_loop
+from stillpath.simulation.closed_loop import ClosedLoop, simulate
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.inversion import Inversion, invert
-from models.plants import DiscretePlant
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.inversion import Inversion, invert
+from stillpath.models.plants import DiscretePlant
 
 SAMPLES, ORDER, POLE, DT_S = 1001, 5, 0.5, 1e-4
 ZEROS = (-5.0, -2.0, -1.1, -1.0, -0.9, -0.5, 0.5, 0.9, 1.0, 1.02, 1.1, 2.0, 5.0)

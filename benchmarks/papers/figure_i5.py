@@ -26,19 +26,19 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 from scipy.special import ndtr
 
-from compensation.basis import bspline_functions
-from compensation.full_preview import FullPreview
-from compensation.lifted import lift
-from compensation.nominal_frequency import (
+from stillpath.compensation.basis import bspline_functions
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import lift
+from stillpath.compensation.nominal_frequency import (
     Distribution,
     Region,
     bandwidths,
     robust_nominal,
     sampled_responses,
 )
-from compensation.operators import LiftedOperator
-from models.plants import DiscretePlant, PlantSetSpec, WeightedMember, plant_set
-from models.store import load_machine
+from stillpath.compensation.operators import LiftedOperator
+from stillpath.models.plants import DiscretePlant, PlantSetSpec, WeightedMember, plant_set
+from stillpath.models.store import load_machine
 
 SAMPLES, FUNCTIONS, DEGREE, DT_S, POINTS = 1001, 200, 5, 1e-3, 4096
 RUN_OUT = 200

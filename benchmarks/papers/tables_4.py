@@ -15,7 +15,7 @@ from records import SAMPLES, Array, Row, cpu, plus_minus, rms, white
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.signal import cont2discrete
 
-from compensation.basis import (
+from stillpath.compensation.basis import (
     bspline_basis,
     ce_opt_basis,
     dct_basis,
@@ -24,12 +24,12 @@ from compensation.basis import (
     robust_functions,
     spread_functions,
 )
-from compensation.full_preview import FullPreview
-from compensation.lifted import LiftedSet, lift, lifted_set
-from compensation.metrics import best_number, error_of_functions
-from compensation.nominal import lifted_optimum, spread_gram, two_step
-from compensation.operators import DenseOperator, LiftedOperator, ToeplitzOperator
-from models.plants import DiscretePlant
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import LiftedSet, lift, lifted_set
+from stillpath.compensation.metrics import best_number, error_of_functions
+from stillpath.compensation.nominal import lifted_optimum, spread_gram, two_step
+from stillpath.compensation.operators import DenseOperator, LiftedOperator, ToeplitzOperator
+from stillpath.models.plants import DiscretePlant
 
 
 def robust(seeds: int) -> Iterator[Row]:

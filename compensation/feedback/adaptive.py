@@ -17,12 +17,12 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from compensation.base import DesignError
-from compensation.feedback._adaptive_kernels import track
-from compensation.feedback.controller import Controller
-from compensation.feedback.fmsdob import Around, QFilter, add_on_blocks, design_q, fmsdob
-from models.diagrams import Block
-from models.loops import Loop
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback._adaptive_kernels import track
+from stillpath.compensation.feedback.controller import Controller
+from stillpath.compensation.feedback.fmsdob import Around, QFilter, add_on_blocks, design_q, fmsdob
+from stillpath.models.diagrams import Block
+from stillpath.models.loops import Loop
 
 __all__ = ["AdaptiveFmsdob", "FrequencyTracker", "Retuning"]
 

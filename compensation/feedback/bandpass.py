@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from models.diagrams import Block, polynomial_response
+from stillpath.compensation.base import DesignError
+from stillpath.models.diagrams import Block, polynomial_response
 
 __all__ = ["LatticeBandPass"]
 

@@ -16,10 +16,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from models.diagrams import Block, Diagram
-from models.disturbances import SensorSpec
-from models.loops import Loop
+from stillpath.compensation.base import DesignError
+from stillpath.models.diagrams import Block, Diagram
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import Loop
 
 __all__ = [
     "CoefficientSet",

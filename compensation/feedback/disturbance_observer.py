@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
-from compensation.feedback.controller import (
+from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
     Prediction,
@@ -27,8 +27,8 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from models.diagrams import Block, polynomial_response
-from models.loops import Loop
+from stillpath.models.diagrams import Block, polynomial_response
+from stillpath.models.loops import Loop
 
 __all__ = [
     "binomial_q",

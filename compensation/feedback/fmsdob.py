@@ -19,9 +19,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from compensation.feedback.bandpass import LatticeBandPass
-from compensation.feedback.controller import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.bandpass import LatticeBandPass
+from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
     Prediction,
@@ -30,9 +30,9 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from compensation.feedback.interpolation import interpolating_fir, inverse_and_slope
-from models.diagrams import Block
-from models.loops import Loop
+from stillpath.compensation.feedback.interpolation import interpolating_fir, inverse_and_slope
+from stillpath.models.diagrams import Block
+from stillpath.models.loops import Loop
 
 __all__ = [
     "Around",

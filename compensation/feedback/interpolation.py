@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
+from stillpath.compensation.base import DesignError
 
 __all__ = ["interpolating_fir", "inverse_and_slope"]
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compensation.feedback.bandpass import LatticeBandPass
-from compensation.feedback.controller import (
+from stillpath.compensation.feedback.bandpass import LatticeBandPass
+from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
     Prediction,
@@ -21,10 +21,10 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from compensation.feedback.fmsdob import QFilter, target_angles
-from compensation.feedback.interpolation import interpolating_fir
-from models.diagrams import Block
-from models.loops import Loop
+from stillpath.compensation.feedback.fmsdob import QFilter, target_angles
+from stillpath.compensation.feedback.interpolation import interpolating_fir
+from stillpath.models.diagrams import Block
+from stillpath.models.loops import Loop
 
 __all__ = ["LARGEST_INVERSE_RADIUS", "inverse_dob"]
 

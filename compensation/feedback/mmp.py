@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from compensation.feedback.controller import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
     Prediction,
@@ -25,10 +25,10 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from compensation.feedback.fmsdob import Shape, design_q, model_blocks
-from models.diagrams import Block, polynomial_response
-from models.disturbances import SensorSpec
-from models.loops import Loop
+from stillpath.compensation.feedback.fmsdob import Shape, design_q, model_blocks
+from stillpath.models.diagrams import Block, polynomial_response
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import Loop
 
 __all__ = ["Predictor", "mmp", "predictor", "predictor_of_gain", "singular_distance_hz"]
 

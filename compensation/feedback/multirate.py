@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.feedback.controller import (
+from stillpath.compensation.feedback.controller import (
     Controller,
     Prediction,
     Refusal,
@@ -26,7 +26,7 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from compensation.feedback.repetitive import (
+from stillpath.compensation.feedback.repetitive import (
     InternalModel,
     ServoInverse,
     internal_model,
@@ -35,8 +35,8 @@ from compensation.feedback.repetitive import (
     repetitive_coefficients,
     shared_period,
 )
-from models.diagrams import Block
-from models.loops import Loop
+from stillpath.models.diagrams import Block
+from stillpath.models.loops import Loop
 
 __all__ = ["FastRate", "alias_spectra", "design_multirate", "fast_rate", "multirate_factor"]
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compensation.base import DesignError
-from models.loops import Loop
+from stillpath.compensation.base import DesignError
+from stillpath.models.loops import Loop
 
 __all__ = ["Margins", "inertia_pd", "loop_margins", "margins"]
 

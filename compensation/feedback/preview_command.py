@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation._preview_kernels import advance_window
-from compensation.feedback.zero_phase import reference_plant
-from compensation.lifted_window import lifted_window
-from compensation.preview import PreviewDesign
-from models.loops import Loop
+from stillpath.compensation._preview_kernels import advance_window
+from stillpath.compensation.feedback.zero_phase import reference_plant
+from stillpath.compensation.lifted_window import lifted_window
+from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.loops import Loop
 
 __all__ = ["preview_command"]
 

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import diric
 
-from compensation.feedback.controller import (
+from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
     Extreme,
@@ -43,8 +43,8 @@ from compensation.feedback.controller import (
     frequency_grid,
     judged,
 )
-from models.diagrams import Block, polynomial_response
-from models.loops import Loop
+from stillpath.models.diagrams import Block, polynomial_response
+from stillpath.models.loops import Loop
 
 __all__ = [
     "InternalModel",

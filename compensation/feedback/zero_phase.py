@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from compensation.base import DesignError
-from compensation.feedback.controller import CoefficientSet, Extreme
-from compensation.inversion import Inversion, invert
-from compensation.inverting import zero_phase_fir
-from models.loops import Loop
-from models.plants import DiscretePlant, balanced_discrete
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.controller import CoefficientSet, Extreme
+from stillpath.compensation.inversion import Inversion, invert
+from stillpath.compensation.inverting import zero_phase_fir
+from stillpath.models.loops import Loop
+from stillpath.models.plants import DiscretePlant, balanced_discrete
 
 __all__ = ["Prefilter", "design_prefilter", "fir_within", "reference_plant"]
 

@@ -18,12 +18,12 @@ from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
-from gcode.containers.compression import Compression, compress, decompress
-from gcode.containers.limits import BLOCK_BYTES, check_unpacked, largest_unpacked
-from gcode.containers.meatpack import Unpacker, pack
-from gcode.errors import GcodeError
-from gcode.slicers.facts import SlicerFacts, facts_in
-from gcode.slicers.retiming import retimed
+from stillpath.gcode.containers.compression import Compression, compress, decompress
+from stillpath.gcode.containers.limits import BLOCK_BYTES, check_unpacked, largest_unpacked
+from stillpath.gcode.containers.meatpack import Unpacker, pack
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.slicers.facts import SlicerFacts, facts_in
+from stillpath.gcode.slicers.retiming import retimed
 
 __all__ = ["BinaryGcode", "Block", "BlockType", "Encoding", "read_blocks"]
 

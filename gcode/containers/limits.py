@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gcode.errors import GcodeError
+from stillpath.gcode.errors import GcodeError
 
 __all__ = ["BLOCK_BYTES", "check_unpacked", "largest_unpacked"]
 

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gcode.errors import GcodeError
-from models.jit import kernel
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.jit import kernel
 
 __all__ = ["Unpacker", "pack"]
 

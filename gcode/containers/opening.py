@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from gcode.containers.bgcode import BinaryGcode
-from gcode.containers.sniff import Kind, foreign, kind_named, sniff
-from gcode.containers.threemf import ThreeMf
-from gcode.errors import GcodeError
-from gcode.slicers.facts import SlicerFacts, read_facts
+from stillpath.gcode.containers.bgcode import BinaryGcode
+from stillpath.gcode.containers.sniff import Kind, foreign, kind_named, sniff
+from stillpath.gcode.containers.threemf import ThreeMf
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
 
 __all__ = ["Container", "Told", "open_text", "rewriting"]
 

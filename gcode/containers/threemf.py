@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from gcode.containers.limits import check_unpacked, largest_unpacked
-from gcode.errors import GcodeError
+from stillpath.gcode.containers.limits import check_unpacked, largest_unpacked
+from stillpath.gcode.errors import GcodeError
 
 __all__ = ["ThreeMf"]
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.pieces import Piece
-from gcode.segments import Segments
-from gcode.timeline import Timeline
-from gcode.types import Phases
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Timeline
+from stillpath.gcode.types import Phases
 
 __all__ = ["feed_at_ends", "final_segments"]
 

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.types import Limits, Moves, Phases, ProgramBlock
+from stillpath.gcode.types import Limits, Moves, Phases, ProgramBlock
 
 if TYPE_CHECKING:
-    from gcode.dialect import Dialect
-    from gcode.firmware.encoding import Encoded
-    from gcode.pieces import Piece
-    from gcode.segments import Segments
-    from gcode.timeline import Group, Timeline
-    from models.machine import CommandLimits
-    from models.shaping import Shaping
+    from stillpath.gcode.dialect import Dialect
+    from stillpath.gcode.firmware.encoding import Encoded
+    from stillpath.gcode.pieces import Piece
+    from stillpath.gcode.segments import Segments
+    from stillpath.gcode.timeline import Group, Timeline
+    from stillpath.models.machine import CommandLimits
+    from stillpath.models.shaping import Shaping
 
 __all__ = [
     "Adviser",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 
-from gcode.dialect import Dialect
-from models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
+from stillpath.gcode.dialect import Dialect
+from stillpath.models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
 
 __all__ = ["dialect_of"]
 
@@ -17,15 +17,15 @@ def dialect_of(firmware: FirmwareFacts) -> Dialect:
     Its tables take longer to make than a short file to read, so the last ones are kept.
     """
     if isinstance(firmware, Klipper):
-        from gcode.firmware.klipper.dialect import klipper
+        from stillpath.gcode.firmware.klipper.dialect import klipper
 
         return klipper(firmware)
     if isinstance(firmware, Marlin):
-        from gcode.firmware.marlin.dialect import marlin
+        from stillpath.gcode.firmware.marlin.dialect import marlin
 
         return marlin(firmware)
     if isinstance(firmware, RepRapFirmware):
-        from gcode.firmware.reprapfirmware.dialect import reprapfirmware
+        from stillpath.gcode.firmware.reprapfirmware.dialect import reprapfirmware
 
         return reprapfirmware(firmware)
     raise TypeError(f"{type(firmware).__name__} has no dialect")

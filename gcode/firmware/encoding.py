@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware._encoding_kernels import lay_out
-from gcode.pieces import Piece
-from gcode.segments import Segments
-from gcode.timeline import Group, Timeline
-from gcode.types import Limits, Moves, Phases
+from stillpath.gcode.firmware._encoding_kernels import lay_out
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Group, Timeline
+from stillpath.gcode.types import Limits, Moves, Phases
 
 __all__ = [
     "UNITS_PER_MM",

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.registry import kit
-from gcode.types import EventKind, Events, Limits, Moves, Phases, ProgramBlock
-from models.machine import Machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.types import EventKind, Events, Limits, Moves, Phases, ProgramBlock
+from stillpath.models.machine import Machine
 
 __all__ = [
     "STOPPING",

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.planning import between_stops, empty_phases, join_phases
-from gcode.types import Limits, Moves, Phases, ProgramBlock
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import between_stops, empty_phases, join_phases
+from stillpath.gcode.types import Limits, Moves, Phases, ProgramBlock
 
 __all__ = ["QueuePlanner"]
 

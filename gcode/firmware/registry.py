@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from gcode.firmware.base import FirmwareKit
-from models.errors import ModelError
-from models.firmware import Klipper, Marlin, RepRapFirmware
-from models.machine import Machine
+from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
+from stillpath.models.machine import Machine
 
 __all__ = ["kit"]
 
@@ -19,15 +19,15 @@ def kit(machine: Machine) -> FirmwareKit:
         The firmware can be described but there is no planner for it.
     """
     if isinstance(machine.firmware, Klipper):
-        from gcode.firmware.klipper.kit import KlipperKit
+        from stillpath.gcode.firmware.klipper.kit import KlipperKit
 
         return KlipperKit(machine, machine.firmware)
     if isinstance(machine.firmware, RepRapFirmware):
-        from gcode.firmware.reprapfirmware.kit import RepRapKit
+        from stillpath.gcode.firmware.reprapfirmware.kit import RepRapKit
 
         return RepRapKit(machine, machine.firmware)
     if isinstance(machine.firmware, Marlin):
-        from gcode.firmware.marlin.kit import MarlinKit
+        from stillpath.gcode.firmware.marlin.kit import MarlinKit
 
         return MarlinKit(machine, machine.firmware)
     raise ModelError(f"{machine.name}: there is no planner for {machine.firmware.kind}")

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware._writing_kernels import format_moves
-from gcode.firmware.base import FirmwareKit
-from gcode.firmware.encoding import Encoded
-from gcode.firmware.planning import stops
-from gcode.pieces import LeftOut, Passage, Piece
-from gcode.types import EventKind, Limits, ModalState
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware._writing_kernels import format_moves
+from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.gcode.firmware.encoding import Encoded
+from stillpath.gcode.firmware.planning import stops
+from stillpath.gcode.pieces import LeftOut, Passage, Piece
+from stillpath.gcode.types import EventKind, Limits, ModalState
 
 __all__ = ["StreamWriter"]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["queue_times", "trapezoid_s"]
 

@@ -21,8 +21,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.slicers._estimator_kernels import queue_times
-from gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.slicers._estimator_kernels import queue_times
+from stillpath.gcode.slicers.facts import SlicerFacts
 
 __all__ = ["Rules", "estimated_s", "rules_of"]
 

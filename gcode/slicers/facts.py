@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import BinaryIO
 
-from gcode.slicers.times import TimeKind, read_times
+from stillpath.gcode.slicers.times import TimeKind, read_times
 
 __all__ = ["LOOKED_AT_BYTES", "SlicerFacts", "facts_in", "read_facts"]
 

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gcode.pieces import Passage
-from gcode.slicers.marks import MarkKind, read_mark
-from gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
+from stillpath.gcode.pieces import Passage
+from stillpath.gcode.slicers.marks import MarkKind, read_mark
+from stillpath.gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite

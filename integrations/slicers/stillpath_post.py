@@ -125,7 +125,7 @@ def _process(settings: Settings, voice: Voice, signals: Signals) -> None:
 def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -> bytes:
     """Compensate on this computer; heavy imports begin here."""
     try:
-        import service.post
+        from stillpath.cli import post
     except ImportError:
         raise Failure(
             "the package stillpath is not installed for this Python; install it, or name a "
@@ -140,8 +140,8 @@ def _here(path: Path, options: dict[str, Any], voice: Voice, signals: Signals) -
         voice.progress(stage, share)
 
     try:
-        page = service.post.compensate_in_place(path, options, name=name, tell=tell)
-    except service.post.Refused as error:
+        page = post.compensate_in_place(path, options, name=name, tell=tell)
+    except post.Refused as error:
         raise Failure(error) from None
     finally:
         signals.deferred = False

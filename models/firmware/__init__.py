@@ -6,10 +6,10 @@ from typing import Annotated, Any
 
 from pydantic import Discriminator, Tag
 
-from models.firmware.common import FirmwareFacts, FirmwareRetraction, Hotend
-from models.firmware.klipper import Klipper
-from models.firmware.marlin import Marlin
-from models.firmware.reprapfirmware import RepRapFirmware
+from stillpath.models.firmware.common import FirmwareFacts, FirmwareRetraction, Hotend
+from stillpath.models.firmware.klipper import Klipper
+from stillpath.models.firmware.marlin import Marlin
+from stillpath.models.firmware.reprapfirmware import RepRapFirmware
 
 __all__ = [
     "FIRMWARE_KINDS",

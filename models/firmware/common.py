@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from models.document import Document, Finite, NonNegative, Positive
+from stillpath.models.document import Document, Finite, NonNegative, Positive
 
 __all__ = [
     "FirmwareFacts",

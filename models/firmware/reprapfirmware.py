@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from models.document import Document, NonNegative, Positive
-from models.firmware.common import FirmwareFacts, Hotend
+from stillpath.models.document import Document, NonNegative, Positive
+from stillpath.models.firmware.common import FirmwareFacts, Hotend
 
 __all__ = ["Drive", "RepRapExtruder", "RepRapFirmware", "RepRapShaper"]
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.interpolate import CubicSpline
 
-from models.errors import ModelError
-from models.identification.excitation import VelocityProfile, regenerate
-from models.identification.types import AccelerationLog, Excitation
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import VelocityProfile, regenerate
+from stillpath.models.identification.types import AccelerationLog, Excitation
 
 __all__ = ["AlignedLog", "align", "check_pair", "resample"]
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.types import FrequencyResponse, Spectrum
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.types import FrequencyResponse, Spectrum
 
 __all__ = ["aligned_to", "low_frequency_delay", "mean_response", "mean_spectrum", "on_grid"]
 

@@ -9,21 +9,21 @@ from dataclasses import replace
 
 from pydantic import ValidationError
 
-from models.errors import ModelError
-from models.identification.conditions import Condition
-from models.identification.prompt import prompt
-from models.identification.sets import parametric_members
-from models.identification.types import AxisIdentification, Fit, ModeEstimate
-from models.plants import ParametricMembers, PlantSetSpec
-from models.provenance import Kind
-from models.schedule import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.conditions import Condition
+from stillpath.models.identification.prompt import prompt
+from stillpath.models.identification.sets import parametric_members
+from stillpath.models.identification.types import AxisIdentification, Fit, ModeEstimate
+from stillpath.models.plants import ParametricMembers, PlantSetSpec
+from stillpath.models.provenance import Kind
+from stillpath.models.schedule import (
     AxisSchedule,
     GridNode,
     GridSchedule,
     MassSchedule,
     moving_mass_from_two_runs,
 )
-from models.store import explain
+from stillpath.models.store import explain
 
 __all__ = ["followed", "scheduled", "special", "usual"]
 

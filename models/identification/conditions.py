@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from models.errors import ModelError
-from models.schedule import COORDINATES, Coordinate
+from stillpath.models.errors import ModelError
+from stillpath.models.schedule import COORDINATES, Coordinate
 
 __all__ = ["Condition"]
 

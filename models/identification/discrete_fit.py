@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.sanathanan_koerner import polynomial_basis, sanathanan_koerner
-from models.plant_specs import PlantSpec, ZpkSpec
-from models.plants import frequency_response
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.sanathanan_koerner import polynomial_basis, sanathanan_koerner
+from stillpath.models.plant_specs import PlantSpec, ZpkSpec
+from stillpath.models.plants import frequency_response
 
 __all__ = ["DiscreteModel", "discrete_model", "zeros_outside"]
 

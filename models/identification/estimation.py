@@ -12,16 +12,16 @@ from scipy.fft import next_fast_len, rfft, rfftfreq
 from scipy.signal import csd
 from scipy.signal.windows import tukey
 
-from models.errors import ModelError
-from models.identification.alignment import AlignedLog, align
-from models.identification.local_model import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.alignment import AlignedLog, align
+from stillpath.models.identification.local_model import (
     LocalResponse,
     Transformed,
     bins_needed,
     local_response,
 )
-from models.identification.nozzle import frame_of
-from models.identification.types import (
+from stillpath.models.identification.nozzle import frame_of
+from stillpath.models.identification.types import (
     AccelerationLog,
     DrivenLog,
     Excitation,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
-from models.identification.types import Excitation
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.types import Excitation
 
 __all__ = [
     "VelocityProfile",

@@ -14,30 +14,30 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.averaging import low_frequency_delay, mean_response
-from models.identification.mode_estimates import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import low_frequency_delay, mean_response
+from stillpath.models.identification.mode_estimates import (
     band_warnings,
     filler_poles,
     mode_estimates,
     robust_covariance,
 )
-from models.identification.pair_structure import PairStructure
-from models.identification.response_candidate import (
+from stillpath.models.identification.pair_structure import PairStructure
+from stillpath.models.identification.response_candidate import (
     Candidate,
     delay_span,
     judged,
     least_error,
     with_gain,
 )
-from models.identification.response_data import ResponseData, response_data
-from models.identification.sanathanan_koerner import (
+from stillpath.models.identification.response_data import ResponseData, response_data
+from stillpath.models.identification.sanathanan_koerner import (
     pairs_of,
     polynomial_basis,
     sanathanan_koerner,
 )
-from models.identification.types import Fit, FrequencyResponse, OrderTrial
-from models.plants import PairsSpec
+from stillpath.models.identification.types import Fit, FrequencyResponse, OrderTrial
+from stillpath.models.plants import PairsSpec
 
 __all__ = ["fit_response", "refit_response"]
 

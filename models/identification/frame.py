@@ -12,7 +12,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
+from stillpath.models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["shaken", "without_frame"]
 

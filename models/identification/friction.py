@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-from models.friction import bend_of
-from models.identification.alignment import AlignedLog
-from models.identification.averaging import low_frequency_delay
-from models.identification.estimation import plateau_gain, response_at
-from models.identification.types import FrequencyResponse
-from models.plants import MOST_FRICTION_MM
+from stillpath.models.friction import bend_of
+from stillpath.models.identification.alignment import AlignedLog
+from stillpath.models.identification.averaging import low_frequency_delay
+from stillpath.models.identification.estimation import plateau_gain, response_at
+from stillpath.models.identification.types import FrequencyResponse
+from stillpath.models.plants import MOST_FRICTION_MM
 
 __all__ = ["dry_friction", "freed"]
 

@@ -12,31 +12,36 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from models.errors import ModelError
-from models.identification.alignment import AlignedLog, align, check_pair
-from models.identification.averaging import mean_response, mean_spectrum
-from models.identification.conditioned import scheduled, special, usual
-from models.identification.conditions import Condition
-from models.identification.estimation import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.alignment import AlignedLog, align, check_pair
+from stillpath.models.identification.averaging import mean_response, mean_spectrum
+from stillpath.models.identification.conditioned import scheduled, special, usual
+from stillpath.models.identification.conditions import Condition
+from stillpath.models.identification.estimation import (
     estimate_aligned,
     estimate_driven,
     estimate_response,
     plateau_gain,
 )
-from models.identification.friction import dry_friction, freed
-from models.identification.modal_fit import refit
-from models.identification.nozzle import Frame, frame_of
-from models.identification.readers import (
+from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.modal_fit import refit
+from stillpath.models.identification.nozzle import Frame, frame_of
+from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
     direction_of,
     excitation_for,
     excitation_notes,
 )
-from models.identification.sets import delay_warning, response_set, spectrum_set, typed_in_set
-from models.identification.spectrum_fit import refit_spectrum
-from models.identification.trust import check_axes, check_told, keeps_time
-from models.identification.types import (
+from stillpath.models.identification.sets import (
+    delay_warning,
+    response_set,
+    spectrum_set,
+    typed_in_set,
+)
+from stillpath.models.identification.spectrum_fit import refit_spectrum
+from stillpath.models.identification.trust import check_axes, check_told, keeps_time
+from stillpath.models.identification.types import (
     AccelerationLog,
     AxisIdentification,
     DrivenLog,
@@ -47,7 +52,7 @@ from models.identification.types import (
     PlantModel,
     Spectrum,
 )
-from models.provenance import Kind, SourceFile
+from stillpath.models.provenance import Kind, SourceFile
 
 __all__ = ["Measured", "Progress", "identify"]
 

@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = ["LocalResponse", "Transformed", "bins_needed", "local_response"]
 

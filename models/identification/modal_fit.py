@@ -15,21 +15,25 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.averaging import low_frequency_delay, mean_response
-from models.identification.fitting import fit_response, refit_response
-from models.identification.modal_structure import ModalStructure
-from models.identification.mode_estimates import band_warnings, robust_covariance, with_floor
-from models.identification.response_candidate import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import low_frequency_delay, mean_response
+from stillpath.models.identification.fitting import fit_response, refit_response
+from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.identification.mode_estimates import (
+    band_warnings,
+    robust_covariance,
+    with_floor,
+)
+from stillpath.models.identification.response_candidate import (
     Candidate,
     delay_span,
     judged,
     least_error,
     with_gain,
 )
-from models.identification.response_data import ResponseData, response_data
-from models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
-from models.plants import PairsSpec, RelativeModesSpec, frequency_response
+from stillpath.models.identification.response_data import ResponseData, response_data
+from stillpath.models.identification.types import Fit, FrequencyResponse, ModeEstimate, OrderTrial
+from stillpath.models.plants import PairsSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["alternatives", "fit_modes", "of_poles", "refit"]
 

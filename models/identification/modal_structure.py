@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.plants import RelativeMode, RelativeModesSpec
+from stillpath.models.plants import RelativeMode, RelativeModesSpec
 
 __all__ = ["ModalStructure"]
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.pair_structure import PairStructure
-from models.identification.types import ModeEstimate
+from stillpath.models.identification.pair_structure import PairStructure
+from stillpath.models.identification.types import ModeEstimate
 
 __all__ = [
     "band_warnings",

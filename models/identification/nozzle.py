@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
-from models.identification.modal_fit import of_poles
-from models.identification.modal_structure import ModalStructure
-from models.identification.response_data import ResponseData, response_data
-from models.identification.types import FrequencyResponse
+from stillpath.models.identification.modal_fit import of_poles
+from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.identification.response_data import ResponseData, response_data
+from stillpath.models.identification.types import FrequencyResponse
 
 __all__ = ["Frame", "frame_of"]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.plants import PairsSpec, PolePair, ZeroPair
+from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 __all__ = ["PairStructure"]
 

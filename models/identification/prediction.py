@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.excitation import drive_spectrum
-from models.identification.spectrum_model import spectrum_model
-from models.identification.types import Excitation, Fit, Spectrum
-from models.plants import PlantSpec, frequency_response
+from stillpath.models.identification.excitation import drive_spectrum
+from stillpath.models.identification.spectrum_model import spectrum_model
+from stillpath.models.identification.types import Excitation, Fit, Spectrum
+from stillpath.models.plants import PlantSpec, frequency_response
 
 __all__ = ["predicted_psd", "predicted_spectrum"]
 

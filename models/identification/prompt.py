@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.identification.sanathanan_koerner import pairs_of
-from models.identification.types import Fit
-from models.plants import PairsSpec, PlantSpec, PolePair, RelativeModesSpec, ZeroPair
+from stillpath.models.identification.sanathanan_koerner import pairs_of
+from stillpath.models.identification.types import Fit
+from stillpath.models.plants import PairsSpec, PlantSpec, PolePair, RelativeModesSpec, ZeroPair
 
 __all__ = ["advanced", "delay_of", "prompt"]
 

@@ -9,8 +9,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.types import ModeEstimate
-from models.plants import PlantSpec, RelativeModesSpec, frequency_response
+from stillpath.models.identification.types import ModeEstimate
+from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["Population", "mode_spread", "representatives"]
 

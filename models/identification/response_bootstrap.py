@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.averaging import aligned_to, mean_response, on_grid
-from models.identification.frame import shaken, without_frame
-from models.identification.modal_fit import alternatives, refit
-from models.identification.mode_estimates import correlation_factor
-from models.identification.prompt import advanced, delay_of, prompt
-from models.identification.representatives import Population, representatives
-from models.identification.response_data import coherent
-from models.identification.types import Fit, FrequencyResponse
-from models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
+from stillpath.models.identification.averaging import aligned_to, mean_response, on_grid
+from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.modal_fit import alternatives, refit
+from stillpath.models.identification.mode_estimates import correlation_factor
+from stillpath.models.identification.prompt import advanced, delay_of, prompt
+from stillpath.models.identification.representatives import Population, representatives
+from stillpath.models.identification.response_data import coherent
+from stillpath.models.identification.types import Fit, FrequencyResponse
+from stillpath.models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["explain_response"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from models.identification.response_data import ResponseData
+from stillpath.models.identification.response_data import ResponseData
 
 __all__ = ["GAIN", "Candidate", "Structure", "delay_span", "judged", "least_error", "with_gain"]
 

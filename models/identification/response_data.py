@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.averaging import low_frequency_delay
-from models.identification.types import FrequencyResponse
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import low_frequency_delay
+from stillpath.models.identification.types import FrequencyResponse
 
 __all__ = ["LEAST_COHERENCE", "ResponseData", "coherent", "coherent_part", "response_data"]
 

@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.linalg import block_diag
 
-from models.errors import ModelError
-from models.identification.ripple_observability import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.ripple_observability import (
     Observability,
     folded_distances,
     observability,
     refuse_unobservable,
 )
-from models.plants import DiscretePlant
-from models.response_kernels import dense_response
-from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
+from stillpath.models.plants import DiscretePlant
+from stillpath.models.response_kernels import dense_response
+from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
 
 __all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
 

@@ -20,18 +20,18 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import block_diag
 
-from models.errors import ModelError
-from models.identification.readers.tables import as_table
-from models.identification.ripple import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.tables import as_table
+from stillpath.models.identification.ripple import (
     PassLog,
     RippleLearning,
     WaveBasis,
     learn_ripple,
     update_ripple,
 )
-from models.machine import Machine
-from models.plants import DiscretePlant, discretise
-from models.ripple import RippleAxis
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, discretise
+from stillpath.models.ripple import RippleAxis
 
 __all__ = ["learn_machine_ripple", "read_pass"]
 

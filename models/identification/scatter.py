@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.spectrum_model import SpectrumModel
+from stillpath.models.identification.spectrum_model import SpectrumModel
 
 __all__ = ["SCATTERS", "Scatter"]
 

@@ -12,21 +12,21 @@ from datetime import date
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.averaging import mean_response
-from models.identification.modal_fit import fit_modes, refit
-from models.identification.prompt import delay_of, prompt
-from models.identification.response_bootstrap import explain_response
-from models.identification.response_data import coherent_part
-from models.identification.spectrum_fit import explain_spectra
-from models.identification.types import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import mean_response
+from stillpath.models.identification.modal_fit import fit_modes, refit
+from stillpath.models.identification.prompt import delay_of, prompt
+from stillpath.models.identification.response_bootstrap import explain_response
+from stillpath.models.identification.response_data import coherent_part
+from stillpath.models.identification.spectrum_fit import explain_spectra
+from stillpath.models.identification.types import (
     AxisIdentification,
     Excitation,
     Fit,
     FrequencyResponse,
     Spectrum,
 )
-from models.plants import (
+from stillpath.models.plants import (
     ParametricMembers,
     PlantSetSpec,
     PlantSpec,
@@ -34,7 +34,7 @@ from models.plants import (
     WeightedMember,
     frequency_response,
 )
-from models.provenance import Kind, MeasuredMode, Provenance, SourceFile
+from stillpath.models.provenance import Kind, MeasuredMode, Provenance, SourceFile
 
 __all__ = [
     "PARAMETRIC_SPREAD",

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
-from models.identification.types import Spectrum
-from models.shaper_pulses import Pulses, shaper_pulses
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.types import Spectrum
+from stillpath.models.shaper_pulses import Pulses, shaper_pulses
 
 __all__ = [
     "ShaperChoice",

@@ -17,25 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from models.errors import ModelError
-from models.identification.averaging import mean_spectrum
-from models.identification.frame import shaken, without_frame
-from models.identification.modal_structure import ModalStructure
-from models.identification.representatives import Population, mode_spread, representatives
-from models.identification.scatter import SCATTERS, Scatter
-from models.identification.spectrum_model import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import mean_spectrum
+from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.identification.representatives import Population, mode_spread, representatives
+from stillpath.models.identification.scatter import SCATTERS, Scatter
+from stillpath.models.identification.spectrum_model import (
     cross_axis_share,
     driven_column,
     spectrum_model,
 )
-from models.identification.types import (
+from stillpath.models.identification.types import (
     Excitation,
     Fit,
     ModeEstimate,
     OrderTrial,
     Spectrum,
 )
-from models.plants import PlantSpec, RelativeModesSpec, frequency_response
+from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
 __all__ = ["Explained", "explain_spectra", "fit_spectrum", "refit_spectrum"]
 

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.excitation import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import (
     drive_spectrum,
     drive_spectrum_regenerated,
     welch_kernel,
 )
-from models.identification.modal_structure import ModalStructure
-from models.identification.types import Excitation, Spectrum
+from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.identification.types import Excitation, Spectrum
 
 __all__ = ["SpectrumModel", "cross_axis_share", "driven_column", "spectrum_model"]
 

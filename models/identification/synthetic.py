@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from models.errors import ModelError
-from models.identification.excitation import VelocityProfile, klipper_psd, regenerate
-from models.identification.types import AccelerationLog, Excitation, Spectrum
-from models.plants import PlantSpec, continuous
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import VelocityProfile, klipper_psd, regenerate
+from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.plants import PlantSpec, continuous
 
 __all__ = [
     "ADXL345",

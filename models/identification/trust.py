@@ -6,9 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.errors import ModelError
-from models.identification.response_data import LEAST_COHERENCE, coherent
-from models.identification.types import AxisIdentification, Fit, FrequencyResponse, Spectrum
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.response_data import LEAST_COHERENCE, coherent
+from stillpath.models.identification.types import (
+    AxisIdentification,
+    Fit,
+    FrequencyResponse,
+    Spectrum,
+)
 
 __all__ = ["check_axes", "check_told", "keeps_time"]
 

@@ -8,8 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from models.plants import PlantSetSpec, PlantSpec
-from models.schedule import AxisSchedule
+from stillpath.models.plants import PlantSetSpec, PlantSpec
+from stillpath.models.schedule import AxisSchedule
 
 __all__ = [
     "AccelerationLog",

@@ -15,14 +15,14 @@ from typing import Annotated, NoReturn
 from fastapi import Depends, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
-from service.api.limits import Limits, name_of
-from service.api.patience import patience_of
-from service.api.problems import Problem
-from service.database.engine import DatabaseAway
-from service.security.audit import AuditLog
-from service.security.callers import LOCAL, Caller, Scope
-from service.security.keys import KeyStore
-from service.settings import is_loopback
+from stillpath.service.api.limits import Limits, name_of
+from stillpath.service.api.patience import patience_of
+from stillpath.service.api.problems import Problem
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.security.audit import AuditLog
+from stillpath.service.security.callers import LOCAL, Caller, Scope
+from stillpath.service.security.keys import KeyStore
+from stillpath.service.settings import is_loopback
 
 __all__ = ["Admin", "Operator", "Reader", "Submitter", "Uploader", "Watcher"]
 

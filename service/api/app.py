@@ -9,7 +9,10 @@ from contextlib import AsyncExitStack, asynccontextmanager
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from service.api import (
+from stillpath.applications.identification.archive import Archive
+from stillpath.applications.machines.resolve import Resolver
+from stillpath.applications.machines.store import MachineStore
+from stillpath.service.api import (
     assets,
     controllers,
     designs,
@@ -29,30 +32,27 @@ from service.api import (
     problems,
     trajectories,
 )
-from service.api.computing import NotYet, not_yet
-from service.api.guard import Guard, hosts_of
-from service.api.hub import Hub
-from service.api.intake import Intake
-from service.api.limits import Limits
-from service.api.proxies import Proxies
-from service.database.documents import open_documents
-from service.database.engine import open_database
-from service.deliveries.checking import Checker
-from service.deliveries.printers import load_printers
-from service.deliveries.sender import Sender
-from service.identification.archive import Archive
-from service.jobs.store import JobStore
-from service.jobs.task import Runner
-from service.jobs.work import Work
-from service.jobs.worker import run_task
-from service.machines.resolve import Resolver
-from service.machines.store import MachineStore
-from service.security.audit import AuditLog
-from service.security.keys import KeyStore, announce_first_key
-from service.settings import Settings
-from service.storage.disk import Disk
-from service.storage.opened import open_storage
-from service.version import __version__
+from stillpath.service.api.computing import NotYet, not_yet
+from stillpath.service.api.guard import Guard, hosts_of
+from stillpath.service.api.hub import Hub
+from stillpath.service.api.intake import Intake
+from stillpath.service.api.limits import Limits
+from stillpath.service.api.proxies import Proxies
+from stillpath.service.database.documents import open_documents
+from stillpath.service.database.engine import open_database
+from stillpath.service.deliveries.checking import Checker
+from stillpath.service.deliveries.printers import load_printers
+from stillpath.service.deliveries.sender import Sender
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.task import Runner
+from stillpath.service.jobs.work import Work
+from stillpath.service.jobs.worker import run_task
+from stillpath.service.security.audit import AuditLog
+from stillpath.service.security.keys import KeyStore, announce_first_key
+from stillpath.service.settings import Settings
+from stillpath.service.storage.disk import Disk
+from stillpath.service.storage.opened import open_storage
+from stillpath.version import __version__
 
 __all__ = ["create_app"]
 

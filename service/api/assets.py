@@ -12,14 +12,14 @@ from fastapi import APIRouter, Path, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from gcode.containers.sniff import Kind, kind_of
-from service.api.access import Reader
-from service.api.finding import JobId, find_done
-from service.api.problems import Problem, responses
-from service.api.schemas import LayerIndex
-from service.api.stored import HEADERS, MEDIA, RANGES, stored
-from service.jobs.state import Job, JobKind
-from service.storage.base import Storage
+from stillpath.gcode.containers.sniff import Kind, kind_of
+from stillpath.service.api.access import Reader
+from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.schemas import LayerIndex
+from stillpath.service.api.stored import HEADERS, MEDIA, RANGES, stored
+from stillpath.service.jobs.state import Job, JobKind
+from stillpath.service.storage.base import Storage
 
 __all__ = ["Layers", "router"]
 

@@ -22,15 +22,15 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, Response
 
-from models.machine import Machine
-from service.api.finding import no_such_job
-from service.api.problems import Problem
-from service.api.schemas import JobView
-from service.jobs.problems import problem
-from service.jobs.state import Cancelled, Job, JobKind, JobState
-from service.machines.resolve import PinnedMachine
-from service.security.callers import Caller
-from service.version import __version__
+from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.models.machine import Machine
+from stillpath.service.api.finding import no_such_job
+from stillpath.service.api.problems import Problem
+from stillpath.service.api.schemas import JobView
+from stillpath.service.jobs.problems import problem
+from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
+from stillpath.service.security.callers import Caller
+from stillpath.version import __version__
 
 __all__ = ["WAITING", "NotYet", "Question", "answer_of", "answered", "not_yet"]
 

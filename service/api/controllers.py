@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Body, Header, Path, Query, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 
-from models.loops import builtin_loops
-from service.api.access import Reader
-from service.api.computing import WAITING, Question, answer_of, answered
-from service.api.problems import Problem, responses
-from service.controllers.figures import ControllerReport, LoopFigures
-from service.controllers.options import ControllerOptions
-from service.jobs.state import JobKind
+from stillpath.applications.controllers.figures import ControllerReport, LoopFigures
+from stillpath.applications.controllers.options import ControllerOptions
+from stillpath.models.loops import builtin_loops
+from stillpath.service.api.access import Reader
+from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.jobs.state import JobKind
 
 __all__ = ["router"]
 

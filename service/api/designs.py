@@ -8,13 +8,13 @@ from fastapi import APIRouter, Depends, Header, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, Response
 
-from service.api.access import Reader
-from service.api.computing import WAITING, Question, answer_of, answered
-from service.api.machines import Name, look_up
-from service.api.problems import responses
-from service.design.figures import DesignReport
-from service.jobs.state import JobKind
-from service.pipeline.options import BasisName, RobustMode
+from stillpath.applications.design.figures import DesignReport
+from stillpath.pipeline.options import BasisName, RobustMode
+from stillpath.service.api.access import Reader
+from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.machines import Name, look_up
+from stillpath.service.api.problems import responses
+from stillpath.service.jobs.state import JobKind
 
 __all__ = ["router"]
 
@@ -83,6 +83,6 @@ async def read_design_page(found: Asked) -> HTMLResponse:
 
 
 def _page(found: DesignReport, headers: dict[str, str] | None = None) -> HTMLResponse:
-    from service.design.page import render_design
+    from stillpath.applications.design.page import render_design
 
     return HTMLResponse(render_design(found), headers=headers)

@@ -19,6 +19,6 @@ async def report_schema() -> dict[str, Any]:
 
 
 def _schema() -> dict[str, Any]:
-    from service.reports import report_schema
+    from stillpath.reports import report_schema
 
     return report_schema()

@@ -9,10 +9,10 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Request
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
-from service.api.access import Watcher
-from service.api.finding import JobId, find
-from service.api.hub import Hub
-from service.api.problems import responses
+from stillpath.service.api.access import Watcher
+from stillpath.service.api.finding import JobId, find
+from stillpath.service.api.hub import Hub
+from stillpath.service.api.problems import responses
 
 __all__ = ["router"]
 

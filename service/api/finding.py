@@ -8,10 +8,10 @@ from typing import Annotated
 from fastapi import Path, Request
 from starlette.concurrency import run_in_threadpool
 
-from service.api.problems import Problem
-from service.jobs.state import Job, JobKind, JobState
-from service.jobs.store import JobStore
-from service.security.callers import Caller
+from stillpath.service.api.problems import Problem
+from stillpath.service.jobs.state import Job, JobKind, JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.security.callers import Caller
 
 __all__ = ["JobId", "find", "find_done", "no_such_job"]
 

@@ -6,12 +6,12 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 
-from models.machine import Machine
-from service.api.access import Reader
-from service.api.machines import as_problems, look_up
-from service.api.problems import responses
-from service.machines.frequency import AxisResponse, axis_responses
-from service.machines.resolve import Resolver
+from stillpath.applications.machines.frequency import AxisResponse, axis_responses
+from stillpath.applications.machines.resolve import Resolver
+from stillpath.models.machine import Machine
+from stillpath.service.api.access import Reader
+from stillpath.service.api.machines import as_problems, look_up
+from stillpath.service.api.problems import responses
 
 __all__ = ["router"]
 

@@ -13,9 +13,9 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.limits import limited_receive, too_long
-from service.api.problems import Problem, problem_response
-from service.settings import Settings, is_loopback
+from stillpath.service.api.limits import limited_receive, too_long
+from stillpath.service.api.problems import Problem, problem_response
+from stillpath.service.settings import Settings, is_loopback
 
 __all__ = ["Guard", "hosts_of"]
 

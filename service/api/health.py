@@ -9,13 +9,13 @@ import structlog
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 
-from service.api.problems import Problem, responses
-from service.api.schemas import Health
-from service.database.engine import StoreError
-from service.jobs.store import JobStore
-from service.storage.base import Storage, StorageError
-from service.storage.disk import Disk
-from service.version import __version__
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.schemas import Health
+from stillpath.service.database.engine import StoreError
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.storage.base import Storage, StorageError
+from stillpath.service.storage.disk import Disk
+from stillpath.version import __version__
 
 __all__ = ["Readiness", "router"]
 

@@ -12,9 +12,9 @@ import structlog
 from sse_starlette import ServerSentEvent
 from starlette.concurrency import run_in_threadpool
 
-from service.api.schemas import JobView
-from service.jobs.state import JobState
-from service.jobs.store import JobStore
+from stillpath.service.api.schemas import JobView
+from stillpath.service.jobs.state import JobState
+from stillpath.service.jobs.store import JobStore
 
 __all__ = ["Hub", "Snapshot"]
 

@@ -11,24 +11,24 @@ from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse
 
-from models.identification.readers.settings import ReadSettings
-from models.machine import Machine
-from models.store import explain
-from service.api.access import Reader, Uploader
-from service.api.computing import WAITING, Question, answer_of, answered
-from service.api.forms import is_form
-from service.api.machine_views import RevisionView
-from service.api.machines import Author, Message, Name, as_problems, look_up
-from service.api.problems import Problem, responses
-from service.api.uploads import Received, receive_files, safe_name
-from service.identification.archive import Archive
-from service.identification.figures import IdentificationReport
-from service.jobs.state import JobKind
-from service.machines.resolve import Resolver
-from service.machines.revision import Revision
-from service.security.audit import record
-from service.security.callers import Caller, Scope
-from service.storage.disk import Disk
+from stillpath.applications.identification.archive import Archive
+from stillpath.applications.identification.figures import IdentificationReport
+from stillpath.applications.machines.resolve import Resolver
+from stillpath.applications.machines.revision import Revision
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.machine import Machine
+from stillpath.models.store import explain
+from stillpath.service.api.access import Reader, Uploader
+from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.forms import is_form
+from stillpath.service.api.machine_views import RevisionView
+from stillpath.service.api.machines import Author, Message, Name, as_problems, look_up
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.uploads import Received, receive_files, safe_name
+from stillpath.service.jobs.state import JobKind
+from stillpath.service.security.audit import record
+from stillpath.service.security.callers import Caller, Scope
+from stillpath.service.storage.disk import Disk
 
 __all__ = ["router"]
 
@@ -188,7 +188,7 @@ def read_identification(request: Request, name: Name, _: Reader) -> Identificati
 )
 def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLResponse:
     """Return one self-contained HTML page: measured and model, modes, shapers."""
-    from service.identification.page import render_identification
+    from stillpath.applications.identification.page import render_identification
 
     return HTMLResponse(render_identification(_kept(request, name)))
 

@@ -17,30 +17,30 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import Request
 from starlette.concurrency import run_in_threadpool
 
-from models.errors import ModelError
-from service.api.problems import Problem
-from service.api.schemas import JobQuery
-from service.api.uploads import Upload, receive_upload
-from service.database.engine import DatabaseAway
-from service.deliveries.checking import Checker
-from service.deliveries.printers import Printer, printer_for
-from service.deliveries.targets import TargetRefused, check_webhook
-from service.jobs.state import Job
-from service.jobs.store import (
+from stillpath.applications.machines.resolve import PinnedMachine, Resolver
+from stillpath.applications.machines.revision import NotApproved, UnknownMachine
+from stillpath.models.errors import ModelError
+from stillpath.service.api.problems import Problem
+from stillpath.service.api.schemas import JobQuery
+from stillpath.service.api.uploads import Upload, receive_upload
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.deliveries.checking import Checker
+from stillpath.service.deliveries.printers import Printer, printer_for
+from stillpath.service.deliveries.targets import TargetRefused, check_webhook
+from stillpath.service.jobs.state import Job
+from stillpath.service.jobs.store import (
     IdempotencyConflict,
     JobStore,
     Quota,
     QuotaExceeded,
     SpaceExceeded,
 )
-from service.machines.resolve import PinnedMachine, Resolver
-from service.machines.revision import NotApproved, UnknownMachine
-from service.security.audit import AuditLog, tell
-from service.security.callers import Caller
-from service.settings import Settings
-from service.storage.base import Storage, StorageError
-from service.storage.disk import Disk
-from service.version import __version__
+from stillpath.service.security.audit import AuditLog, tell
+from stillpath.service.security.callers import Caller
+from stillpath.service.settings import Settings
+from stillpath.service.storage.base import Storage, StorageError
+from stillpath.service.storage.disk import Disk
+from stillpath.version import __version__
 
 __all__ = ["Intake", "Taken"]
 

@@ -10,21 +10,21 @@ from typing import Annotated, TypeVar
 from fastapi import APIRouter, Header, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from gcode.containers.sniff import Kind
-from service.api.access import Reader, Submitter, Uploader, Watcher
-from service.api.finding import JobId, find, no_such_job
-from service.api.hub import Hub
-from service.api.intake import Intake
-from service.api.problems import Problem, responses
-from service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
-from service.database.engine import DatabaseAway
-from service.deliveries.sender import Sender
-from service.jobs.state import Cancelled, Job, JobKind, JobState
-from service.jobs.store import BadCursor, JobStore
-from service.security.audit import record
-from service.security.callers import Caller, Scope
-from service.storage.base import Storage, StorageError
-from service.storage.disk import Disk
+from stillpath.gcode.containers.sniff import Kind
+from stillpath.service.api.access import Reader, Submitter, Uploader, Watcher
+from stillpath.service.api.finding import JobId, find, no_such_job
+from stillpath.service.api.hub import Hub
+from stillpath.service.api.intake import Intake
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.deliveries.sender import Sender
+from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
+from stillpath.service.jobs.store import BadCursor, JobStore
+from stillpath.service.security.audit import record
+from stillpath.service.security.callers import Caller, Scope
+from stillpath.service.storage.base import Storage, StorageError
+from stillpath.service.storage.disk import Disk
 
 __all__ = ["router", "upload_body"]
 

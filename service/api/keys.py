@@ -9,11 +9,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.api.access import Admin
-from service.api.problems import Problem, responses
-from service.security.audit import AuditEntry, AuditLog, record
-from service.security.callers import Scope
-from service.security.keys import OWNER_PATTERN, Key, KeyRefused, KeyStore
+from stillpath.service.api.access import Admin
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.security.audit import AuditEntry, AuditLog, record
+from stillpath.service.security.callers import Scope
+from stillpath.service.security.keys import OWNER_PATTERN, Key, KeyRefused, KeyStore
 
 __all__ = ["router"]
 

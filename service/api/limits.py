@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 from starlette.exceptions import HTTPException
 
-from service.api.patience import PATIENCE, Patience
-from service.api.problems import Problem
+from stillpath.service.api.patience import PATIENCE, Patience
+from stillpath.service.api.problems import Problem
 
 if TYPE_CHECKING:
     from starlette.types import Message, Receive, Scope
 
-    from service.security.callers import Caller
+    from stillpath.service.security.callers import Caller
 
 __all__ = ["COUNTED", "Limits", "limited_receive", "name_of", "too_long"]
 

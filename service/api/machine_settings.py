@@ -8,17 +8,24 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from models.errors import ModelError
-from models.machine import Machine
-from service.api.access import Admin
-from service.api.machine_views import RevisionView
-from service.api.machines import Author, IfMatch, Message, Name, as_problems, store_revision
-from service.api.problems import Problem, responses
-from service.api.uploads import receive_document, safe_name
-from service.machines import marlin_settings
-from service.machines.checks import machine_from_config
-from service.machines.klipper_config import parse_printer_config
-from service.machines.revision import source_file
+from stillpath.applications.machines import marlin_settings
+from stillpath.applications.machines.checks import machine_from_config
+from stillpath.applications.machines.klipper_config import parse_printer_config
+from stillpath.applications.machines.revision import source_file
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.service.api.access import Admin
+from stillpath.service.api.machine_views import RevisionView
+from stillpath.service.api.machines import (
+    Author,
+    IfMatch,
+    Message,
+    Name,
+    as_problems,
+    store_revision,
+)
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.uploads import receive_document, safe_name
 
 __all__ = ["router"]
 

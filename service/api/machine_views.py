@@ -8,12 +8,12 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from models.errors import ModelError
-from models.machine import Machine
-from models.provenance import Provenance, SourceFile
-from service.machines.diff import Change
-from service.machines.drift import Drift
-from service.machines.revision import Approval, Revision
+from stillpath.applications.machines.diff import Change
+from stillpath.applications.machines.drift import Drift
+from stillpath.applications.machines.revision import Approval, Revision
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.provenance import Provenance, SourceFile
 
 __all__ = ["DiffView", "HistoryView", "MachineSummary", "RevisionDocument", "RevisionView"]
 

@@ -10,27 +10,27 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from models.errors import ModelError
-from models.machine import Machine
-from models.provenance import SourceFile
-from models.store import builtin_machines, load_machine, read_machine
-from service.api.access import Admin, Reader
-from service.api.machine_views import (
+from stillpath.applications.machines.diff import diff
+from stillpath.applications.machines.drift import drift
+from stillpath.applications.machines.resolve import Resolver
+from stillpath.applications.machines.revision import Conflict, Revision, UnknownMachine
+from stillpath.applications.machines.store import MachineStore
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.provenance import SourceFile
+from stillpath.models.store import builtin_machines, load_machine, read_machine
+from stillpath.service.api.access import Admin, Reader
+from stillpath.service.api.machine_views import (
     DiffView,
     HistoryView,
     MachineSummary,
     RevisionDocument,
     RevisionView,
 )
-from service.api.problems import Problem, responses
-from service.api.uploads import receive_document
-from service.machines.diff import diff
-from service.machines.drift import drift
-from service.machines.resolve import Resolver
-from service.machines.revision import Conflict, Revision, UnknownMachine
-from service.machines.store import MachineStore
-from service.security.audit import record
-from service.security.callers import Caller
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.uploads import receive_document
+from stillpath.service.security.audit import record
+from stillpath.service.security.callers import Caller
 
 __all__ = [
     "Author",

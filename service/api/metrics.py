@@ -15,14 +15,14 @@ from prometheus_client.registry import Collector
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
-from service.api.access import Operator
-from service.api.problems import responses
-from service.database.engine import StoreError
+from stillpath.service.api.access import Operator
+from stillpath.service.api.problems import responses
+from stillpath.service.database.engine import StoreError
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-    from service.jobs.store import JobStore
+    from stillpath.service.jobs.store import JobStore
 
 __all__ = ["Measured", "Metrics", "router"]
 

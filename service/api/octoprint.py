@@ -14,12 +14,12 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.concurrency import run_in_threadpool
 
-from service.api.access import Reader, Uploader
-from service.api.intake import Intake
-from service.api.jobs import upload_body
-from service.api.problems import Problem, responses
-from service.api.schemas import JobQuery
-from service.version import __version__
+from stillpath.service.api.access import Reader, Uploader
+from stillpath.service.api.intake import Intake
+from stillpath.service.api.jobs import upload_body
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.schemas import JobQuery
+from stillpath.version import __version__
 
 __all__ = ["router"]
 

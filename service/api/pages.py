@@ -17,11 +17,11 @@ from importlib.resources.abc import Traversable
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
-from service.api.problems import Problem
+from stillpath.service.api.problems import Problem
 
 __all__ = ["Page", "PageFile", "page_files", "router"]
 
-_PACKAGE = "service.web"
+_PACKAGE = "stillpath.service.web"
 _INDEX = "index.html"
 _PLACEHOLDER = b"{{version}}"
 _TYPES = {

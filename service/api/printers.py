@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Path, Request
 from pydantic import BaseModel, Field
 
-from models.errors import ModelError
-from models.machine import Machine
-from service.api.access import Admin, Reader
-from service.api.problems import Problem, responses
-from service.deliveries.checking import Checker, PrinterCheck, PrinterUnknown
-from service.deliveries.printers import Printer
-from service.machines.resolve import Resolver
-from service.security.audit import record
+from stillpath.applications.machines.resolve import Resolver
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.service.api.access import Admin, Reader
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.deliveries.checking import Checker, PrinterCheck, PrinterUnknown
+from stillpath.service.deliveries.printers import Printer
+from stillpath.service.security.audit import record
 
 __all__ = ["router"]
 

@@ -16,11 +16,11 @@ from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 from starlette.routing import Match
 
-from models.complaints import complaint
-from service.database.engine import DatabaseAway
-from service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
-from service.storage.base import StorageError
-from service.storage.disk import NoRoom
+from stillpath.models.complaints import complaint
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
+from stillpath.service.storage.base import StorageError
+from stillpath.service.storage.disk import NoRoom
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
 

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from service.deliveries.targets import read_url
-from service.jobs.state import Job, JobKind, JobState
-from service.pipeline.options import (
+from stillpath.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
     BudgetUm,
@@ -20,9 +18,11 @@ from service.pipeline.options import (
     RobustMode,
     Where,
 )
+from stillpath.service.deliveries.targets import read_url
+from stillpath.service.jobs.state import Job, JobKind, JobState
 
 if TYPE_CHECKING:
-    from service.deliveries.rows import Delivery
+    from stillpath.service.deliveries.rows import Delivery
 
 __all__ = ["DeliveryView", "Health", "JobPage", "JobQuery", "JobView", "LayerIndex", "Links"]
 

@@ -10,8 +10,8 @@ from fastapi import Request
 from starlette.concurrency import iterate_in_threadpool, run_in_threadpool
 from starlette.responses import Response, StreamingResponse
 
-from service.api.problems import Problem
-from service.storage.base import Storage
+from stillpath.service.api.problems import Problem
+from stillpath.service.storage.base import Storage
 
 __all__ = ["HEADERS", "MEDIA", "RANGES", "matches", "stored"]
 

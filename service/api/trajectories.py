@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
-from service.api.access import Reader
-from service.api.computing import WAITING, Question, answered
-from service.api.finding import JobId, find_done
-from service.api.problems import Problem, responses
-from service.api.stored import MEDIA, stored
-from service.jobs.state import JobKind
+from stillpath.service.api.access import Reader
+from stillpath.service.api.computing import WAITING, Question, answered
+from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.stored import MEDIA, stored
+from stillpath.service.jobs.state import JobKind
 
 __all__ = ["router"]
 

@@ -14,10 +14,10 @@ from typing import BinaryIO
 from anyio import to_thread
 from fastapi import Request
 
-from service.api.forms import broken_form, is_form, read_form
-from service.api.limits import COUNTED
-from service.api.problems import Problem
-from service.storage.disk import Disk
+from stillpath.service.api.forms import broken_form, is_form, read_form
+from stillpath.service.api.limits import COUNTED
+from stillpath.service.api.problems import Problem
+from stillpath.service.storage.disk import Disk
 
 __all__ = [
     "Received",

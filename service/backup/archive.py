@@ -23,9 +23,9 @@ from typing import IO
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from service.exclusive import exclusive
-from service.pipeline.files import replacing
-from service.version import __version__
+from stillpath.pipeline.files import replacing
+from stillpath.service.exclusive import exclusive
+from stillpath.version import __version__
 
 __all__ = ["BackupError", "Manifest", "back_up", "restore"]
 

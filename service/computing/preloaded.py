@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import gc
 
-import service.controllers.design
-import service.controllers.page
-import service.design.design
-import service.identification.run  # noqa: F401
+import stillpath.applications.controllers.design
+import stillpath.applications.controllers.page
+import stillpath.applications.design.design
+import stillpath.applications.identification.run  # noqa: F401
 
 gc.freeze()  # so that the copies' collectors leave alone what they share

@@ -6,9 +6,9 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from service.jobs.state import JobKind
-from service.jobs.task import Task
-from service.pipeline.progress import Progress, ProgressCallback, telling
+from stillpath.pipeline.progress import Progress, ProgressCallback, telling
+from stillpath.service.jobs.state import JobKind
+from stillpath.service.jobs.task import Task
 
 __all__ = ["answer"]
 
@@ -32,9 +32,9 @@ def _identify(task: Task, progress: ProgressCallback) -> None:
     Options: `files` (name and condition of each), `settings` (of reading), `name`, `title` and
     `order`.
     """
-    from models.identification.conditions import Condition
-    from models.identification.readers import ReadSettings
-    from service.identification.run import InputFile, identify_files
+    from stillpath.applications.identification.run import InputFile, identify_files
+    from stillpath.models.identification.conditions import Condition
+    from stillpath.models.identification.readers import ReadSettings
 
     asked = task.options
     inputs = [
@@ -61,7 +61,7 @@ def _identify(task: Task, progress: ProgressCallback) -> None:
 
 def _design(task: Task, progress: ProgressCallback) -> None:
     """Write the report of the design of one axis; options: `axis`, `basis`, `robust`."""
-    from service.design.design import design_report
+    from stillpath.applications.design.design import design_report
 
     telling(progress, "designing", 0.0)(0.0)
     asked = task.options
@@ -76,9 +76,9 @@ def _design_controller(task: Task, progress: ProgressCallback) -> None:
 
     The options are those of the request; the machine is a closed-loop one.
     """
-    from service.controllers.design import design_controller
-    from service.controllers.options import read_options, resolved
-    from service.controllers.page import render_controller
+    from stillpath.applications.controllers.design import design_controller
+    from stillpath.applications.controllers.options import read_options, resolved
+    from stillpath.applications.controllers.page import render_controller
 
     telling(progress, "designing", 0.0)(0.0)
     options = read_options(task.options)
@@ -95,7 +95,7 @@ def _design_controller(task: Task, progress: ProgressCallback) -> None:
 
 def _list_loops(task: Task, progress: ProgressCallback) -> None:
     """Write the built-in closed-loop machines and the methods that fit each."""
-    from service.controllers.design import loop_figures
+    from stillpath.applications.controllers.design import loop_figures
 
     telling(progress, "designing", 0.0)(0.0)
     _write(task, [figures.model_dump(mode="json") for figures in loop_figures()])
@@ -103,8 +103,8 @@ def _list_loops(task: Task, progress: ProgressCallback) -> None:
 
 def _trace(task: Task, progress: ProgressCallback) -> None:
     """Write the motion of another job; options: that job's `options`, `format` and times."""
-    from service.pipeline.options import Options
-    from service.pipeline.trajectories import write_trajectories
+    from stillpath.pipeline.options import Options
+    from stillpath.pipeline.trajectories import write_trajectories
 
     asked = task.options
     settings = Options.model_validate(asked["options"])

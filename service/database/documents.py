@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 from sqlalchemy import ColumnElement, Connection, Engine, func, select, text, update
 
-from service.database.engine import database_url, insert, reading, writing
-from service.database.tables import documents
-from service.machines.documents import DocumentFolder, Documents
+from stillpath.applications.machines.documents import DocumentFolder, Documents
+from stillpath.service.database.engine import database_url, insert, reading, writing
+from stillpath.service.database.tables import documents
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    from stillpath.service.settings import Settings
 
 __all__ = ["DocumentTable", "open_documents"]
 
@@ -42,7 +42,7 @@ def open_documents(settings: Settings, engine: Engine, name: str) -> Documents:
 
 
 class DocumentTable:
-    """`service.machines.documents.Documents` in the table ``documents``.
+    """`applications.machines.documents.Documents` in the table ``documents``.
 
     Parameters
     ----------

@@ -21,13 +21,13 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, InterfaceError, Operationa
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
-from service.database.migrations import LATEST
-from service.private import private_file, private_folder
+from stillpath.service.database.migrations import LATEST
+from stillpath.service.private import private_file, private_folder
 
 if TYPE_CHECKING:
     from sqlalchemy import Table
 
-    from service.settings import Settings
+    from stillpath.service.settings import Settings
 
 _T = TypeVar("_T")
 
@@ -201,7 +201,7 @@ def _lock_schema(connection: Connection) -> None:
 
 def _make_schema(connection: Connection) -> None:
     """Make the tables as they are now, and say so as Alembic does: there is nothing to migrate."""
-    from service.database.tables import metadata
+    from stillpath.service.database.tables import metadata
 
     metadata.create_all(connection)
     connection.exec_driver_sql(
@@ -362,7 +362,7 @@ def _plainly(engine: Engine) -> Iterator[None]:
 
 def _take_over_old_jobs(data_dir: Path, engine: Engine) -> None:
     if (data_dir / "jobs.sqlite3").exists():
-        from service.database.old_jobs import take_over
+        from stillpath.service.database.old_jobs import take_over
 
         take_over(data_dir, engine)
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from sqlalchemy import Engine
 
-from service.database import tables
-from service.database.engine import StoreError, insert, writing
-from service.security.callers import LOCAL
+from stillpath.service.database import tables
+from stillpath.service.database.engine import StoreError, insert, writing
+from stillpath.service.security.callers import LOCAL
 
 __all__ = ["take_over"]
 
@@ -89,8 +89,8 @@ def _new_row(old: sqlite3.Row, folder: Path) -> dict[str, Any]:
 
 
 def _machine_revision(file: Path) -> str:
-    from models.errors import ModelError
-    from service.machines.resolve import PinnedMachine
+    from stillpath.applications.machines.resolve import PinnedMachine
+    from stillpath.models.errors import ModelError
 
     try:
         return PinnedMachine.read(file, "").machine.revision if file.is_file() else ""

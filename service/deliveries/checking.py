@@ -16,15 +16,15 @@ from typing import Any, Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json
 
-from models.errors import ModelError
-from models.firmware import Klipper
-from models.machine import Machine
-from service.deliveries.moonraker import Asked, NotReady, ask
-from service.deliveries.posting import Unanswered, Unreached
-from service.deliveries.printers import Printer
-from service.deliveries.targets import TargetRefused
-from service.machines.checks import differences
-from service.machines.documents import Documents
+from stillpath.applications.machines.checks import differences
+from stillpath.applications.machines.documents import Documents
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import Machine
+from stillpath.service.deliveries.moonraker import Asked, NotReady, ask
+from stillpath.service.deliveries.posting import Unanswered, Unreached
+from stillpath.service.deliveries.printers import Printer
+from stillpath.service.deliveries.targets import TargetRefused
 
 __all__ = ["Checker", "Finding", "PrinterCheck", "PrinterUnknown", "findings", "relevant"]
 
@@ -334,7 +334,7 @@ def _in_force(machine: Machine, asked: Asked) -> Iterator[Finding]:
 
 def _commands(machine: Machine, asked: Asked) -> Iterator[Finding]:
     """Find macros that stand in the way of what a stream sets."""
-    from gcode.firmware.registry import kit  # heavy
+    from stillpath.gcode.firmware.registry import kit  # heavy
 
     own = {section.lower() for section in asked.sections}
     limits = kit(machine).stream_limits(kit(machine).initial_limits())

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.deliveries.posting import Unanswered, get
-from service.deliveries.printers import Printer
-from service.deliveries.targets import read_url
-from service.machines.klipper_config import Option, PrinterConfig
+from stillpath.applications.machines.klipper_config import Option, PrinterConfig
+from stillpath.service.deliveries.posting import Unanswered, get
+from stillpath.service.deliveries.printers import Printer
+from stillpath.service.deliveries.targets import read_url
 
 __all__ = ["Asked", "NotReady", "ask"]
 

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from service.deliveries.targets import Target, Unresolved, addresses_of
-from service.version import __version__
+from stillpath.service.deliveries.targets import Target, Unresolved, addresses_of
+from stillpath.version import __version__
 
 if TYPE_CHECKING:
     import httpx2

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
-from models.complaints import complaint
-from service.deliveries.posting import Reply, post
-from service.deliveries.targets import TargetRefused, read_url
-from service.pipeline.options import BudgetUm, MethodName
+from stillpath.models.complaints import complaint
+from stillpath.pipeline.options import BudgetUm, MethodName
+from stillpath.service.deliveries.posting import Reply, post
+from stillpath.service.deliveries.targets import TargetRefused, read_url
 
 __all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 
 from sqlalchemy import Engine, select, update
 
-from service.database.engine import reading, writing
-from service.database.tables import deliveries
+from stillpath.service.database.engine import reading, writing
+from stillpath.service.database.tables import deliveries
 
 __all__ = ["Delivery", "claim", "deliveries_of", "prolong", "settle"]
 

@@ -9,22 +9,22 @@ from collections.abc import Mapping
 import structlog
 from sqlalchemy import Engine
 
-from models.errors import ModelError
-from models.machine import Machine
-from models.store import load_machine
-from service.database.engine import DatabaseAway
-from service.deliveries import rows
-from service.deliveries.checking import Checker, PrinterUnknown
-from service.deliveries.posting import Reply, Unanswered, Unreached
-from service.deliveries.printers import Printer, printer_for, upload, what_started
-from service.deliveries.rows import Delivery
-from service.deliveries.targets import TargetRefused, check_webhook
-from service.deliveries.webhooks import send_webhook
-from service.jobs.state import Job
-from service.jobs.store import JobStore
-from service.machines.resolve import PinnedMachine
-from service.settings import Settings
-from service.storage.base import Storage, StorageError
+from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.deliveries import rows
+from stillpath.service.deliveries.checking import Checker, PrinterUnknown
+from stillpath.service.deliveries.posting import Reply, Unanswered, Unreached
+from stillpath.service.deliveries.printers import Printer, printer_for, upload, what_started
+from stillpath.service.deliveries.rows import Delivery
+from stillpath.service.deliveries.targets import TargetRefused, check_webhook
+from stillpath.service.deliveries.webhooks import send_webhook
+from stillpath.service.jobs.state import Job
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
+from stillpath.service.storage.base import Storage, StorageError
 
 __all__ = ["Sender"]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from service.settings import Settings, is_loopback
+from stillpath.service.settings import Settings, is_loopback
 
 __all__ = ["Target", "TargetRefused", "Unresolved", "addresses_of", "check_webhook", "read_url"]
 

@@ -8,9 +8,9 @@ import json
 from datetime import UTC, datetime
 from typing import Any
 
-from service.deliveries.posting import Reply, post
-from service.deliveries.targets import Target
-from service.jobs.state import Job
+from stillpath.service.deliveries.posting import Reply, post
+from stillpath.service.deliveries.targets import Target
+from stillpath.service.jobs.state import Job
 
 __all__ = ["SIGNATURE", "SignatureRefused", "body_of", "send_webhook", "sign", "verify"]
 

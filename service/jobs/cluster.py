@@ -24,12 +24,12 @@ from typing import TYPE_CHECKING, Any
 
 import structlog
 
-from service.jobs.preload import quiet_dask
-from service.jobs.state import Job
-from service.jobs.task import Runner
-from service.jobs.worker import run_job
-from service.processes import METHOD, OF_THE_SERVICE, loaded_context
-from service.settings import Settings
+from stillpath.service.jobs.preload import quiet_dask
+from stillpath.service.jobs.state import Job
+from stillpath.service.jobs.task import Runner
+from stillpath.service.jobs.worker import run_job
+from stillpath.service.processes import METHOD, OF_THE_SERVICE, loaded_context
+from stillpath.service.settings import Settings
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -52,7 +52,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
     "distributed.worker.profile.enabled": False,
-    "distributed.worker.preload": ["service.jobs.preload"],
+    "distributed.worker.preload": ["stillpath.service.jobs.preload"],
     "distributed.worker.multiprocessing-method": METHOD,
     # They die with us.
     "distributed.worker.daemon": True,

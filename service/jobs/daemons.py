@@ -13,9 +13,9 @@ from collections.abc import Iterator
 
 import structlog
 
-from service.jobs.cluster import prepare_dask
-from service.machines.settings import ENV_PREFIX
-from service.settings import Settings
+from stillpath.applications.machines.settings import ENV_PREFIX
+from stillpath.service.jobs.cluster import prepare_dask
+from stillpath.service.settings import Settings
 
 __all__ = ["run_scheduler", "run_workers"]
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from sqlalchemy import CursorResult, Engine, and_, delete, or_, select, update
 
-from service.database import tables
-from service.database.engine import insert, reading, writing
-from service.jobs.state import JobKind, JobState
+from stillpath.service.database import tables
+from stillpath.service.database.engine import insert, reading, writing
+from stillpath.service.jobs.state import JobKind, JobState
 
 __all__ = ["Expiry"]
 

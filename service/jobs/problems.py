@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 from typing import Any
 
-from service.jobs.state import JobKind
+from stillpath.service.jobs.state import JobKind
 
 __all__ = [
     "DISK_FULL",
@@ -52,10 +52,10 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
     written file that the last check refuses (500); anything else is ours, and the details stay in
     the log.
     """
-    from compensation.base import DesignError
-    from gcode.errors import GcodeError
-    from models.errors import ModelError
-    from service.pipeline.last_check.comparing import LastCheckError
+    from stillpath.compensation.base import DesignError
+    from stillpath.gcode.errors import GcodeError
+    from stillpath.models.errors import ModelError
+    from stillpath.pipeline.last_check.comparing import LastCheckError
 
     match error:
         case GcodeError() | ModelError() | DesignError() if kind in _REFUSED:

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from service.database.engine import DatabaseAway
-from service.jobs.cluster import Cluster, ClusterAway
-from service.jobs.state import Job, JobState, Lost
-from service.jobs.store import JobStore
-from service.jobs.sweep import Sweep
-from service.settings import Settings
-from service.storage import Storage, StorageError
-from service.storage.disk import Disk
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs.cluster import Cluster, ClusterAway
+from stillpath.service.jobs.state import Job, JobState, Lost
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.sweep import Sweep
+from stillpath.service.settings import Settings
+from stillpath.service.storage import Storage, StorageError
+from stillpath.service.storage.disk import Disk
 
 if TYPE_CHECKING:
     from distributed import Future

@@ -90,7 +90,7 @@ class Job:
     machine, machine_revision : str
         Name of a machine, and which state of it; the document is kept with the job's files.
     options : dict
-        The fields of `service.pipeline.options.Options`; of other kinds, what was asked.
+        The fields of `pipeline.options.Options`; of other kinds, what was asked.
     dedupe_key : str
         Equal for jobs that must have the same result: of input, machine, options and version.
     priority : int

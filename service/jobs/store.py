@@ -32,9 +32,9 @@ from sqlalchemy import (
     update,
 )
 
-from service.database import tables
-from service.database.engine import insert, reading, write_together, writing
-from service.jobs.state import (
+from stillpath.service.database import tables
+from stillpath.service.database.engine import insert, reading, write_together, writing
+from stillpath.service.jobs.state import (
     WAITING_FOR_ROOM,
     Claimed,
     Event,

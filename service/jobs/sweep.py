@@ -11,13 +11,13 @@ from pathlib import Path
 
 import structlog
 
-from service.database.engine import DatabaseAway
-from service.jobs.expiry import Expiry
-from service.jobs.state import Job, JobState
-from service.jobs.store import JobStore
-from service.settings import Settings
-from service.storage import Stat, Storage
-from service.storage.disk import Disk
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs.expiry import Expiry
+from stillpath.service.jobs.state import Job, JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
+from stillpath.service.storage import Stat, Storage
+from stillpath.service.storage.disk import Disk
 
 __all__ = ["Sweep", "sweep_files"]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.jobs.state import JobKind
-from service.pipeline.progress import Progress
+from stillpath.pipeline.progress import Progress
+from stillpath.service.jobs.state import JobKind
 
 if TYPE_CHECKING:
-    from service.machines.resolve import PinnedMachine
+    from stillpath.applications.machines.resolve import PinnedMachine
 
 __all__ = ["Runner", "Task"]
 
@@ -23,7 +23,7 @@ class Task:
     Attributes
     ----------
     machine_file : Path
-        Machine that the job was accepted with (`service.machines.resolve.PinnedMachine`).
+        Machine that the job was accepted with (`applications.machines.resolve.PinnedMachine`).
     sources : tuple of Path
         To be read only.
     target, report : Path
@@ -56,7 +56,7 @@ class Task:
         ------
         ModelError
         """
-        from service.machines.resolve import PinnedMachine
+        from stillpath.applications.machines.resolve import PinnedMachine
 
         return PinnedMachine.read(self.machine_file, self.machine)
 

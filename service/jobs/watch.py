@@ -16,12 +16,12 @@ from typing import Self
 import psutil
 import structlog
 
-from service.database.engine import DatabaseAway
-from service.jobs.problems import problem
-from service.jobs.state import Event, Failed, Job, JobKind, Lost, NoRoom
-from service.jobs.store import JobStore
-from service.pipeline.progress import Cancelled, Progress
-from service.settings import Settings
+from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs.problems import problem
+from stillpath.service.jobs.state import Event, Failed, Job, JobKind, Lost, NoRoom
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 
 __all__ = ["STUCK_EXIT_CODE", "Limits", "Watch", "held_bytes"]
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from service.jobs.cluster import Cluster
-from service.jobs.reconciler import Reconciler
-from service.jobs.store import JobStore
-from service.jobs.task import Runner
-from service.jobs.worker import run_task
-from service.settings import Settings
-from service.storage import Storage
+from stillpath.service.jobs.cluster import Cluster
+from stillpath.service.jobs.reconciler import Reconciler
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.task import Runner
+from stillpath.service.jobs.worker import run_task
+from stillpath.service.settings import Settings
+from stillpath.service.storage import Storage
 
 __all__ = ["Work"]
 

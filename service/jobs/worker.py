@@ -24,21 +24,21 @@ from typing import Any, TypeVar
 
 import structlog
 
-from service.computing.tasks import answer
-from service.database.engine import DatabaseAway, StoreError, open_database
-from service.environment import prepare_environment
-from service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
-from service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
-from service.jobs.store import JobStore
-from service.jobs.task import Runner, Task
-from service.jobs.watch import Limits, Watch, held_bytes
-from service.logs import configure_logging
-from service.pipeline.progress import Cancelled, Progress
-from service.processes import limit_memory
-from service.settings import Settings
-from service.storage import Storage, StorageError
-from service.storage.disk import Disk
-from service.storage.opened import open_storage
+from stillpath.pipeline.progress import Cancelled, Progress
+from stillpath.service.computing.tasks import answer
+from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
+from stillpath.service.environment import prepare_environment
+from stillpath.service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
+from stillpath.service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.task import Runner, Task
+from stillpath.service.jobs.watch import Limits, Watch, held_bytes
+from stillpath.service.logs import configure_logging
+from stillpath.service.processes import limit_memory
+from stillpath.service.settings import Settings
+from stillpath.service.storage import Storage, StorageError
+from stillpath.service.storage.disk import Disk
+from stillpath.service.storage.opened import open_storage
 
 __all__ = ["Workplace", "execute", "run_job", "run_task"]
 
@@ -151,10 +151,10 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
 
 def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Compensate the task's file and write its report; see `Runner`."""
-    from service.compiling import compiling_told
-    from service.pipeline.options import Options
-    from service.pipeline.road import compensate_file
-    from service.reports import write_report
+    from stillpath.pipeline.compensate import compensate_file
+    from stillpath.pipeline.options import Options
+    from stillpath.reports import write_report
+    from stillpath.service.compiling import compiling_told
 
     pinned = task.pinned()
     with compiling_told(progress) as told:

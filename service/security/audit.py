@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import structlog
 from sqlalchemy import Engine, insert, select
 
-from service.database.engine import DatabaseAway, reading, writing
-from service.database.tables import audit
-from service.security.callers import Caller
+from stillpath.service.database.engine import DatabaseAway, reading, writing
+from stillpath.service.database.tables import audit
+from stillpath.service.security.callers import Caller
 
 if TYPE_CHECKING:
     from fastapi import Request

@@ -15,11 +15,11 @@ from pydantic import SecretStr
 from sqlalchemy import Engine, RowMapping, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.database.engine import reading, writing
-from service.database.tables import keys
-from service.private import private_file
-from service.security.callers import Caller, Scope
-from service.settings import Settings, is_loopback
+from stillpath.service.database.engine import reading, writing
+from stillpath.service.database.tables import keys
+from stillpath.service.private import private_file
+from stillpath.service.security.callers import Caller, Scope
+from stillpath.service.settings import Settings, is_loopback
 
 __all__ = [
     "KEY_PREFIX",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from service.private import private_folder
+from stillpath.service.private import private_folder
 
 __all__ = ["Disk", "NoRoom"]
 

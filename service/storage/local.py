@@ -10,9 +10,9 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from service.storage.base import Stat, StorageError
-from service.storage.keys import check_key, check_prefix
-from service.storage.leftovers import delete_leftovers
+from stillpath.service.storage.base import Stat, StorageError
+from stillpath.service.storage.keys import check_key, check_prefix
+from stillpath.service.storage.leftovers import delete_leftovers
 
 __all__ = ["LocalStorage"]
 

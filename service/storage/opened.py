@@ -6,10 +6,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
-from service.settings import Settings
-from service.storage.base import Storage
-from service.storage.local import LocalStorage
-from service.storage.s3 import S3Storage
+from stillpath.service.settings import Settings
+from stillpath.service.storage.base import Storage
+from stillpath.service.storage.local import LocalStorage
+from stillpath.service.storage.s3 import S3Storage
 
 __all__ = ["open_storage"]
 

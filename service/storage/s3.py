@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
-from service.storage.base import Stat, StorageError
-from service.storage.keys import check_key, check_prefix
-from service.storage.leftovers import delete_leftovers
+from stillpath.service.storage.base import Stat, StorageError
+from stillpath.service.storage.keys import check_key, check_prefix
+from stillpath.service.storage.leftovers import delete_leftovers
 
 if TYPE_CHECKING:
     from obstore.store import S3Store

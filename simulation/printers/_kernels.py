@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["followed"]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from simulation.printers._kernels import followed
+from stillpath.simulation.printers._kernels import followed
 
 __all__ = ["Bodies", "Element", "Friction", "Motion"]
 

@@ -26,7 +26,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from simulation.printers.machines import Axis, CoreXY, Frame, Mount, Printer, bed_slinger, corexy
+from stillpath.simulation.printers.machines import (
+    Axis,
+    CoreXY,
+    Frame,
+    Mount,
+    Printer,
+    bed_slinger,
+    corexy,
+)
 
 __all__ = ["KINDS", "draw"]
 

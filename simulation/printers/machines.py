@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from simulation.printers.bodies import STEP_S, Bodies, Element, Friction, Motion
+from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction, Motion
 
 __all__ = ["Axis", "CoreXY", "Frame", "Mount", "Printer", "bed_slinger", "corexy"]
 

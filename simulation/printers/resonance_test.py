@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from models.identification.excitation import klipper_psd, regenerate
-from models.identification.types import Excitation
-from simulation.printers.bodies import STEP_S, Bodies, Element
-from simulation.printers.machines import Printer
+from stillpath.models.identification.excitation import klipper_psd, regenerate
+from stillpath.models.identification.types import Excitation
+from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element
+from stillpath.simulation.printers.machines import Printer
 
 __all__ = ["NEW_TEST", "OLD_TEST", "Accelerometer", "Record", "drawn_sensor", "run_test"]
 

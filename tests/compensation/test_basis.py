@@ -7,8 +7,8 @@ import pytest
 from scipy.fft import idct
 from scipy.linalg import subspace_angles
 
-from compensation.base import DesignError
-from compensation.basis import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import (
     BASES,
     bspline_functions,
     ce_opt_basis,
@@ -20,11 +20,11 @@ from compensation.basis import (
     robust_functions,
     spread_functions,
 )
-from compensation.lifted import LiftedSet, integrated, lift, lifted_set, lifted_set_of
-from compensation.metrics import robust_error_metric
-from compensation.nominal import lifted_optimum, spread_gram
-from compensation.operators import BlockOperator, ToeplitzOperator
-from models.plants import Mode, ModesSpec, discretise
+from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set, lifted_set_of
+from stillpath.compensation.metrics import robust_error_metric
+from stillpath.compensation.nominal import lifted_optimum, spread_gram
+from stillpath.compensation.operators import BlockOperator, ToeplitzOperator
+from stillpath.models.plants import Mode, ModesSpec, discretise
 
 M = 80
 

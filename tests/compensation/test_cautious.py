@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.base import DesignError
-from compensation.cautious import Caution
-from compensation.registry import compensator
-from compensation.shapers import ShaperCompensator
-from models.reference_motion import reference_motion
-from models.store import load_machine
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.cautious import Caution
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
 
 DT_S = 1e-3
 NO_RESTS = np.zeros((0, 2), np.int64)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from compensation.basis import (
+from stillpath.compensation.basis import (
     bspline_basis,
     ce_opt_basis,
     ce_opt_basis_of,
@@ -18,13 +18,13 @@ from compensation.basis import (
     robust_basis_for,
     spread_functions,
 )
-from compensation.full_preview import FullPreview
-from compensation.lifted import LiftedSet, lift, lifted_set
-from compensation.metrics import best_number, effort_metric, effort_of_ce_opt
-from compensation.nominal import lifted_optimum, spread_gram, two_step
-from compensation.operators import DenseOperator, LiftedOperator
-from models.plants import DiscretePlant, discretise
-from models.store import load_machine
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import LiftedSet, lift, lifted_set
+from stillpath.compensation.metrics import best_number, effort_metric, effort_of_ce_opt
+from stillpath.compensation.nominal import lifted_optimum, spread_gram, two_step
+from stillpath.compensation.operators import DenseOperator, LiftedOperator
+from stillpath.models.plants import DiscretePlant, discretise
+from stillpath.models.store import load_machine
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = 1001

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.base import DesignError
-from compensation.fbf import PreviewFbf
-from compensation.registry import compensator
-from models.machine import CommandLimits, Machine
-from models.plants import plant_set
-from models.store import load_machine
-from simulation.measures import contour_error
-from simulation.response import response
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.registry import compensator
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
 
 DT_S = 1e-3
 NO_RESTS = np.zeros((0, 2), np.int64)

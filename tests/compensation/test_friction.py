@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.friction import FrictionCompensator, against_friction
-from compensation.registry import compensator
-from models.friction import DryFriction
-from models.machine import Machine
-from models.reference_motion import reference_motion
-from models.store import load_machine
-from simulation.measures import contour_error
-from simulation.scheduled import MachineStream
+from stillpath.compensation.friction import FrictionCompensator, against_friction
+from stillpath.compensation.registry import compensator
+from stillpath.models.friction import DryFriction
+from stillpath.models.machine import Machine
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.scheduled import MachineStream
 
 DT_S = 1e-3
 RESTS = np.array([[900, 1000], [2400, 2450]], np.int64)

@@ -7,18 +7,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.basis import bspline_functions, ce_opt_basis, dct_basis
-from compensation.full_preview import FullPreview, independence
-from compensation.lifted import free_response, lift, lifted_set, lifted_set_of, time_varying
-from compensation.operators import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import bspline_functions, ce_opt_basis, dct_basis
+from stillpath.compensation.full_preview import FullPreview, independence
+from stillpath.compensation.lifted import (
+    free_response,
+    lift,
+    lifted_set,
+    lifted_set_of,
+    time_varying,
+)
+from stillpath.compensation.operators import (
     BlockOperator,
     DenseOperator,
     LiftedOperator,
     ProductOperator,
     ToeplitzOperator,
 )
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
 
 M = 90
 

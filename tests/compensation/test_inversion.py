@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from compensation.base import DesignError
-from compensation.inversion import KINDS, Inversion, TwoSidedFilter, invert
-from compensation.registry import COMPENSATORS, INVERSIONS
-from models.plants import DiscretePlant, ZpkSpec, discretise
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.inversion import KINDS, Inversion, TwoSidedFilter, invert
+from stillpath.compensation.registry import COMPENSATORS, INVERSIONS
+from stillpath.models.plants import DiscretePlant, ZpkSpec, discretise
 
 F_HZ = np.linspace(0.5, 499.0, 150)
 DT = 1e-3

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from compensation.base import DesignError
-from compensation.holds import stand_still
-from compensation.inversion import invert
-from compensation.inverting import InversionCompensator, zero_phase_fir
-from compensation.registry import compensator
-from models.machine import Machine
-from models.plants import ZpkSpec, plant_set
-from models.store import load_machine
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.holds import stand_still
+from stillpath.compensation.inversion import invert
+from stillpath.compensation.inverting import InversionCompensator, zero_phase_fir
+from stillpath.compensation.registry import compensator
+from stillpath.models.machine import Machine
+from stillpath.models.plants import ZpkSpec, plant_set
+from stillpath.models.store import load_machine
 
 F_HZ = np.linspace(0.5, 450, 200)
 NO_RESTS = np.zeros((0, 2), np.int64)

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation._lifted_kernels import run_adjoint, run_forward
-from compensation.base import DesignError
-from compensation.lifted import (
+from stillpath.compensation._lifted_kernels import run_adjoint, run_forward
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.lifted import (
     free_response,
     integrated,
     lift,
@@ -18,7 +18,7 @@ from compensation.lifted import (
     lifted_set_of,
     time_varying,
 )
-from compensation.operators import (
+from stillpath.compensation.operators import (
     BlockOperator,
     DenseOperator,
     LiftedOperator,
@@ -26,7 +26,7 @@ from compensation.operators import (
     TimeVaryingOperator,
     ToeplitzOperator,
 )
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
 
 RNG = np.random.default_rng
 

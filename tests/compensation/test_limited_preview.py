@@ -24,11 +24,11 @@ from benchmarks.preview import (
     one_mode,
     taz,
 )
-from compensation.basis import bspline_basis
-from compensation.full_preview import FullPreview
-from compensation.lifted import integrated
-from compensation.operators import ToeplitzOperator
-from models.plants import DiscretePlant
+from stillpath.compensation.basis import bspline_basis
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import integrated
+from stillpath.compensation.operators import ToeplitzOperator
+from stillpath.models.plants import DiscretePlant
 
 PLANTS = {"45 Hz": one_mode, "taz6-x": taz}
 

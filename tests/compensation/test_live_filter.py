@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from compensation.live_filter import LiveFilter, design_taps, shaper_taps
-from models.plants import ContinuousPlant, DiscretePlant
-from models.shaper_pulses import SHAPERS, shaper_pulses
+from stillpath.compensation.live_filter import LiveFilter, design_taps, shaper_taps
+from stillpath.models.plants import ContinuousPlant, DiscretePlant
+from stillpath.models.shaper_pulses import SHAPERS, shaper_pulses
 
 DT_S = 1e-3
 

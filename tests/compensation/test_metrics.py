@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.basis import BASES, ce_opt_basis, robust_basis_for, spread_functions
-from compensation.full_preview import FullPreview
-from compensation.lifted import lift, lifted_set
-from compensation.metrics import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES, ce_opt_basis, robust_basis_for, spread_functions
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import lift, lifted_set
+from stillpath.compensation.metrics import (
     best_number,
     effort_metric,
     effort_of_ce_opt,
@@ -22,9 +22,9 @@ from compensation.metrics import (
     robust_error_of_spread,
     toeplitz_metric,
 )
-from compensation.nominal import spread_gram
-from compensation.operators import ToeplitzOperator
-from models.plants import Mode, ModesSpec, discretise
+from stillpath.compensation.nominal import spread_gram
+from stillpath.compensation.operators import ToeplitzOperator
+from stillpath.models.plants import Mode, ModesSpec, discretise
 
 M = 70
 

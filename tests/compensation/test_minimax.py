@@ -7,10 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.minimax import guarded_weights, member_errors, path_spectrum, worst_case_weights
-from models.plants import Mode, ModesSpec, discretise, plant_set
-from models.store import load_machine
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.minimax import (
+    guarded_weights,
+    member_errors,
+    path_spectrum,
+    worst_case_weights,
+)
+from stillpath.models.plants import Mode, ModesSpec, discretise, plant_set
+from stillpath.models.store import load_machine
 
 F_HZ = np.linspace(2.0, 150.0, 300)
 

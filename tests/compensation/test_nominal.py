@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import subspace_angles
 
-from compensation.base import DesignError
-from compensation.basis import robust_basis_for, spread_functions
-from compensation.full_preview import FullPreview
-from compensation.lifted import LiftedSet, lift, lifted_set
-from compensation.metrics import robust_error_metric, robust_error_of_spread
-from compensation.nominal import lifted_optimum, spread_gram, two_step
-from compensation.operators import DenseOperator
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import robust_basis_for, spread_functions
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import LiftedSet, lift, lifted_set
+from stillpath.compensation.metrics import robust_error_metric, robust_error_of_spread
+from stillpath.compensation.nominal import lifted_optimum, spread_gram, two_step
+from stillpath.compensation.operators import DenseOperator
 
 M = 60
 

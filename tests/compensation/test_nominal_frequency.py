@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from compensation.base import DesignError
-from compensation.basis import bspline_functions
-from compensation.full_preview import FullPreview
-from compensation.lifted import lift
-from compensation.nominal_frequency import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import bspline_functions
+from stillpath.compensation.full_preview import FullPreview
+from stillpath.compensation.lifted import lift
+from stillpath.compensation.nominal_frequency import (
     Distribution,
     Region,
     bandwidths,
@@ -21,8 +21,8 @@ from compensation.nominal_frequency import (
     robust_response,
     sampled_responses,
 )
-from models.plants import DiscretePlant, Mode, ModesSpec, ZpkSpec, discretise, plant_set
-from models.store import load_machine
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, ZpkSpec, discretise, plant_set
+from stillpath.models.store import load_machine
 
 DT = 1e-3
 DISTRIBUTIONS: tuple[Distribution, ...] = ("sampled", "uniform", "kernel")

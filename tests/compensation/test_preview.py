@@ -10,17 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline
 
-from compensation._preview_kernels import advance_state, advance_window, run_windows
-from compensation.base import DesignError
-from compensation.basis import BASES, bspline_basis, ce_opt_basis
-from compensation.lifted import LiftedSet
-from compensation.lifted_window import LiftedWindow, lifted_window
-from compensation.preview import PreviewDesign
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
-from models.reference_motion import reference_motion
-from models.store import load_machine
-from simulation.measures import contour_error
-from simulation.response import response
+from stillpath.compensation._preview_kernels import advance_state, advance_window, run_windows
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES, bspline_basis, ce_opt_basis
+from stillpath.compensation.lifted import LiftedSet
+from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
+from stillpath.compensation.preview import PreviewDesign
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise, plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
 
 DT_S = 1e-3
 WINDOW, UPDATE = 300, 150

@@ -7,15 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.registry import compensator
-from compensation.ripple import PassThrough, RippleCompensator, input_command, wave_shares
-from models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
-from models.machine import CommandLimits, Machine
-from models.plants import Mode, ModesSpec, PlantSetSpec, continuous
-from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource, RippleTable
-from models.store import load_machine
-from simulation.response import response
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.ripple import PassThrough, RippleCompensator, input_command, wave_shares
+from stillpath.models.identification.ripple import PassLog, WaveBasis, learn_ripple, update_ripple
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
+from stillpath.models.ripple import (
+    AxisRipple,
+    RippleHarmonic,
+    RippleSide,
+    RippleSource,
+    RippleTable,
+)
+from stillpath.models.store import load_machine
+from stillpath.simulation.response import response
 
 DT = 1e-3
 FINER = 8

@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from compensation.base import Compensator, DesignError
-from compensation.fbf import LADDER, PreviewFbf
-from compensation.preview_axis import BAND_MARGIN, functions_within
-from compensation.registry import compensator
-from compensation.scheduled import BLEND_STEP, STEP, ScheduledCompensator
-from models.machine import CommandLimits, Machine
-from models.operating import OperatingGrid, machine_at
-from models.plants import Mode, ModesSpec, plant_set
-from models.schedule import (
+from stillpath.compensation.base import Compensator, DesignError
+from stillpath.compensation.fbf import LADDER, PreviewFbf
+from stillpath.compensation.preview_axis import BAND_MARGIN, functions_within
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.scheduled import BLEND_STEP, STEP, ScheduledCompensator
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.plants import Mode, ModesSpec, plant_set
+from stillpath.models.schedule import (
     AxisSchedule,
     GridNode,
     GridSchedule,
     MassSchedule,
     OperatingPoint,
 )
-from models.store import load_machine
-from simulation.measures import contour_error
-from simulation.response import response
-from simulation.scheduled import MachineStream
+from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
+from stillpath.simulation.scheduled import MachineStream
 
 Array = NDArray[np.float64]
 Piece = tuple[Array, NDArray[np.bool_], NDArray[np.int64]]

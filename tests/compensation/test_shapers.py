@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation._shaper_kernels import add_delayed
-from compensation.base import DesignError
-from compensation.registry import COMPENSATORS, compensator
-from compensation.shapers import SHAPERS, ShaperCompensator, shape, shaper_pulses
-from models.store import load_machine
+from stillpath.compensation._shaper_kernels import add_delayed
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.registry import COMPENSATORS, compensator
+from stillpath.compensation.shapers import SHAPERS, ShaperCompensator, shape, shaper_pulses
+from stillpath.models.store import load_machine
 
 NO_RESTS = np.zeros((0, 2), np.int64)
 

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation._sliding_kernels import contour_square, move_targets
-from compensation.base import DesignError
-from compensation.fbf import PreviewFbf
-from models.machine import Machine
-from models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
-from models.reference_motion import reference_motion
-from models.store import load_machine
-from simulation.measures import contour_error
-from simulation.response import response
+from stillpath.compensation._sliding_kernels import contour_square, move_targets
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.fbf import PreviewFbf
+from stillpath.models.machine import Machine
+from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
 
 DT_S = 1e-3
 NO_RESTS = np.zeros((0, 2), np.int64)

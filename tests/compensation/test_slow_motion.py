@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.registry import compensator
-from models.machine import Machine
-from models.plants import (
+from stillpath.compensation.registry import compensator
+from stillpath.models.machine import Machine
+from stillpath.models.plants import (
     PlantSetSpec,
     RelativeMode,
     RelativeModesSpec,
     WeightedMember,
     frequency_response,
 )
-from models.store import load_machine
+from stillpath.models.store import load_machine
 
 DT_S = 1e-3
 NO_RESTS = np.zeros((0, 2), np.int64)

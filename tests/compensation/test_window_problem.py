@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import LinearConstraint, minimize
 
-from compensation._least_squares_kernels import (
+from stillpath.compensation._least_squares_kernels import (
     BLOCK,
     backward,
     factorise,
     forward,
     weighted_gram,
 )
-from compensation.lifted_window import lifted_window
-from compensation.preview import PreviewDesign, running_gram
-from compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
-from models.plants import Mode, ModesSpec, discretise
+from stillpath.compensation.lifted_window import lifted_window
+from stillpath.compensation.preview import PreviewDesign, running_gram
+from stillpath.compensation.window_problem import EFFORT_PRICE, Bounds, Extremes, solve_window
+from stillpath.models.plants import Mode, ModesSpec, discretise
 
 DT_S = 1e-3
 WINDOW, UPDATE = 120, 60

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gcode.containers.opening import open_text
-from gcode.firmware.registry import kit
-from models.machine import AxisTravel, Machine
+from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.firmware.registry import kit
+from stillpath.models.machine import AxisTravel, Machine
 from tests.gcode.plain_reader import is_motion, read
 from tests.gcode.states import timeless
 

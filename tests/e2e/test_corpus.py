@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from gcode.errors import GcodeError
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.errors import GcodeError
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.e2e.round_trip import corpus_files, excerpt, flaws, made_to_fit, text_of
 from tests.fuzz.machines import KINDS, machine_of
 from tests.gcode.plain_reader import is_motion, read

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from gcode.dialect import Dialect
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter
-from gcode.pieces import Splitter
-from gcode.types import Moves, Phases, ProgramBlock
-from models.machine import AxisTravel, Machine
-from service.pipeline.options import Options
-from service.pipeline.passages import plan_passage
-from service.pipeline.road import compensate_file
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import Splitter
+from stillpath.gcode.types import Moves, Phases, ProgramBlock
+from stillpath.models.machine import AxisTravel, Machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.pass_through import plan_passage
 from tests.gcode.states import differences, has_code
 
 __all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_road", "walk"]

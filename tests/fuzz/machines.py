@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 from tests.fuzz.checks import roomy
 
 __all__ = ["KINDS", "machine_of"]

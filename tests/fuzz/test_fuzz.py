@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from gcode.detection import detect
-from gcode.errors import GcodeError
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.slicers.facts import facts_in
+from stillpath.gcode.detection import detect
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.slicers.facts import facts_in
 from tests.fuzz.checks import read_through, through_the_road, walk
 from tests.fuzz.grammar import written
 from tests.fuzz.hostile import HOSTILE, pieces

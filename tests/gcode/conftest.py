@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import heatshrink2
 
-from gcode.containers.meatpack import pack
+from stillpath.gcode.containers.meatpack import pack
 
 __all__ = ["binary", "block", "blocks", "members", "normal", "package"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gcode.interpreter import Interpreter
-from gcode.pieces import Passage, Piece, Splitter
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator
-from service.pipeline.options import Options
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import Passage, Piece, Splitter
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator
 
 __all__ = ["HEAD", "compensated", "cut", "ender3_with", "pieces_of"]
 

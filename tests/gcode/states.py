@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.types import EventKind, Limits, ModalState
-from models.machine import Machine
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.types import EventKind, Limits, ModalState
+from stillpath.models.machine import Machine
 
 __all__ = ["State", "differences", "states", "tagged"]
 

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.containers.opening import open_text, rewriting
-from gcode.containers.sniff import Kind
-from gcode.errors import GcodeError
+from stillpath.gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.containers.sniff import Kind
+from stillpath.gcode.errors import GcodeError
 from tests.gcode.container_files import binary, block, blocks, normal
 from tests.gcode.test_meatpack import prints
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gcode.detection import DIALECTS, detect
+from stillpath.gcode.detection import DIALECTS, detect
 
 # Which firmware a file of the corpus was written for, and whether a person should look.
 EXPECTED = {

@@ -10,11 +10,11 @@ import math
 import numpy as np
 import pytest
 
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter
-from gcode.types import EventKind, ProgramBlock
-from models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
-from models.machine import Machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.types import EventKind, ProgramBlock
+from stillpath.models.firmware import FirmwareFacts, Klipper, Marlin, RepRapFirmware
+from stillpath.models.machine import Machine
 
 HOMED = {"homed_at_start": True, "home_mm": (0.0, 0.0, 0.0)}
 BUILD = {

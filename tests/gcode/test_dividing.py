@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.dividing import divided, sections
-from gcode.pieces import LeftOut, Piece
+from stillpath.gcode.dividing import divided, sections
+from stillpath.gcode.pieces import LeftOut, Piece
 from tests.gcode.cutting import ender3_with, pieces_of
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

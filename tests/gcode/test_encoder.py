@@ -9,21 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware._encoding_kernels import lay_out
-from gcode.firmware._writing_kernels import format_moves
-from gcode.firmware.klipper import encoder as encoder_module
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.interpreter import interpret_bytes
-from gcode.pieces import Piece
-from gcode.segments import ErrorFilter, fit_segments
-from gcode.timeline import build_timeline, group_rows
-from models.machine import Machine
-from models.plants import plant_set
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator, deviation
-from service.pipeline.options import Options
-from service.pipeline.yardstick import BestShaper
+from stillpath.gcode.firmware._encoding_kernels import lay_out
+from stillpath.gcode.firmware._writing_kernels import format_moves
+from stillpath.gcode.firmware.klipper import encoder as encoder_module
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import interpret_bytes
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import ErrorFilter, fit_segments
+from stillpath.gcode.timeline import build_timeline, group_rows
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.store import load_machine
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, deviation
 from tests.gcode.cutting import HEAD, pieces_of
 
 BODIES = {

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.fuzz.machines import machine_of
 from tests.gcode.plain_reader import read
 from tests.gcode.states import differences, tagged

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gcode.containers.opening import open_text
-from gcode.errors import GcodeError
+from stillpath.gcode.containers.opening import open_text
+from stillpath.gcode.errors import GcodeError
 
 
 @pytest.mark.parametrize(

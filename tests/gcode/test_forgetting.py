@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gcode import state
-from gcode.firmware.planning import join_phases
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.pieces import Passage, Piece
-from gcode.types import Phases, ProgramBlock
-from models.machine import Machine
+from stillpath.gcode import state
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.types import Phases, ProgramBlock
+from stillpath.models.machine import Machine
 from tests.fuzz.machines import machine_of
 from tests.gcode.cutting import HEAD, cut
 from tests.gcode.prints import made_up_print

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.firmware.klipper.planner import Planner
-from gcode.firmware.planning import join_phases
-from gcode.interpreter import interpret_bytes
-from models.machine import Machine
+from stillpath.gcode.firmware.klipper.planner import Planner
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.interpreter import interpret_bytes
+from stillpath.models.machine import Machine
 
 pytestmark = pytest.mark.shared
 

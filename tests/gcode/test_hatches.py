@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.errors import GcodeError
-from gcode.hatches import Timing, read_hatches, sample_hatches
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.hatches import Timing, read_hatches, sample_hatches
 
 TWO = """
 G21 G90

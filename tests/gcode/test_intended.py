@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.firmware.planning import intended
-from gcode.firmware.registry import kit
-from gcode.pieces import Piece
-from gcode.types import Phases
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.gcode.firmware.planning import intended
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 from tests.gcode.cutting import HEAD, pieces_of
 
 FIRMWARES = Path(__file__).parents[2] / "examples" / "firmware"

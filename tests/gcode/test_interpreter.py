@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter, interpret_bytes
-from gcode.types import EventKind, ProgramBlock
-from models.machine import Machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter, interpret_bytes
+from stillpath.gcode.types import EventKind, ProgramBlock
+from stillpath.models.machine import Machine
 
 
 def run(text: str, machine: Machine) -> ProgramBlock:

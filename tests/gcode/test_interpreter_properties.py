@@ -8,10 +8,10 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter, interpret_bytes
-from gcode.types import Events, Moves, ProgramBlock
-from models.machine import Machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter, interpret_bytes
+from stillpath.gcode.types import Events, Moves, ProgramBlock
+from stillpath.models.machine import Machine
 
 relaxed = settings(
     deadline=None,

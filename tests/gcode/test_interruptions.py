@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gcode.firmware.encoding import as_moves, limits_in_force
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.pieces import Piece
-from gcode.sampler import sample_phases
-from gcode.types import Limits, Moves, rows_of
-from models.machine import Machine
-from service.pipeline.compensating import CompensatedPiece
+from stillpath.gcode.firmware.encoding import as_moves, limits_in_force
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import Limits, Moves, rows_of
+from stillpath.models.machine import Machine
+from stillpath.pipeline.piece_compensator import CompensatedPiece
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 BODY = (

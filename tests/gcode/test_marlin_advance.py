@@ -10,19 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.marlin._encoder_kernels import spread_advance
-from gcode.firmware.marlin.encoder import stream_limits
-from gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
-from gcode.firmware.marlin.planner import Planner
-from gcode.firmware.marlin.voice import MarlinVoice
-from gcode.sampler import sample_phases
-from models.firmware import Marlin
-from models.firmware.marlin import MarlinPlanner, PerAxis
-from models.machine import CommandLimits, Machine
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator, Unfit
-from service.pipeline.options import Options
-from service.pipeline.yardstick import BestShaper
+from stillpath.gcode.firmware.marlin._encoder_kernels import spread_advance
+from stillpath.gcode.firmware.marlin.encoder import stream_limits
+from stillpath.gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
+from stillpath.gcode.firmware.marlin.planner import Planner
+from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.sampler import sample_phases
+from stillpath.models.firmware import Marlin
+from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator, Unfit
 from tests.gcode.cutting import HEAD, pieces_of
 
 K_S = 0.05

@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
-from gcode.firmware.marlin.encoder import stream_limits
-from gcode.firmware.marlin.kit import MarlinKit
-from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
-from gcode.firmware.marlin.voice import MarlinVoice
-from gcode.interpreter import Interpreter
-from models.firmware import Marlin
-from models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
-from models.machine import CommandLimits, Machine
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
+from stillpath.gcode.firmware.marlin.encoder import stream_limits
+from stillpath.gcode.firmware.marlin.kit import MarlinKit
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
+from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.models.firmware import Marlin
+from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcode.errors import GcodeError
-from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
-from gcode.firmware.marlin.planner import Planner
-from gcode.firmware.planning import join_phases
-from gcode.types import Moves, Phases
-from models.firmware import Marlin
-from models.firmware.marlin import PerAxis
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
+from stillpath.gcode.firmware.marlin.planner import Planner
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import Marlin
+from stillpath.models.firmware.marlin import PerAxis
 
 SCALE = PerAxis(x=80.0, y=80.0, z=400.0, e=100.0)
 FINE_HZ = 1e9

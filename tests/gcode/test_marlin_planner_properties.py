@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gcode.firmware.marlin._block_kernels import (
+from stillpath.gcode.firmware.marlin._block_kernels import (
     Q_ACCEL,
     Q_FLOOR2,
     Q_JUNCTION2,
@@ -22,13 +22,13 @@ from gcode.firmware.marlin._block_kernels import (
     Q_SIZE,
     Q_STEPS,
 )
-from gcode.firmware.marlin._planner_kernels import _step_time, settle
-from gcode.firmware.marlin.limits import initial_limits
-from gcode.firmware.marlin.planner import Planner, planner_facts
-from gcode.firmware.planning import join_phases
-from gcode.types import Moves, Phases
-from models.firmware import Marlin
-from models.firmware.marlin import PerAxis
+from stillpath.gcode.firmware.marlin._planner_kernels import _step_time, settle
+from stillpath.gcode.firmware.marlin.limits import initial_limits
+from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import Marlin
+from stillpath.models.firmware.marlin import PerAxis
 
 SCALE = (80.0, 80.0, 400.0, 100.0)
 MACHINES = st.builds(

@@ -14,20 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gcode.firmware.marlin import _vertex_kernels as kernels
-from gcode.firmware.marlin.vertices import Lattice, _Answers, vertices_on_steps
-from gcode.interpreter import Interpreter
-from gcode.segments import ErrorFilter, Segments
-from gcode.timeline import Timeline
-from gcode.types import ProgramBlock
-from models.firmware import Marlin
-from models.firmware.marlin import MarlinPlanner, PerAxis
-from models.machine import Machine
-from models.plants import plant_set
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
-from simulation.response import response
+from stillpath.gcode.firmware.marlin import _vertex_kernels as kernels
+from stillpath.gcode.firmware.marlin.vertices import Lattice, _Answers, vertices_on_steps
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.segments import ErrorFilter, Segments
+from stillpath.gcode.timeline import Timeline
+from stillpath.gcode.types import ProgramBlock
+from stillpath.models.firmware import Marlin
+from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.simulation.response import response
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 

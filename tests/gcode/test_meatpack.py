@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.containers.meatpack import Unpacker, pack
-from gcode.errors import GcodeError
+from stillpath.gcode.containers.meatpack import Unpacker, pack
+from stillpath.gcode.errors import GcodeError
 from tests.gcode.container_files import normal
 
 ON, OFF, RESET = b"\xff\xff\xfb", b"\xff\xff\xfa", b"\xff\xff\xf9"

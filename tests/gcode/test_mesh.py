@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gcode.firmware.encoding import UNITS_PER_MM, as_moves, limits_in_force
-from gcode.firmware.planning import plan_moves
-from gcode.firmware.registry import kit
-from gcode.pieces import Piece
-from gcode.types import Phases
-from models.errors import ModelError
-from models.machine import Machine
-from service.pipeline.compensating import CompensatedPiece, deviation
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.gcode.firmware.encoding import UNITS_PER_MM, as_moves, limits_in_force
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.types import Phases
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import CompensatedPiece, deviation
 from tests.gcode.cutting import HEAD, compensated, ender3_with
 
 SLOPE = 0.005

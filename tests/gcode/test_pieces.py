@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.errors import GcodeError
-from gcode.firmware.planning import plan_moves
-from gcode.pieces import Passage, Piece
-from gcode.types import EventKind
-from models.machine import AxisTravel, Machine
-from models.store import load_machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.types import EventKind
+from stillpath.models.machine import AxisTravel, Machine
+from stillpath.models.store import load_machine
 from tests.fuzz.machines import machine_of
 from tests.gcode.cutting import HEAD, cut, pieces_of
 from tests.gcode.prints import made_up_print, polygon

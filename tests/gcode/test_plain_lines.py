@@ -7,13 +7,13 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from gcode import _slots as at
-from gcode._plain_kernels import decimal, eight_digits, line_end
-from gcode.errors import GcodeError
-from gcode.interpreter import Interpreter
-from gcode.types import Events, Moves, ProgramBlock
-from models.firmware import Klipper, Marlin, RepRapFirmware
-from models.machine import Machine
+from stillpath.gcode import _slots as at
+from stillpath.gcode._plain_kernels import decimal, eight_digits, line_end
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.types import Events, Moves, ProgramBlock
+from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
+from stillpath.models.machine import Machine
 
 relaxed = settings(
     deadline=None,

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.klipper.limits import KlipperLimits
-from gcode.firmware.klipper.planner import Planner
-from gcode.firmware.planning import join_phases
-from gcode.interpreter import interpret_bytes
-from gcode.types import Moves, Phases
-from models.firmware import Klipper
-from models.machine import Machine
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.firmware.klipper.planner import Planner
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.interpreter import interpret_bytes
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import Machine
 
 FIRMWARE = Klipper()
 LIMITS = [KlipperLimits(500.0, 5000.0, 5.0, 0.5), KlipperLimits(80.0, 1000.0, 8.0, 0.0)]

@@ -9,10 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.firmware.registry import kit
-from gcode.interpreter import Interpreter
-from gcode.pieces import Piece, Splitter, excerpt
-from gcode.quickening import (
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pacing import (
     AS_SLICED,
     TRAVEL,
     FirstLayer,
@@ -21,9 +20,10 @@ from gcode.quickening import (
     quickened,
     top_limits,
 )
-from models.firmware import Marlin, RepRapFirmware
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.gcode.pieces import Piece, Splitter, excerpt
+from stillpath.models.firmware import Marlin, RepRapFirmware
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 from tests.gcode.cutting import HEAD
 
 ENDER = load_machine("ender3")

@@ -10,25 +10,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.errors import GcodeError
-from gcode.firmware.encoding import as_moves
-from gcode.firmware.planning import join_phases, plan_moves
-from gcode.firmware.registry import kit
-from gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
-from gcode.firmware.reprapfirmware.encoder import stream_limits
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
-from gcode.firmware.reprapfirmware.voice import RepRapVoice
-from gcode.interpreter import Interpreter
-from gcode.sampler import sample_phases
-from gcode.types import EventKind
-from models.firmware import RepRapFirmware
-from models.firmware.reprapfirmware import Drive, RepRapExtruder, RepRapShaper
-from models.machine import CommandLimits, Machine
-from models.store import load_machine
-from service.pipeline.compensating import CompensatedPiece, PieceCompensator, Unfit, deviation
-from service.pipeline.options import Options
-from service.pipeline.yardstick import BestShaper
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.encoding import as_moves
+from stillpath.gcode.firmware.planning import join_phases, plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
+from stillpath.gcode.firmware.reprapfirmware.encoder import stream_limits
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from stillpath.gcode.firmware.reprapfirmware.voice import RepRapVoice
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import EventKind
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder, RepRapShaper
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import (
+    CompensatedPiece,
+    PieceCompensator,
+    Unfit,
+    deviation,
+)
 from tests.gcode.cutting import HEAD, pieces_of
 from tests.gcode.test_encoder import BODIES
 

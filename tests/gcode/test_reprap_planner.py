@@ -11,12 +11,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.planning import join_phases
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from gcode.types import Moves, Phases
-from models.firmware import RepRapFirmware
-from models.firmware.reprapfirmware import Drive, RepRapExtruder
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder
 
 FIRMWARE = RepRapFirmware(
     x=Drive(max_speed_mm_s=300.0),

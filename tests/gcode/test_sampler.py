@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.klipper.planner import Planner
-from gcode.firmware.planning import join_phases
-from gcode.interpreter import interpret_bytes
-from gcode.sampler import Sampler, Samples, distances, sample_phases, sample_until
-from gcode.types import Phases
-from models.machine import Machine
+from stillpath.gcode.firmware.klipper.planner import Planner
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.interpreter import interpret_bytes
+from stillpath.gcode.sampler import Sampler, Samples, distances, sample_phases, sample_until
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
 
 
 def plan_of(text: str, machine: Machine) -> Phases:

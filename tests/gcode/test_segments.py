@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import gcode.segments as module
-from gcode._segment_kernels import path_directions
-from gcode.segments import (
+import stillpath.gcode.segments as module
+from stillpath.gcode._segment_kernels import path_directions
+from stillpath.gcode.segments import (
     ALONG_SHARE,
     LOOSE_MM,
     ErrorFilter,
@@ -19,8 +19,8 @@ from gcode.segments import (
     across_tolerance_mm,
     fit_segments,
 )
-from gcode.timeline import Group, Timeline
-from models.plants import DiscretePlant, Mode, ModesSpec, discretise
+from stillpath.gcode.timeline import Group, Timeline
+from stillpath.models.plants import DiscretePlant, Mode, ModesSpec, discretise
 
 DT_S = 1e-3
 GRID_MM = 1e-3

@@ -18,9 +18,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.containers.opening import open_text, rewriting
-from gcode.containers.sniff import Kind, sniff
-from gcode.errors import GcodeError
+from stillpath.gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.containers.sniff import Kind, sniff
+from stillpath.gcode.errors import GcodeError
 from tests.gcode.container_files import binary, members, package
 
 TEXT = b"G28\nG1 X10 Y5 F6000\r\n\nG1X20"
@@ -210,8 +210,8 @@ def test_nothing_is_left_of_a_killed_writer(tmp_path: Path, content: bytes):
     program = """
         import os, signal, sys
         from pathlib import Path
-        from gcode.containers.opening import open_text, rewriting
-        from service.pipeline.files import replacing
+        from stillpath.gcode.containers.opening import open_text, rewriting
+        from stillpath.pipeline.files import replacing
 
         def die(done):
             if done > 0.5:
@@ -240,7 +240,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path, kind: str):
     program = """
         import resource, sys
         from pathlib import Path
-        from gcode.containers.opening import open_text, rewriting
+        from stillpath.gcode.containers.opening import open_text, rewriting
 
         source, size = Path(sys.argv[1]), int(sys.argv[2])
         first, second = source.with_name("first"), source.with_name("second")

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.pieces import Piece
-from gcode.sampler import sample_phases
-from gcode.timeline import Timeline, build_timeline, group_rows
-from gcode.types import Phases
-from models.machine import Machine
-from models.store import load_machine
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.timeline import Timeline, build_timeline, group_rows
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
 from tests.gcode.cutting import HEAD, pieces_of
 
 DT_S = 1e-3

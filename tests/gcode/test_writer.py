@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcode.interpreter import Interpreter
-from gcode.types import EventKind
-from models.firmware.klipper import FirmwareShaper
-from models.machine import Machine
-from models.shaper_pulses import shaper_pulses
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.result import Result
-from service.pipeline.road import compensate_file
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.types import EventKind
+from stillpath.models.firmware.klipper import FirmwareShaper
+from stillpath.models.machine import Machine
+from stillpath.models.shaper_pulses import shaper_pulses
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import made_up_print, polygon
 from tests.gcode.states import differences, states, tagged

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
+from stillpath.models.machine import Machine
 from tests.integrations.klipper_host import Steps, printer_cfg, steps_of
 
 __all__ = [

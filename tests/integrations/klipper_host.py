@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.machine import Machine
+from stillpath.models.machine import Machine
 
 __all__ = [
     "CHECKOUT",

@@ -65,9 +65,9 @@ async def answer(send, status, document, *headers):
 if __name__ == "__main__":
     from unittest import mock
 
-    from service import server
-    from service.api import create_app
-    from service.settings import Settings
+    from stillpath.service import server
+    from stillpath.service.api import create_app
+    from stillpath.service.settings import Settings
     from tests.service.runners import pretend
 
     def application(settings: Settings, **more):

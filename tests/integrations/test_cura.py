@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.pipeline.options import Options
+from stillpath.pipeline.options import Options
 from tests.integrations.cura import SCRIPT, Cura
 from tests.integrations.posting import PROGRAM, environment
 

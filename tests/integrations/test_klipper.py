@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.firmware.klipper.kit import KlipperKit
-from gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
-from models.store import load_machine
+from stillpath.gcode.firmware.klipper.kit import KlipperKit
+from stillpath.gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
+from stillpath.models.store import load_machine
 from tests.integrations.klipper import SETTINGS, CommandError, ConfigError, Klipper, macros_of
 
 FOLDER = Path(__file__).resolve().parents[2] / "integrations" / "klipper"

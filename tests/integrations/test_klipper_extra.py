@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensation.live_filter import FADE, LiveFilter, design_taps
+from stillpath.compensation.live_filter import FADE, LiveFilter, design_taps
 from tests.compensation.test_live_filter import mode
 
 EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from compensation.live_filter import LiveFilter
-from models.machine import Machine
-from models.store import load_machine
-from service.live.export import export_digest, write_export
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.applications.live.export import export_digest, write_export
+from stillpath.compensation.live_filter import LiveFilter
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.integrations.interrupted import MACROS, USERS, asked, homed, two_objects
 from tests.integrations.klipper_host import (
     NO_KLIPPER,

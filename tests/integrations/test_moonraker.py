@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from gcode.firmware.registry import kit
-from gcode.firmware.writing import StreamWriter
-from models.store import load_machine
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.writing import StreamWriter
+from stillpath.models.store import load_machine
 from tests.integrations.klipper import CommandError, Klipper, macros_of
 from tests.integrations.moonraker import COMPONENT, Config, Server, ServerError, component_module
 from tests.integrations.running import Running

@@ -19,9 +19,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.slicers.marks import MarkKind, read_mark
-from service.pipeline.options import Options
-from service.version import __version__
+from stillpath.gcode.slicers.marks import MarkKind, read_mark
+from stillpath.pipeline.options import Options
+from stillpath.version import __version__
 from tests.integrations.octoprint import PLUGIN
 from tests.integrations.posting import PROGRAM
 from tests.integrations.running import Running

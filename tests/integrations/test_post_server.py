@@ -139,7 +139,7 @@ def test_a_server_that_comes_back_goes_on(part: Path, tmp_path: Path):
     code = f"""
 import sys
 sys.argv = ["pretend_server.py", {str(data)!r}]
-from service import server
+from stillpath.service import server
 real = server.serve_forever
 server.serve_forever = lambda settings, host, _, **more: real(settings, host, {port}, **more)
 import runpy

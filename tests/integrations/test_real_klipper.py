@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.machine import Machine
-from models.store import load_machine
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file, plan_file
-from service.proof.motor_test import borne, levels_of, motor_test
+from stillpath.applications.proof.motor_test import borne, levels_of, motor_test
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.options import Options
 from tests.integrations.interrupted import (
     EVENTS,
     ONCE,

@@ -9,10 +9,10 @@ from typing import Any
 import httpx2
 import pytest
 
-from models.store import load_machine
-from service.deliveries.checking import Checker, PrinterUnknown
-from service.deliveries.printers import Printer
-from service.machines.documents import DocumentFolder
+from stillpath.applications.machines.documents import DocumentFolder
+from stillpath.models.store import load_machine
+from stillpath.service.deliveries.checking import Checker, PrinterUnknown
+from stillpath.service.deliveries.printers import Printer
 from tests.integrations.klippy import klippy
 from tests.integrations.moonraker import RealMoonraker
 from tests.integrations.running import Running

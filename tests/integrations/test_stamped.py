@@ -16,13 +16,13 @@ from typing import Any
 import httpx2
 import pytest
 
-from gcode.firmware.registry import kit
-from gcode.firmware.writing import StreamWriter
-from models.store import load_machine
-from service.cli import run
-from service.farm.items import Group, items_of
-from service.pipeline.files import default_cache_dir
-from service.pipeline.yardstick import cached_shaper
+from stillpath.cli.batch.items import Group, items_of
+from stillpath.cli.main import run
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.writing import StreamWriter
+from stillpath.models.store import load_machine
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from tests.gcode.container_files import binary, package
 from tests.integrations.cura import Cura
 from tests.integrations.moonraker import Config, Server, ServerError, component_module
@@ -110,7 +110,7 @@ def test_batch(file: Path, tmp_path: Path, capsys: Any):
     [row] = json.loads((out / "summary.json").read_text())["files"]
     assert row["state"] == "failed"
     assert REFUSED in row["error"]
-    # (`watch` leaves it alone: tests/service/farm/test_watching.py.)
+    # (`watch` leaves it alone: tests/cli/batch/test_watching.py.)
 
 
 @pytest.mark.slow

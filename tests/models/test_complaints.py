@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from models.complaints import complaint
+from stillpath.models.complaints import complaint
 
 
 class Example(BaseModel):

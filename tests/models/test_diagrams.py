@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from models.diagrams import Block, Diagram, Running
-from models.errors import ModelError
+from stillpath.models.diagrams import Block, Diagram, Running
+from stillpath.models.errors import ModelError
 
 small = st.floats(-0.4, 0.4)
 

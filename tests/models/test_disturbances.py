@@ -7,7 +7,7 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.signal import welch
 
-from models.disturbances import (
+from stillpath.models.disturbances import (
     DisturbanceSpec,
     Narrowband,
     Peak,
@@ -17,7 +17,7 @@ from models.disturbances import (
     Wideband,
     sample,
 )
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 TS = 1e-4
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.friction import BEND_MM, DryFriction, bend_of
-from models.plants import PlantSetSpec
-from models.store import load_machine
+from stillpath.models.friction import BEND_MM, DryFriction, bend_of
+from stillpath.models.plants import PlantSetSpec
+from stillpath.models.store import load_machine
 
 HELD_MM = (0.003, 0.012)
 T_S = np.arange(3000) * 1e-3

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numba.core.errors import NumbaError
 
-from models import jit
+from stillpath.models import jit
 
 ROOT = Path(jit.__file__).parents[1]
 CALLER = """
-from models.jit import kernel
+from stillpath.models.jit import kernel
 from tools.inner import double
 from tools.numbers import OFFSET
 
@@ -32,7 +32,7 @@ def fill(values, out) -> None:
         out[k] = double(values[k]) + OFFSET
 """
 INNER = """
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 @kernel
 def double(x: float) -> float:

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.diagrams import Diagram
-from models.errors import ModelError
-from models.loops import Loop, LoopSpec, PidLoop, builtin_loops, load_loop, read_loop
+from stillpath.models.diagrams import Diagram
+from stillpath.models.errors import ModelError
+from stillpath.models.loops import Loop, LoopSpec, PidLoop, builtin_loops, load_loop, read_loop
 
 F_HZ = np.array([10.0, 300.0, 1500.0, 3300.0])
 PRINTED = {

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.machine import Machine
-from models.operating import OperatingGrid, machine_at
-from models.plants import Mode, ModesSpec
-from models.schedule import (
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.plants import Mode, ModesSpec
+from stillpath.models.schedule import (
     AxisSchedule,
     GridNode,
     GridSchedule,
@@ -18,7 +18,7 @@ from models.schedule import (
     OperatingPoint,
     resonances_hz,
 )
-from models.store import load_machine
+from stillpath.models.store import load_machine
 
 
 def mode(f_hz: float) -> ModesSpec:

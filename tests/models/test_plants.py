@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from models.errors import ModelError
-from models.plants import (
+from stillpath.models.errors import ModelError
+from stillpath.models.plants import (
     FirSpec,
     Mode,
     ModesSpec,
@@ -27,7 +27,7 @@ from models.plants import (
     frequency_response,
     plant_set,
 )
-from models.repair import repair_rounded
+from stillpath.models.repair import repair_rounded
 
 F_HZ = np.linspace(0.5, 240.0, 97)
 

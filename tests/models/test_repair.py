@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.errors import ModelError
-from models.repair import printed_decimals, repair_rounded
+from stillpath.models.errors import ModelError
+from stillpath.models.repair import printed_decimals, repair_rounded
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from models.errors import ModelError
-from models.identification.ripple import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.ripple import (
     PassLog,
     WaveBasis,
     learn_ripple,
     update_ripple,
 )
-from models.identification.ripple_observability import folded_distances
-from models.plants import ContinuousPlant, DiscretePlant, Mode, ModesSpec, continuous
-from models.response_kernels import dense_response
-from models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource, RippleTable
+from stillpath.models.identification.ripple_observability import folded_distances
+from stillpath.models.plants import ContinuousPlant, DiscretePlant, Mode, ModesSpec, continuous
+from stillpath.models.response_kernels import dense_response
+from stillpath.models.ripple import (
+    AxisRipple,
+    RippleHarmonic,
+    RippleSide,
+    RippleSource,
+    RippleTable,
+)
 
 DT = 1e-3
 FINER = 8

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.ripple import WaveBasis
-from models.identification.ripple_passes import learn_machine_ripple, read_pass
-from models.machine import Machine
-from models.plants import Mode, ModesSpec, PlantSetSpec, continuous
-from models.response_kernels import dense_response
-from models.ripple import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.ripple import WaveBasis
+from stillpath.models.identification.ripple_passes import learn_machine_ripple, read_pass
+from stillpath.models.machine import Machine
+from stillpath.models.plants import Mode, ModesSpec, PlantSetSpec, continuous
+from stillpath.models.response_kernels import dense_response
+from stillpath.models.ripple import (
     AxisRipple,
     MachineRipple,
     RippleAxis,
@@ -19,8 +19,8 @@ from models.ripple import (
     RippleSide,
     RippleSource,
 )
-from models.store import load_machine
-from simulation.response import response
+from stillpath.models.store import load_machine
+from stillpath.simulation.response import response
 
 DT, FINER = 1e-3, 8
 MODE = Mode(f_hz=45.0, zeta=0.05)

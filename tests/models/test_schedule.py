@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from models.errors import ModelError
-from models.machine import Machine
-from models.plants import (
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.plants import (
     FirSpec,
     Mode,
     ModesSpec,
@@ -26,7 +26,7 @@ from models.plants import (
     ZpkSpec,
     frequency_response,
 )
-from models.schedule import (
+from stillpath.models.schedule import (
     AxisSchedule,
     GridNode,
     GridSchedule,
@@ -35,7 +35,7 @@ from models.schedule import (
     moving_mass_from_two_runs,
     resonances_hz,
 )
-from models.store import load_machine, read_machine
+from stillpath.models.store import load_machine, read_machine
 
 F_HZ = np.linspace(1.0, 120.0, 240)
 M0, K, C = 0.8, 0.8 * (2 * np.pi * 35.0) ** 2, 2 * 0.08 * 0.8 * 2 * np.pi * 35.0

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.plants import RelativeModesSpec, TfSpec, plant_set
-from models.repair import repair_rounded
-from models.store import builtin_machines, load_machine, read_machine
+from stillpath.models.errors import ModelError
+from stillpath.models.plants import RelativeModesSpec, TfSpec, plant_set
+from stillpath.models.repair import repair_rounded
+from stillpath.models.store import builtin_machines, load_machine, read_machine
 
 GOLDEN = Path(__file__).parents[2] / "examples" / "machines" / "klipper-golden.json"
 FITTED = ("annex-k3", "ender3", "voron-v0", "voron-v24-250")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from datetime import date
 from typing import Any
 
-from models.firmware.klipper import PlannerLimits
-from models.machine import Machine
-from models.plants import PlantSetSpec
-from models.store import load_machine
+from stillpath.models.firmware.klipper import PlannerLimits
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSetSpec
+from stillpath.models.store import load_machine
 
 __all__ = ["make_machine", "make_plants", "with_accel"]
 

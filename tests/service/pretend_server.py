@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 if __name__ == "__main__":
-    from service.environment import prepare_environment
-    from service.server import serve_forever
-    from service.settings import Settings
+    from stillpath.service.environment import prepare_environment
+    from stillpath.service.server import serve_forever
+    from stillpath.service.settings import Settings
     from tests.service import runners
 
     prepare_environment()

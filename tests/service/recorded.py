@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from models.machine import Machine
-from models.plants import discretise
-from service.pipeline.motion import plan_file
-from simulation.response import PlantStream
+from stillpath.models.machine import Machine
+from stillpath.models.plants import discretise
+from stillpath.pipeline.simulate import plan_file
+from stillpath.simulation.response import PlantStream
 
 __all__ = ["record"]
 

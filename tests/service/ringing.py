@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from models.machine import Machine
-from models.plants import ParametricMembers, PlantSetSpec, PlantSpec, TfSpec
-from models.store import load_machine
-from service.pipeline.motion import TextMotion
-from service.pipeline.reading import dialect_for
-from simulation.printers.bodies import STEP_S, Bodies, Element, Friction
-from simulation.printers.resonance_test import Accelerometer, Record
+from stillpath.models.machine import Machine
+from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, TfSpec
+from stillpath.models.store import load_machine
+from stillpath.pipeline.reading import dialect_for
+from stillpath.pipeline.simulate import TextMotion
+from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
+from stillpath.simulation.printers.resonance_test import Accelerometer, Record
 
 __all__ = ["SENSOR", "TRUE", "Chain", "machine_of", "recorded"]
 

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gcode.errors import GcodeError
-from service.jobs.task import Task
-from service.pipeline.progress import Progress
+from stillpath.gcode.errors import GcodeError
+from stillpath.pipeline.progress import Progress
+from stillpath.service.jobs.task import Task
 
 __all__ = ["light", "pretend"]
 
@@ -31,7 +31,7 @@ SUMMARY: dict[str, Any] = {
 
 def pretend(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Do as told, with a real report."""
-    from service.reports import write_report
+    from stillpath.reports import write_report
     from tests.service.synthetic import make_result
 
     _act(task, progress)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 
-from service.pipeline.result import (
+from stillpath.pipeline.result import (
     Channel,
     ErrorFigures,
     GroupFigures,

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from models.store import builtin_machines
-from service.api import create_app
-from service.api.uploads import safe_name
-from service.settings import Settings, is_loopback
+from stillpath.models.store import builtin_machines
+from stillpath.service.api import create_app
+from stillpath.service.api.uploads import safe_name
+from stillpath.service.settings import Settings, is_loopback
 from tests.service.runners import pretend
 
 JOBS = "/v1/jobs?machine=ender3"

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from gcode.containers.opening import open_text
-from service.api import create_app
-from service.settings import Settings
+from stillpath.gcode.containers.opening import open_text
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.gcode.container_files import binary, package
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon

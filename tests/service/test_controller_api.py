@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from models.loops import builtin_loops, load_loop
-from service.api import create_app
-from service.controllers.design import design_controller
-from service.controllers.figures import ControllerReport
-from service.controllers.options import read_options
-from service.settings import Settings
+from stillpath.applications.controllers.design import design_controller
+from stillpath.applications.controllers.figures import ControllerReport
+from stillpath.applications.controllers.options import read_options
+from stillpath.models.loops import builtin_loops, load_loop
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.service.runners import pretend
 from tests.service.test_api import assert_problem
 

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import run
-from service.database.documents import open_documents
-from service.database.engine import open_database
-from service.machines.commands import data_dir
-from service.machines.store import MachineStore
-from service.server import _tell_where
-from service.settings import Settings
+from stillpath.applications.machines.store import MachineStore
+from stillpath.cli.machines import data_dir
+from stillpath.cli.main import run
+from stillpath.service.database.documents import open_documents
+from stillpath.service.database.engine import open_database
+from stillpath.service.server import _tell_where
+from stillpath.service.settings import Settings
 
 pytestmark = pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG convention")
 

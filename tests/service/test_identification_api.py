@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from models.machine import Machine
-from models.plants import PairsSpec
-from service.api import create_app
-from service.identification.figures import IdentificationReport
-from service.identification.run import InputFile
-from service.settings import Settings
+from stillpath.applications.identification.figures import IdentificationReport
+from stillpath.applications.identification.run import InputFile
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PairsSpec
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.models.identification.recordings import (
     BROKEN,
     QUICK_QUERY,

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from service.interruption import Interrupted, interruptible
+from stillpath.service.interruption import Interrupted, interruptible
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="sends signals")
 

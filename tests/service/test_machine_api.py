@@ -13,19 +13,19 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from models.machine import Machine
-from models.store import builtin_machines
-from service.api import create_app
-from service.jobs.task import Task
-from service.jobs.worker import run_task
-from service.machines.resolve import PinnedMachine, Resolver
-from service.machines.store import MachineStore
-from service.settings import Settings
+from stillpath.applications.machines.resolve import PinnedMachine, Resolver
+from stillpath.applications.machines.store import MachineStore
+from stillpath.models.machine import Machine
+from stillpath.models.store import builtin_machines
+from stillpath.service.api import create_app
+from stillpath.service.jobs.task import Task
+from stillpath.service.jobs.worker import run_task
+from stillpath.service.settings import Settings
+from tests.applications.test_machine_m503 import M503
+from tests.cli.test_machine_cli import CONFIG
 from tests.service.machines import make_machine, make_plants
 from tests.service.runners import pretend
 from tests.service.test_api import assert_problem, over, until
-from tests.service.test_machine_cli import CONFIG
-from tests.service.test_machine_m503 import M503
 
 MINE = "/v1/machines/mine"
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from service.database.engine import open_database
-from service.exclusive import exclusive
-from service.private import private_file, private_folder
-from service.settings import Settings
+from stillpath.service.database.engine import open_database
+from stillpath.service.exclusive import exclusive
+from stillpath.service.private import private_file, private_folder
+from stillpath.service.settings import Settings
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")
 

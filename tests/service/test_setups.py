@@ -14,10 +14,10 @@ from pathlib import Path
 import httpx2
 import pytest
 
-from models.store import load_machine as machine
-from service.client import Client, ClientError
-from service.pipeline.options import Options
-from service.pipeline.road import compensate_file
+from stillpath.models.store import load_machine as machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.service.client import Client, ClientError
 from tests.service.database.postgres import PostgresServer
 from tests.service.jobs.site import Site, until
 from tests.service.storage.s3_server import BUCKET, CREDENTIALS, free_port, s3_server

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.jobs.state import (
+from stillpath.service.jobs.state import (
     Cancelled,
     Claimed,
     Event,

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from models.diagrams import Block
-from models.disturbances import SensorSpec
-from models.loops import PidLoop, load_loop
-from simulation.closed_loop import ClosedLoop, Imperfections, batch, simulate
+from stillpath.models.diagrams import Block
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import PidLoop, load_loop
+from stillpath.simulation.closed_loop import ClosedLoop, Imperfections, batch, simulate
 
 GALVO = load_loop("galvo-10khz")
 TABLE = load_loop("direct-drive-table").nominal()

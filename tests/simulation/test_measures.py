@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulation.measures import (
+from stillpath.simulation.measures import (
     ContourMeter,
     GroupTally,
     MotionMeter,

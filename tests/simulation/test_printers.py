@@ -10,13 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import StateSpace, lsim
 
-from models.identification.readers import ReadSettings, read_content
-from models.identification.types import AccelerationLog, Spectrum
-from simulation.printers._kernels import followed
-from simulation.printers.bodies import STEP_S, Bodies, Element, Friction
-from simulation.printers.drawing import KINDS, draw
-from simulation.printers.machines import Printer
-from simulation.printers.resonance_test import OLD_TEST, Accelerometer, drawn_sensor, run_test
+from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.types import AccelerationLog, Spectrum
+from stillpath.simulation.printers._kernels import followed
+from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
+from stillpath.simulation.printers.drawing import KINDS, draw
+from stillpath.simulation.printers.machines import Printer
+from stillpath.simulation.printers.resonance_test import (
+    OLD_TEST,
+    Accelerometer,
+    drawn_sensor,
+    run_test,
+)
 
 QUIET = Accelerometer(rate_hz=3200.0, step_mm_s2=1e-6, noise_mm_s2=0.0)
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.modal import modal_form
-from models.plants import (
+from stillpath.models.modal import modal_form
+from stillpath.models.plants import (
     DiscretePlant,
     FirSpec,
     Mode,
@@ -21,9 +21,9 @@ from models.plants import (
     ZeroPair,
     discretise,
 )
-from models.store import builtin_machines, load_machine
-from simulation.response import PlantStream, response
-from simulation.truth import TruthStream, refined, truth_response
+from stillpath.models.store import builtin_machines, load_machine
+from stillpath.simulation.evaluation import TruthStream, refined, truth_response
+from stillpath.simulation.response import PlantStream, response
 
 PAIRS = PairsSpec(
     poles=(PolePair(f_hz=34, zeta=0.28), PolePair(f_hz=44.7, zeta=0.046)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulation.scanning import track_errors
+from stillpath.simulation.scanning import track_errors
 
 
 def test_along_and_across() -> None:

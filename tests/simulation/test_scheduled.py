@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from models.machine import Machine
-from models.operating import machine_at
-from models.plants import Mode, ModesSpec, discretise
-from models.schedule import AxisSchedule, GridNode, GridSchedule, MassSchedule, OperatingPoint
-from models.store import load_machine
-from simulation.response import PlantStream
-from simulation.scheduled import MachineStream
+from stillpath.models.machine import Machine
+from stillpath.models.operating import machine_at
+from stillpath.models.plants import Mode, ModesSpec, discretise
+from stillpath.models.schedule import (
+    AxisSchedule,
+    GridNode,
+    GridSchedule,
+    MassSchedule,
+    OperatingPoint,
+)
+from stillpath.models.store import load_machine
+from stillpath.simulation.response import PlantStream
+from stillpath.simulation.scheduled import MachineStream
 
 DT_S = 1e-3
 M0 = 0.8

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from playwright.sync_api import expect
 
+from tests.applications.test_machine_m503 import M503
 from tests.models.identification.recordings import QUICK_QUERY, quick_raw
-from tests.service.test_machine_m503 import M503
 from tests.web.machines import put
 from tests.web.served import Service
 from tests.web.visitor import Visitor

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
-from service.api.schemas import JobView
-from service.compiling import STAGE
+from stillpath.service.api.schemas import JobView
+from stillpath.service.compiling import STAGE
 from tests.web.served import GEAR, Service, running
 from tests.web.visitor import Visitor
 

@@ -12,8 +12,8 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from service.api import pages, problems
-from service.api.pages import page_files
+from stillpath.service.api import pages, problems
+from stillpath.service.api.pages import page_files
 
 WEB = Path(pages.__file__).resolve().parents[1] / "web"
 OWN = [p for p in sorted(WEB.rglob("*.js")) if "vendor" not in p.parts]

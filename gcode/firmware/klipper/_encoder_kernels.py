@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware._writing_kernels import printed_feedrate
-from models.jit import kernel
+from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.models.jit import kernel
 
 __all__ = ["assign_speeds", "expected_braking"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 from typing import Any
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["move_limits"]
 

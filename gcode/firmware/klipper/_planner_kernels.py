@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import Any
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["append", "emit", "look_ahead"]
 

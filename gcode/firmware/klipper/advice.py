@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import cast
 
-from gcode.dialect import Dialect
-from gcode.firmware.klipper.limits import KlipperLimits
-from gcode.lexer import extended_parameters, split_line
-from gcode.types import Limits
-from models.firmware import Klipper
-from models.shaper_pulses import SHAPERS
-from models.shaping import AxisShaper, Shaping
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.lexer import extended_parameters, split_line
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Klipper
+from stillpath.models.shaper_pulses import SHAPERS
+from stillpath.models.shaping import AxisShaper, Shaping
 
 __all__ = ["KlipperAdviser"]
 

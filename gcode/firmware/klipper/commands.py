@@ -10,10 +10,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gcode import _slots as at
-from gcode.lexer import Command
-from gcode.state import MachineState, Saved
-from gcode.types import EventKind
+from stillpath.gcode import _slots as at
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState, Saved
+from stillpath.gcode.types import EventKind
 
 __all__ = [
     "acceleration",

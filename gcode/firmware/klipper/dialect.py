@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import re
 
-from gcode.commands import cancel_object, home, retract
-from gcode.dialect import NEEDED, Action, Dialect, Word, words
-from gcode.firmware.klipper import commands, flushing
-from gcode.types import EventKind
-from models.firmware import Klipper
+from stillpath.gcode.commands import cancel_object, home, retract
+from stillpath.gcode.dialect import NEEDED, Action, Dialect, Word, words
+from stillpath.gcode.firmware.klipper import commands, flushing
+from stillpath.gcode.types import EventKind
+from stillpath.models.firmware import Klipper
 
 __all__ = ["klipper"]
 

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware.base import square_corner_mm_s
-from gcode.firmware.encoding import (
+from stillpath.gcode.firmware.base import square_corner_mm_s
+from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
     as_moves,
@@ -24,17 +24,17 @@ from gcode.firmware.encoding import (
     interleave,
     limits_in_force,
 )
-from gcode.firmware.klipper._encoder_kernels import assign_speeds, expected_braking
-from gcode.firmware.klipper._motion_kernels import move_limits
-from gcode.firmware.klipper.limits import KlipperLimits
-from gcode.firmware.klipper.planner import Planner
-from gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
-from gcode.pieces import Piece
-from gcode.segments import Segments
-from gcode.timeline import Group, Timeline
-from gcode.types import Limits, Phases
-from models.firmware import Klipper
-from models.machine import CommandLimits
+from stillpath.gcode.firmware.klipper._encoder_kernels import assign_speeds, expected_braking
+from stillpath.gcode.firmware.klipper._motion_kernels import move_limits
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.firmware.klipper.planner import Planner
+from stillpath.gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Group, Timeline
+from stillpath.gcode.types import Limits, Phases
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import CommandLimits
 
 __all__ = ["KlipperEncoder", "stream_limits"]
 

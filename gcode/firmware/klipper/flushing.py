@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import math
 
-from gcode.lexer import Command
-from gcode.state import MachineState
-from gcode.types import EventKind
-from models.errors import ModelError
-from models.firmware import Klipper
-from models.shaper_pulses import SHAPERS, shaper_pulses
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState
+from stillpath.gcode.types import EventKind
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
+from stillpath.models.shaper_pulses import SHAPERS, shaper_pulses
 
 __all__ = ["pressure_advance", "shaper"]
 

@@ -9,16 +9,16 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.dialect import Dialect
-from gcode.firmware.base import scaled
-from gcode.firmware.klipper.advice import KlipperAdviser
-from gcode.firmware.klipper.encoder import KlipperEncoder, stream_limits
-from gcode.firmware.klipper.limits import KlipperLimits
-from gcode.firmware.klipper.planner import Planner
-from gcode.firmware.klipper.voice import KlipperVoice
-from gcode.types import Limits
-from models.firmware import Klipper
-from models.machine import CommandLimits, Machine
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.base import scaled
+from stillpath.gcode.firmware.klipper.advice import KlipperAdviser
+from stillpath.gcode.firmware.klipper.encoder import KlipperEncoder, stream_limits
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.firmware.klipper.planner import Planner
+from stillpath.gcode.firmware.klipper.voice import KlipperVoice
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = ["KlipperKit"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gcode.types import Limits
+from stillpath.gcode.types import Limits
 
 __all__ = ["KlipperLimits"]
 

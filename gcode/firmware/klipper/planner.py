@@ -12,12 +12,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.klipper import _planner_kernels as kernels
-from gcode.firmware.planning import empty_phases
-from gcode.firmware.queueing import QueuePlanner
-from gcode.types import Moves, Phases
-from models.firmware import Klipper
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.klipper import _planner_kernels as kernels
+from stillpath.gcode.firmware.planning import empty_phases
+from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import Klipper
 
 __all__ = ["Planner"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import cast
 
-from gcode.firmware.klipper.limits import KlipperLimits
-from gcode.types import Limits
-from models.firmware import Klipper
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Klipper
 
 __all__ = ["IN_STREAM_MARK_MM_S", "KlipperVoice"]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 from math import ceil, floor, sqrt
 from typing import Any
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["append"]
 

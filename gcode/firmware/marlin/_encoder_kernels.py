@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from gcode.firmware._writing_kernels import printed_feedrate
-from gcode.firmware.marlin._vertex_kernels import hop
-from models.jit import kernel
+from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.gcode.firmware.marlin._vertex_kernels import hop
+from stillpath.models.jit import kernel
 
 __all__ = ["assign_rates", "bend_reversals", "spread_advance", "thin"]
 

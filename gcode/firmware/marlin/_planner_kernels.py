@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from gcode.firmware.marlin._block_kernels import (
+from stillpath.gcode.firmware.marlin._block_kernels import (
     BUGFIX,
     C_FAMILY,
     C_MIN_RATE,
@@ -45,7 +45,7 @@ from gcode.firmware.marlin._block_kernels import (
     Q_STEPS_PER_MM,
     S_ENTRY2,
 )
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["drop", "emit", "settle"]
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["MOST_PLACES", "choose_vertices", "hop", "list_places", "nearly_back"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import cast
 
-from gcode.dialect import Dialect
-from gcode.firmware.marlin.limits import MarlinLimits
-from gcode.lexer import Command, split_line
-from gcode.types import Limits
-from models.firmware import Marlin
-from models.shaping import OFF, AxisShaper, Shaping
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits
+from stillpath.gcode.lexer import Command, split_line
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Marlin
+from stillpath.models.shaping import OFF, AxisShaper, Shaping
 
 __all__ = ["MarlinAdviser"]
 

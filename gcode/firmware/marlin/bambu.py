@@ -6,9 +6,9 @@ writes; a word that nobody explains is a barrier.
 
 from __future__ import annotations
 
-from gcode.dialect import Word, words
-from gcode.firmware.marlin import commands
-from gcode.types import EventKind
+from stillpath.gcode.dialect import Word, words
+from stillpath.gcode.firmware.marlin import commands
+from stillpath.gcode.types import EventKind
 
 __all__ = ["BAMBU"]
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from gcode import _slots as at
-from gcode.dialect import Handler
-from gcode.lexer import Command
-from gcode.state import MachineState
-from gcode.types import EventKind
-from models.firmware import Marlin
+from stillpath.gcode import _slots as at
+from stillpath.gcode.dialect import Handler
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState
+from stillpath.gcode.types import EventKind
+from stillpath.models.firmware import Marlin
 
 __all__ = [
     "axis_limits",

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from gcode.commands import cancel_object, home, retract, tool
-from gcode.dialect import (
+from stillpath.gcode.commands import cancel_object, home, retract, tool
+from stillpath.gcode.dialect import (
     Action,
     ArcRule,
     Dialect,
@@ -21,12 +21,12 @@ from gcode.dialect import (
     Word,
     words,
 )
-from gcode.firmware.marlin import commands
-from gcode.firmware.marlin.bambu import BAMBU
-from gcode.firmware.marlin.prusa import PRUSA
-from gcode.types import EventKind
-from gcode.workspaces import machine_space, move_to_saved, save_place, select_workspace
-from models.firmware import Marlin
+from stillpath.gcode.firmware.marlin import commands
+from stillpath.gcode.firmware.marlin.bambu import BAMBU
+from stillpath.gcode.firmware.marlin.prusa import PRUSA
+from stillpath.gcode.types import EventKind
+from stillpath.gcode.workspaces import machine_space, move_to_saved, save_place, select_workspace
+from stillpath.models.firmware import Marlin
 
 __all__ = ["marlin"]
 

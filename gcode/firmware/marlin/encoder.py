@@ -17,10 +17,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.advance import feed_at_ends, final_segments
-from gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
-from gcode.firmware.encoding import (
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
+from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
     Encoded,
     Interleaved,
@@ -31,22 +31,22 @@ from gcode.firmware.encoding import (
     limits_in_force,
     to_units,
 )
-from gcode.firmware.marlin._encoder_kernels import (
+from stillpath.gcode.firmware.marlin._encoder_kernels import (
     assign_rates,
     bend_reversals,
     spread_advance,
     thin,
 )
-from gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
-from gcode.firmware.marlin.planner import Planner
-from gcode.firmware.marlin.vertices import Lattice, vertices_on_steps
-from gcode.firmware.planning import join_phases
-from gcode.pieces import Piece
-from gcode.segments import Segments
-from gcode.timeline import Group, Timeline
-from gcode.types import Limits, Phases
-from models.firmware import Marlin
-from models.machine import CommandLimits
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
+from stillpath.gcode.firmware.marlin.planner import Planner
+from stillpath.gcode.firmware.marlin.vertices import Lattice, vertices_on_steps
+from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Group, Timeline
+from stillpath.gcode.types import Limits, Phases
+from stillpath.models.firmware import Marlin
+from stillpath.models.machine import CommandLimits
 
 __all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 

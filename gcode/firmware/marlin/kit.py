@@ -9,16 +9,21 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.dialect import Dialect
-from gcode.firmware.base import scaled
-from gcode.firmware.marlin.advice import MarlinAdviser
-from gcode.firmware.marlin.encoder import DEVIATION_MM, STEEPEST, MarlinEncoder, stream_limits
-from gcode.firmware.marlin.limits import MarlinLimits, initial_limits
-from gcode.firmware.marlin.planner import Planner
-from gcode.firmware.marlin.voice import MarlinVoice
-from gcode.types import Limits
-from models.firmware import Marlin
-from models.machine import CommandLimits, Machine
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.base import scaled
+from stillpath.gcode.firmware.marlin.advice import MarlinAdviser
+from stillpath.gcode.firmware.marlin.encoder import (
+    DEVIATION_MM,
+    STEEPEST,
+    MarlinEncoder,
+    stream_limits,
+)
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
+from stillpath.gcode.firmware.marlin.planner import Planner
+from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Marlin
+from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = ["LONGEST_LEAST_MM", "MarlinKit"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from gcode.types import Limits
-from models.firmware import Marlin
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Marlin
 
 __all__ = ["MarlinLimits", "advance_speed_mm_s", "initial_limits", "without_advance"]
 

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.marlin import _block_kernels as blocks
-from gcode.firmware.marlin import _planner_kernels as kernels
-from gcode.firmware.planning import empty_phases
-from gcode.firmware.queueing import QueuePlanner
-from gcode.types import Moves, Phases
-from models.firmware import Marlin
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.marlin import _block_kernels as blocks
+from stillpath.gcode.firmware.marlin import _planner_kernels as kernels
+from stillpath.gcode.firmware.planning import empty_phases
+from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import Marlin
 
 __all__ = ["Planner", "planner_facts"]
 

@@ -7,9 +7,9 @@ M9140: what they do.
 
 from __future__ import annotations
 
-from gcode.dialect import Word, words
-from gcode.firmware.marlin import commands
-from gcode.types import EventKind
+from stillpath.gcode.dialect import Word, words
+from stillpath.gcode.firmware.marlin import commands
+from stillpath.gcode.types import EventKind
 
 __all__ = ["PRUSA"]
 

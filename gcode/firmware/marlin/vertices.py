@@ -11,10 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode._segment_kernels import path_directions
-from gcode.firmware.marlin._vertex_kernels import MOST_PLACES, choose_vertices, list_places
-from gcode.segments import ErrorFilter, Segments
-from gcode.timeline import Timeline
+from stillpath.gcode._segment_kernels import path_directions
+from stillpath.gcode.firmware.marlin._vertex_kernels import (
+    MOST_PLACES,
+    choose_vertices,
+    list_places,
+)
+from stillpath.gcode.segments import ErrorFilter, Segments
+from stillpath.gcode.timeline import Timeline
 
 __all__ = ["Lattice", "vertices_on_steps"]
 

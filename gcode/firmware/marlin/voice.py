@@ -6,9 +6,9 @@ import re
 from decimal import Decimal
 from typing import cast
 
-from gcode.firmware.marlin.limits import MarlinLimits, without_advance
-from gcode.types import Limits
-from models.firmware import Marlin
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits, without_advance
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import Marlin
 
 __all__ = ["MarlinVoice"]
 

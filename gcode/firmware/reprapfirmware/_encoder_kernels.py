@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.firmware._writing_kernels import printed_feedrate
-from gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
-from models.jit import kernel
+from stillpath.gcode.firmware._writing_kernels import printed_feedrate
+from stillpath.gcode.firmware.reprapfirmware._planner_kernels import SHORT_CLOCKS
+from stillpath.models.jit import kernel
 
 __all__ = ["assign_speeds", "keep_apart"]
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from models.jit import kernel
+from stillpath.models.jit import kernel
 
 __all__ = ["append", "drop", "emit", "on_steps", "run"]
 

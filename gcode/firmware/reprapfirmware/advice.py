@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import cast
 
-from gcode.dialect import Dialect
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.lexer import split_line
-from gcode.types import Limits
-from models.firmware import RepRapFirmware
-from models.shaping import AxisShaper, Shaping
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.lexer import split_line
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.shaping import AxisShaper, Shaping
 
 __all__ = ["RepRapAdviser"]
 

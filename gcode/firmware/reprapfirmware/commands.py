@@ -10,15 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from gcode import _slots as at
-from gcode._motion_kernels import set_feed
-from gcode.commands import retract
-from gcode.commands import tool as other_tool
-from gcode.firmware.marlin.commands import reset_limits
-from gcode.lexer import Command
-from gcode.state import MachineState, Saved
-from gcode.types import EventKind
-from gcode.workspaces import set_workspace
+from stillpath.gcode import _slots as at
+from stillpath.gcode._motion_kernels import set_feed
+from stillpath.gcode.commands import retract
+from stillpath.gcode.commands import tool as other_tool
+from stillpath.gcode.firmware.marlin.commands import reset_limits
+from stillpath.gcode.lexer import Command
+from stillpath.gcode.state import MachineState, Saved
+from stillpath.gcode.types import EventKind
+from stillpath.gcode.workspaces import set_workspace
 
 __all__ = [
     "acceleration",

@@ -5,8 +5,8 @@ Sources: docs/dialects.md, which also says what was not read in the firmware's o
 
 from __future__ import annotations
 
-from gcode.commands import cancel_object, home, retract
-from gcode.dialect import (
+from stillpath.gcode.commands import cancel_object, home, retract
+from stillpath.gcode.dialect import (
     Action,
     ArcRule,
     Dialect,
@@ -16,11 +16,11 @@ from gcode.dialect import (
     Word,
     words,
 )
-from gcode.firmware.marlin.commands import filament_area, unheeded
-from gcode.firmware.reprapfirmware import commands
-from gcode.types import EventKind
-from gcode.workspaces import machine_space, save_place, select_workspace
-from models.firmware import RepRapFirmware
+from stillpath.gcode.firmware.marlin.commands import filament_area, unheeded
+from stillpath.gcode.firmware.reprapfirmware import commands
+from stillpath.gcode.types import EventKind
+from stillpath.gcode.workspaces import machine_space, save_place, select_workspace
+from stillpath.models.firmware import RepRapFirmware
 
 __all__ = ["reprapfirmware"]
 

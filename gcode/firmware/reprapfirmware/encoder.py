@@ -17,10 +17,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.advance import feed_at_ends, final_segments
-from gcode.firmware.base import corner_step_mm_s
-from gcode.firmware.encoding import (
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware.base import corner_step_mm_s
+from stillpath.gcode.firmware.encoding import (
     Encoded,
     as_moves,
     encoded_piece,
@@ -28,15 +28,15 @@ from gcode.firmware.encoding import (
     interleave,
     limits_in_force,
 )
-from gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
-from gcode.pieces import Piece
-from gcode.segments import Segments
-from gcode.timeline import Group, Timeline
-from gcode.types import Limits, Phases
-from models.firmware import RepRapFirmware
-from models.machine import CommandLimits
+from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.segments import Segments
+from stillpath.gcode.timeline import Group, Timeline
+from stillpath.gcode.types import Limits, Phases
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.machine import CommandLimits
 
 __all__ = ["STEEPEST", "RepRapEncoder", "stream_limits"]
 

@@ -9,16 +9,16 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.dialect import Dialect
-from gcode.firmware.base import scaled
-from gcode.firmware.reprapfirmware.advice import RepRapAdviser
-from gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from gcode.firmware.reprapfirmware.voice import RepRapVoice
-from gcode.types import Limits
-from models.firmware import RepRapFirmware
-from models.machine import CommandLimits, Machine
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.base import scaled
+from stillpath.gcode.firmware.reprapfirmware.advice import RepRapAdviser
+from stillpath.gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
+from stillpath.gcode.firmware.reprapfirmware.voice import RepRapVoice
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.machine import CommandLimits, Machine
 
 __all__ = ["RepRapKit"]
 

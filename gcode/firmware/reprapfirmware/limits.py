@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gcode.types import Limits
-from models.firmware.reprapfirmware import RepRapFirmware
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware.reprapfirmware import RepRapFirmware
 
 __all__ = ["RepRapLimits"]
 

@@ -13,12 +13,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcode.errors import GcodeError
-from gcode.firmware.planning import empty_phases, join_phases
-from gcode.firmware.queueing import QueuePlanner
-from gcode.firmware.reprapfirmware import _planner_kernels as kernels
-from gcode.types import Moves, Phases
-from models.firmware import RepRapFirmware
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import empty_phases, join_phases
+from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.firmware.reprapfirmware import _planner_kernels as kernels
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.firmware import RepRapFirmware
 
 __all__ = ["GRACE_S", "RepRapPlanner", "on_steps"]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import cast
 
-from gcode.firmware.reprapfirmware.limits import RepRapLimits
-from gcode.types import Limits
-from models.firmware import RepRapFirmware
+from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
+from stillpath.gcode.types import Limits
+from stillpath.models.firmware import RepRapFirmware
 
 __all__ = ["RepRapVoice"]
 

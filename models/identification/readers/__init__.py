@@ -1,8 +1,8 @@
 """Readers of measurement and model files; see `read_measurements`."""
 
-from models.identification.readers.reading import read_content, read_measurements
-from models.identification.readers.resampling import resampled
-from models.identification.readers.settings import (
+from stillpath.models.identification.readers.reading import read_content, read_measurements
+from stillpath.models.identification.readers.resampling import resampled
+from stillpath.models.identification.readers.settings import (
     ReadSettings,
     date_in_name,
     direction_of,

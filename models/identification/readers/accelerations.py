@@ -6,16 +6,16 @@ import re
 
 import numpy as np
 
-from models.errors import ModelError
-from models.identification.readers.checks import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.checks import (
     check_alive,
     check_long,
     check_range,
     check_steady,
 )
-from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import MOST_ROWS, Table
-from models.identification.types import AccelerationLog
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.tables import MOST_ROWS, Table
+from stillpath.models.identification.types import AccelerationLog
 
 __all__ = ["is_klipper_log", "is_m956", "read_klipper_log", "read_m956"]
 

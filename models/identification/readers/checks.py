@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.readers.tables import Table
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.tables import Table
 
 __all__ = ["check_alive", "check_long", "check_range", "check_rising", "check_steady"]
 

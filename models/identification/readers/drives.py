@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.errors import ModelError
-from models.identification.readers.checks import check_long, check_steady
-from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import MOST_ROWS, Table
-from models.identification.types import DrivenLog
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.checks import check_long, check_steady
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.tables import MOST_ROWS, Table
+from stillpath.models.identification.types import DrivenLog
 
 __all__ = ["is_drive", "read_drives"]
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
+from stillpath.models.errors import ModelError
 
 __all__ = ["is_matlab", "matlab_variables"]
 

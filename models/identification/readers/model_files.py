@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
-from models.errors import ModelError
-from models.identification.readers.matlab import matlab_variables
-from models.identification.readers.settings import ReadSettings
-from models.identification.readers.state_spaces import zeros_poles_gain
-from models.identification.types import PlantModel
-from models.plant_specs import PlantSpec, TfSpec
-from models.repair import printed_decimals, repair_rounded
-from models.roots import frequency_and_damping
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.matlab import matlab_variables
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.state_spaces import zeros_poles_gain
+from stillpath.models.identification.types import PlantModel
+from stillpath.models.plant_specs import PlantSpec, TfSpec
+from stillpath.models.repair import printed_decimals, repair_rounded
+from stillpath.models.roots import frequency_and_damping
 
 __all__ = ["read_json_models", "read_matlab_models"]
 

@@ -6,21 +6,21 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from models.errors import ModelError
-from models.identification.readers.accelerations import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.accelerations import (
     is_klipper_log,
     is_m956,
     read_klipper_log,
     read_m956,
 )
-from models.identification.readers.drives import is_drive, read_drives
-from models.identification.readers.matlab import is_matlab
-from models.identification.readers.model_files import read_json_models, read_matlab_models
-from models.identification.readers.responses import is_response, read_responses
-from models.identification.readers.settings import ReadSettings, direction_of
-from models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
-from models.identification.readers.tables import Table, as_table, check_size
-from models.identification.types import Measurement
+from stillpath.models.identification.readers.drives import is_drive, read_drives
+from stillpath.models.identification.readers.matlab import is_matlab
+from stillpath.models.identification.readers.model_files import read_json_models, read_matlab_models
+from stillpath.models.identification.readers.responses import is_response, read_responses
+from stillpath.models.identification.readers.settings import ReadSettings, direction_of
+from stillpath.models.identification.readers.spectra import MOST_BINS, is_spectrum, read_spectrum
+from stillpath.models.identification.readers.tables import Table, as_table, check_size
+from stillpath.models.identification.types import Measurement
 
 __all__ = ["LARGEST_BYTES", "read_content", "read_measurements"]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.readers.state_spaces import zeros_poles_gain
-from models.plants import PlantSpec, ZpkSpec, discretise, frequency_response
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.state_spaces import zeros_poles_gain
+from stillpath.models.plants import PlantSpec, ZpkSpec, discretise, frequency_response
 
 __all__ = ["resampled"]
 

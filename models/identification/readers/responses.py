@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.readers.checks import check_long, check_rising
-from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import Table
-from models.identification.types import FrequencyResponse
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.checks import check_long, check_rising
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.tables import Table
+from stillpath.models.identification.types import FrequencyResponse
 
 __all__ = ["is_response", "read_responses"]
 

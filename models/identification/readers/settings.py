@@ -9,9 +9,9 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, field_validator, model_validator
 
-from models.document import Document, NonNegative, Positive
-from models.errors import ModelError
-from models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.document import Document, NonNegative, Positive
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 
 __all__ = [
     "ReadSettings",

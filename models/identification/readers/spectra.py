@@ -7,11 +7,11 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.identification.readers.checks import check_alive, check_long, check_rising
-from models.identification.readers.settings import ReadSettings
-from models.identification.readers.tables import Table
-from models.identification.types import Spectrum
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers.checks import check_alive, check_long, check_rising
+from stillpath.models.identification.readers.settings import ReadSettings
+from stillpath.models.identification.readers.tables import Table
+from stillpath.models.identification.types import Spectrum
 
 __all__ = ["MOST_BINS", "is_spectrum", "read_spectrum"]
 

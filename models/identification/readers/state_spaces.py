@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.errors import ModelError
-from models.realisation import transmission_zeros
-from models.roots import dc_gain
+from stillpath.models.errors import ModelError
+from stillpath.models.realisation import transmission_zeros
+from stillpath.models.roots import dc_gain
 
 __all__ = ["zeros_poles_gain"]
 

@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from service.database.tables import metadata
+from stillpath.service.database.tables import metadata
 
 # SQLite can undo changes of its schema too; Alembic's default is made for its older driver.
 context.configure(

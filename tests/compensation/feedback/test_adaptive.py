@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.feedback._adaptive_kernels import track
-from compensation.feedback.adaptive import AdaptiveFmsdob, FrequencyTracker
-from models.disturbances import Switched, Tone, sample
-from models.loops import load_loop
-from simulation.closed_loop import ClosedLoop, Imperfections
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback._adaptive_kernels import track
+from stillpath.compensation.feedback.adaptive import AdaptiveFmsdob, FrequencyTracker
+from stillpath.models.disturbances import Switched, Tone, sample
+from stillpath.models.loops import load_loop
+from stillpath.simulation.closed_loop import ClosedLoop, Imperfections
 
 SPEC = load_loop("galvo-10khz")
 TS = 1e-4

@@ -10,20 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.feedback.controller import Refusal
-from compensation.feedback.disturbance_observer import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.controller import Refusal
+from stillpath.compensation.feedback.disturbance_observer import (
     binomial_q,
     continuous_q,
     delay_limit_hz,
     design_disturbance_observer,
     observer_sensitivity,
 )
-from compensation.feedback.pd import inertia_pd, loop_margins, margins
-from compensation.feedback.zero_phase import design_prefilter, fir_within, reference_plant
-from models.diagrams import Diagram, polynomial_response
-from models.loops import Loop, load_loop
-from simulation.closed_loop import Imperfections, simulate
+from stillpath.compensation.feedback.pd import inertia_pd, loop_margins, margins
+from stillpath.compensation.feedback.zero_phase import design_prefilter, fir_within, reference_plant
+from stillpath.models.diagrams import Diagram, polynomial_response
+from stillpath.models.loops import Loop, load_loop
+from stillpath.simulation.closed_loop import Imperfections, simulate
 
 LOOPS = load_loop("direct-drive-table").loops()
 TABLE = LOOPS[0]

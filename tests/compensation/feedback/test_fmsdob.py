@@ -11,10 +11,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.feedback.bandpass import LatticeBandPass
-from compensation.feedback.controller import Controller, Prediction, Refusal
-from compensation.feedback.fmsdob import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.bandpass import LatticeBandPass
+from stillpath.compensation.feedback.controller import Controller, Prediction, Refusal
+from stillpath.compensation.feedback.fmsdob import (
     Around,
     QFilter,
     Shape,
@@ -24,11 +24,11 @@ from compensation.feedback.fmsdob import (
     forward_model,
     instant_check,
 )
-from compensation.feedback.interpolation import interpolating_fir
-from compensation.feedback.inverse_dob import inverse_dob
-from models.diagrams import Diagram, polynomial_response
-from models.loops import Loop, builtin_loops, load_loop
-from simulation.closed_loop import batch, simulate
+from stillpath.compensation.feedback.interpolation import interpolating_fir
+from stillpath.compensation.feedback.inverse_dob import inverse_dob
+from stillpath.models.diagrams import Diagram, polynomial_response
+from stillpath.models.loops import Loop, builtin_loops, load_loop
+from stillpath.simulation.closed_loop import batch, simulate
 
 PRINTED = Loop((0, 0, 0.0282, 0.1504, 0.1146), (1, -1.319, 0.929, -0.6073, -0.0035), 2.5e-5)
 FAST = load_loop("galvo-40khz")

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from compensation.base import DesignError
-from compensation.feedback.controller import Refusal
-from compensation.feedback.mmp import (
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.controller import Refusal
+from stillpath.compensation.feedback.mmp import (
     mmp,
     predictor,
     predictor_of_gain,
     singular_distance_hz,
 )
-from models.diagrams import Diagram, Running
-from models.disturbances import SensorSpec
-from models.loops import load_loop
-from simulation.closed_loop import batch, simulate
+from stillpath.models.diagrams import Diagram, Running
+from stillpath.models.disturbances import SensorSpec
+from stillpath.models.loops import load_loop
+from stillpath.simulation.closed_loop import batch, simulate
 
 SPEC = load_loop("galvo-camera")
 LOOP = SPEC.nominal()

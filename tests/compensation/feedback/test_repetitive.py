@@ -10,14 +10,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from compensation.feedback.controller import Controller, Refusal
-from compensation.feedback.multirate import (
+from stillpath.compensation.feedback.controller import Controller, Refusal
+from stillpath.compensation.feedback.multirate import (
     alias_spectra,
     design_multirate,
     fast_rate,
     multirate_factor,
 )
-from compensation.feedback.repetitive import (
+from stillpath.compensation.feedback.repetitive import (
     InternalModel,
     design_quasi,
     design_wide_band,
@@ -27,8 +27,8 @@ from compensation.feedback.repetitive import (
     plug_in_factor,
     shared_period,
 )
-from models.loops import Loop, PidLoop, load_loop
-from simulation.closed_loop import simulate
+from stillpath.models.loops import Loop, PidLoop, load_loop
+from stillpath.simulation.closed_loop import simulate
 
 HARMONICS = 1200.0 * np.arange(1, 6)
 VOLTS = (4e-3,) * 5

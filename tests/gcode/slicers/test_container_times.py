@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.containers.opening import open_text, rewriting
 from tests.gcode.container_files import binary, block, blocks, members, package
 
 TEXT = b"G28\nG1 X1 Y1 F600\n"

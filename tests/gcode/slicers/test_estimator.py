@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.slicers._estimator_kernels import queue_times, trapezoid_s
-from gcode.slicers.estimator import Rules, estimated_s, rules_of
-from gcode.slicers.facts import SlicerFacts, read_facts
+from stillpath.gcode.slicers._estimator_kernels import queue_times, trapezoid_s
+from stillpath.gcode.slicers.estimator import Rules, estimated_s, rules_of
+from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
 
 LIMITS = {
     **{f"machine_max_acceleration_{a}": "1000" for a in "xyze"},

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcode.slicers import facts
-from gcode.slicers.facts import LOOKED_AT_BYTES, facts_in, read_facts
+from stillpath.gcode.slicers import facts
+from stillpath.gcode.slicers.facts import LOOKED_AT_BYTES, facts_in, read_facts
 
 
 @pytest.mark.parametrize(

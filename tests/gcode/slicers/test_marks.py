@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from gcode.interpreter import Interpreter
-from gcode.slicers.features import Feature, feature_of, feature_title
-from gcode.slicers.marks import Mark, MarkKind, read_mark
-from models.machine import Machine
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.slicers.features import Feature, feature_of, feature_title
+from stillpath.gcode.slicers.marks import Mark, MarkKind, read_mark
+from stillpath.models.machine import Machine
 
 K = MarkKind
 

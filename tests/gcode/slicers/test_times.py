@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcode.slicers.times import TimeKind, may_tell_time, read_times
+from stillpath.gcode.slicers.times import TimeKind, may_tell_time, read_times
 
 K = TimeKind
 

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from models.identification.conditions import Condition
-from models.identification.synthetic import (
+from stillpath.applications.identification.run import InputFile
+from stillpath.models.identification.conditions import Condition
+from stillpath.models.identification.synthetic import (
     ADXL345,
     Sensor,
     simulate_log,
@@ -19,9 +20,8 @@ from models.identification.synthetic import (
     write_raw_data,
     write_resonances,
 )
-from models.identification.types import AccelerationLog, Excitation, Spectrum
-from models.plants import PairsSpec, PlantSpec, PolePair
-from service.identification.run import InputFile
+from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
+from stillpath.models.plants import PairsSpec, PlantSpec, PolePair
 
 __all__ = [
     "BROKEN",

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.readers import ReadSettings
-from models.identification.synthetic import (
+from stillpath.applications.identification.figures import AxisFigures
+from stillpath.applications.identification.run import Identified, InputFile, identify_files
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import ReadSettings
+from stillpath.models.identification.synthetic import (
     ADXL345,
     LIS2DW,
     Sensor,
@@ -22,8 +24,8 @@ from models.identification.synthetic import (
     write_calibration_data,
     write_raw_data,
 )
-from models.machine import Machine
-from models.plants import (
+from stillpath.models.machine import Machine
+from stillpath.models.plants import (
     Mode,
     ModesSpec,
     PlantSpec,
@@ -32,9 +34,7 @@ from models.plants import (
     discretise,
     frequency_response,
 )
-from models.store import load_machine
-from service.identification.figures import AxisFigures
-from service.identification.run import Identified, InputFile, identify_files
+from stillpath.models.store import load_machine
 from tests.models.identification.recordings import (
     BROKEN,
     LEGACY,

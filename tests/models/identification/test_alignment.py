@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, correlate, sosfiltfilt
 
-from models.errors import ModelError
-from models.identification.alignment import align, check_pair, resample
-from models.identification.excitation import regenerate
-from models.identification.synthetic import ADXL345, LIS2DW, Sensor, simulate_log
-from models.identification.types import AccelerationLog, Excitation
-from models.plants import Mode, ModesSpec
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.alignment import align, check_pair, resample
+from stillpath.models.identification.excitation import regenerate
+from stillpath.models.identification.synthetic import ADXL345, LIS2DW, Sensor, simulate_log
+from stillpath.models.identification.types import AccelerationLog, Excitation
+from stillpath.models.plants import Mode, ModesSpec
 
 NEW = Excitation((1.0, 0.0))
 NEW_Y = Excitation((0.0, 1.0))

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.errors import ModelError
-from models.identification.conditions import Condition
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.conditions import Condition
 
 
 @pytest.mark.parametrize(

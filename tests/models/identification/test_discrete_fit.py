@@ -6,9 +6,9 @@ import control
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.discrete_fit import discrete_model, zeros_outside
-from models.plants import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.discrete_fit import discrete_model, zeros_outside
+from stillpath.models.plants import (
     Mode,
     ModesSpec,
     PairsSpec,

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import coherence, csd, welch
 
-from models.errors import ModelError
-from models.identification.alignment import align
-from models.identification.estimation import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.alignment import align
+from stillpath.models.identification.estimation import (
     check_plateau,
     estimate_aligned,
     estimate_driven,
@@ -21,16 +21,23 @@ from models.identification.estimation import (
     estimate_welch,
     plateau_gain,
 )
-from models.identification.local_model import Transformed, local_response
-from models.identification.readers import ReadSettings, excitation_for, read_measurements
-from models.identification.synthetic import ADXL345, Sensor, simulate_log, write_raw_data
-from models.identification.types import (
+from stillpath.models.identification.local_model import Transformed, local_response
+from stillpath.models.identification.readers import ReadSettings, excitation_for, read_measurements
+from stillpath.models.identification.synthetic import ADXL345, Sensor, simulate_log, write_raw_data
+from stillpath.models.identification.types import (
     AccelerationLog,
     DrivenLog,
     Excitation,
     FrequencyResponse,
 )
-from models.plants import Mode, ModesSpec, PairsSpec, PolePair, ZeroPair, frequency_response
+from stillpath.models.plants import (
+    Mode,
+    ModesSpec,
+    PairsSpec,
+    PolePair,
+    ZeroPair,
+    frequency_response,
+)
 
 NEW = Excitation((1.0, 0.0))
 LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import welch
 
-from models.errors import ModelError
-from models.identification.excitation import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import (
     drive_spectrum,
     drive_spectrum_regenerated,
     klipper_psd,
@@ -19,7 +19,7 @@ from models.identification.excitation import (
     welch_kernel,
     welch_length,
 )
-from models.identification.types import Excitation
+from stillpath.models.identification.types import Excitation
 
 NEW = Excitation((1.0, 0.0))
 LEGACY = Excitation((1.0, 0.0), 5.0, 10_000 / 75, 75.0, 1.0, 0.0, 0.0)

@@ -9,12 +9,12 @@ import control
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.estimation import estimate_driven
-from models.identification.fitting import fit_response, refit_response
-from models.identification.types import DrivenLog, FrequencyResponse
-from models.plants import frequency_response
-from models.store import load_machine
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.estimation import estimate_driven
+from stillpath.models.identification.fitting import fit_response, refit_response
+from stillpath.models.identification.types import DrivenLog, FrequencyResponse
+from stillpath.models.plants import frequency_response
+from stillpath.models.store import load_machine
 
 TRUTH = ((47.0, 0.035), (95.0, 0.060), (170.0, 0.050))
 Modes = tuple[tuple[float, float], ...]

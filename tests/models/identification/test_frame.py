@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.identification.frame import shaken, without_frame
-from models.plants import (
+from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.plants import (
     PairsSpec,
     PolePair,
     RelativeMode,

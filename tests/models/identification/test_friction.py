@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.identification.alignment import align
-from models.identification.averaging import mean_response
-from models.identification.estimation import estimate_aligned, estimate_response
-from models.identification.friction import dry_friction, freed
-from models.identification.types import AccelerationLog, Excitation
-from simulation.printers.drawing import draw
-from simulation.printers.machines import Printer
-from simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
+from stillpath.models.identification.alignment import align
+from stillpath.models.identification.averaging import mean_response
+from stillpath.models.identification.estimation import estimate_aligned, estimate_response
+from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.types import AccelerationLog, Excitation
+from stillpath.simulation.printers.drawing import draw
+from stillpath.simulation.printers.machines import Printer
+from stillpath.simulation.printers.resonance_test import NEW_TEST, OLD_TEST, drawn_sensor, run_test
 
 
 def held_mm(printer: Printer, number: int) -> float:

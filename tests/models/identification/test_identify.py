@@ -10,20 +10,20 @@ from datetime import date
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.conditions import Condition
-from models.identification.identify import Measured, identify
-from models.identification.readers import ReadSettings, read_content
-from models.identification.synthetic import Sensor
-from models.identification.types import (
+from stillpath.applications.identification.run import InputFile
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.conditions import Condition
+from stillpath.models.identification.identify import Measured, identify
+from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.synthetic import Sensor
+from stillpath.models.identification.types import (
     AxisIdentification,
     FrequencyResponse,
     Measurement,
     PlantModel,
 )
-from models.plants import PairsSpec, PolePair, frequency_response
-from models.schedule import AxisSchedule, MassSchedule
-from service.identification.run import InputFile
+from stillpath.models.plants import PairsSpec, PolePair, frequency_response
+from stillpath.models.schedule import AxisSchedule, MassSchedule
 from tests.models.identification.recordings import (
     LEGACY,
     QUICK,

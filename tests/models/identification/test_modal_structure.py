@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.identification.modal_structure import ModalStructure
-from models.plants import RelativeMode, RelativeModesSpec, frequency_response
+from stillpath.models.identification.modal_structure import ModalStructure
+from stillpath.models.plants import RelativeMode, RelativeModesSpec, frequency_response
 
 F = np.linspace(1.0, 150.0, 60)
 

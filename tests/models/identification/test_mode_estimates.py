@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.identification.mode_estimates import (
+from stillpath.models.identification.mode_estimates import (
     band_warnings,
     filler_poles,
     mode_estimates,
     robust_covariance,
 )
-from models.identification.pair_structure import PairStructure
-from models.identification.types import ModeEstimate
-from models.plants import PairsSpec, PolePair, ZeroPair
+from stillpath.models.identification.pair_structure import PairStructure
+from stillpath.models.identification.types import ModeEstimate
+from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 
 def test_covariance_of_a_linear_fit() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.identification.nozzle import Frame, frame_of
-from models.identification.types import FrequencyResponse
+from stillpath.models.identification.nozzle import Frame, frame_of
+from stillpath.models.identification.types import FrequencyResponse
 
 F_HZ = np.arange(24, 520) * 0.25
 

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.identification.pair_structure import PairStructure
-from models.plants import PairsSpec, PolePair, ZeroPair
+from stillpath.models.identification.pair_structure import PairStructure
+from stillpath.models.plants import PairsSpec, PolePair, ZeroPair
 
 F = np.linspace(1.0, 150.0, 60)
 SPEC = PairsSpec(

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.prediction import predicted_psd, predicted_spectrum
-from models.identification.spectrum_fit import fit_spectrum
-from models.identification.synthetic import Sensor, simulate_spectrum
-from models.identification.types import Spectrum
-from models.plants import PairsSpec, PolePair
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
+from stillpath.models.identification.spectrum_fit import fit_spectrum
+from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
+from stillpath.models.identification.types import Spectrum
+from stillpath.models.plants import PairsSpec, PolePair
 from tests.models.identification.recordings import LEGACY, one_mode
 
 SMOOTH = one_mode(55.0, 0.25)  # wider than the window's 2.3 Hz

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.identification.prompt import advanced, delay_of
-from models.plants import (
+from stillpath.models.identification.prompt import advanced, delay_of
+from stillpath.models.plants import (
     Mode,
     ModesSpec,
     PairsSpec,

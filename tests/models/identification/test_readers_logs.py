@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from models.errors import ModelError
-from models.identification.readers import ReadSettings, read_content, read_measurements
-from models.identification.types import AccelerationLog, DrivenLog
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
+from stillpath.models.identification.types import AccelerationLog, DrivenLog
 
 N = 400
 

@@ -17,11 +17,18 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from models.errors import ModelError
-from models.identification.readers import ReadSettings, read_content, resampled
-from models.identification.readers.matlab import matlab_variables
-from models.identification.types import PlantModel
-from models.plants import PairsSpec, PlantSpec, PolePair, ZeroPair, discretise, frequency_response
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import ReadSettings, read_content, resampled
+from stillpath.models.identification.readers.matlab import matlab_variables
+from stillpath.models.identification.types import PlantModel
+from stillpath.models.plants import (
+    PairsSpec,
+    PlantSpec,
+    PolePair,
+    ZeroPair,
+    discretise,
+    frequency_response,
+)
 
 F_HZ = np.linspace(0.1, 200.0, 150)
 DT_S = 1e-3

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.errors import ModelError
-from models.identification.readers import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
     direction_of,
     excitation_for,
     excitation_notes,
 )
-from models.identification.types import Excitation, Spectrum
+from stillpath.models.identification.types import Excitation, Spectrum
 
 
 def spectrum(

@@ -10,15 +10,15 @@ import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.errors import ModelError
-from models.identification.readers import ReadSettings, read_content, read_measurements
-from models.identification.synthetic import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
+from stillpath.models.identification.synthetic import (
     simulate_spectrum,
     write_calibration_data,
     write_resonances,
 )
-from models.identification.types import Excitation, FrequencyResponse, Spectrum
-from models.plants import PairsSpec, PolePair
+from stillpath.models.identification.types import Excitation, FrequencyResponse, Spectrum
+from stillpath.models.plants import PairsSpec, PolePair
 
 RATE_HZ = 3193.7
 

@@ -14,10 +14,10 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.errors import ModelError
-from models.identification.readers import ReadSettings, read_content, read_measurements
-from models.identification.readers.reading import LARGEST_BYTES
-from models.identification.types import Measurement
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
+from stillpath.models.identification.readers.reading import LARGEST_BYTES
+from stillpath.models.identification.types import Measurement
 
 RNG = np.random.default_rng(7)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.identification.representatives import mode_spread, representatives
-from models.identification.scatter import SCATTERS
-from models.identification.spectrum_model import SpectrumModel
-from models.plants import RelativeMode, RelativeModesSpec, frequency_response
+from stillpath.models.identification.representatives import mode_spread, representatives
+from stillpath.models.identification.scatter import SCATTERS
+from stillpath.models.identification.spectrum_model import SpectrumModel
+from stillpath.models.plants import RelativeMode, RelativeModesSpec, frequency_response
 
 F = np.linspace(1.0, 150.0, 300)
 

@@ -6,7 +6,7 @@ import control
 import numpy as np
 import pytest
 
-from models.identification.sanathanan_koerner import (
+from stillpath.models.identification.sanathanan_koerner import (
     pairs_of,
     polynomial_basis,
     sanathanan_koerner,

@@ -8,9 +8,9 @@ from datetime import date
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.averaging import mean_response, mean_spectrum
-from models.identification.sets import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.averaging import mean_response, mean_spectrum
+from stillpath.models.identification.sets import (
     delay_warning,
     parametric_members,
     plant_set_from,
@@ -18,15 +18,15 @@ from models.identification.sets import (
     spectrum_set,
     typed_in_set,
 )
-from models.identification.synthetic import Sensor, simulate_spectrum
-from models.identification.types import Excitation, FrequencyResponse, Spectrum
-from models.plants import (
+from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
+from stillpath.models.identification.types import Excitation, FrequencyResponse, Spectrum
+from stillpath.models.plants import (
     Mode,
     ModesSpec,
     RelativeModesSpec,
     frequency_response,
 )
-from models.provenance import SourceFile
+from stillpath.models.provenance import SourceFile
 
 F = np.arange(5.0, 134.0, 0.5)
 TEST = Excitation((1.0, 0.0), 5.0, 133.33, 75.0, 1.0, 0.0)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.shaper_choice import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.shaper_choice import (
     choose_shaper,
     choose_shaper_of,
     residual_vibration,
 )
-from models.identification.types import Spectrum
-from models.shaper_pulses import SHAPERS, shaper_pulses
+from stillpath.models.identification.types import Spectrum
+from stillpath.models.shaper_pulses import SHAPERS, shaper_pulses
 
 F = np.arange(0.0, 200.0, 1.5625)
 

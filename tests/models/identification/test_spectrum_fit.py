@@ -8,20 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.errors import ModelError
-from models.identification.excitation import drive_spectrum, klipper_psd
-from models.identification.frame import without_frame
-from models.identification.readers import read_measurements
-from models.identification.shaper_choice import choose_shaper_of
-from models.identification.spectrum_fit import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import drive_spectrum, klipper_psd
+from stillpath.models.identification.frame import without_frame
+from stillpath.models.identification.readers import read_measurements
+from stillpath.models.identification.shaper_choice import choose_shaper_of
+from stillpath.models.identification.spectrum_fit import (
     explain_spectra,
     fit_spectrum,
     refit_spectrum,
 )
-from models.identification.spectrum_model import cross_axis_share, driven_column, spectrum_model
-from models.identification.synthetic import Sensor, simulate_spectrum
-from models.identification.types import Excitation, Fit, Spectrum
-from models.plants import (
+from stillpath.models.identification.spectrum_model import (
+    cross_axis_share,
+    driven_column,
+    spectrum_model,
+)
+from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
+from stillpath.models.identification.types import Excitation, Fit, Spectrum
+from stillpath.models.plants import (
     Mode,
     ModesSpec,
     RelativeMode,

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from models.errors import ModelError
-from models.identification.excitation import drive_spectrum, regenerate
-from models.identification.synthetic import (
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.excitation import drive_spectrum, regenerate
+from stillpath.models.identification.synthetic import (
     LIS2DW,
     Sensor,
     acceleration_response,
@@ -20,8 +20,8 @@ from models.identification.synthetic import (
     write_raw_data,
     write_resonances,
 )
-from models.identification.types import Excitation, Spectrum
-from models.plants import (
+from stillpath.models.identification.types import Excitation, Spectrum
+from stillpath.models.plants import (
     FirSpec,
     Mode,
     ModesSpec,

@@ -9,15 +9,15 @@ from pathlib import Path
 from unittest import mock
 
 if __name__ == "__main__":
-    from service.environment import prepare_environment
+    from stillpath.service.environment import prepare_environment
 
     prepare_environment()
 
-    from models.store import load_machine
-    from service.api import designs
-    from service.design.design import design_report
-    from service.server import serve_forever
-    from service.settings import Settings
+    from stillpath.applications.design.design import design_report
+    from stillpath.models.store import load_machine
+    from stillpath.service.api import designs
+    from stillpath.service.server import serve_forever
+    from stillpath.service.settings import Settings
     from tests.service.runners import light
 
     design = design_report(load_machine("ender3"), "x").model_dump(mode="json")

@@ -7,8 +7,8 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from service.api import create_app
-from service.settings import Settings
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.service.runners import light
 from tests.service.test_api import JOBS
 

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from service.client import Client, ClientError
+from stillpath.service.client import Client, ClientError
 from tests.service.test_server import PRETEND, ROOT, server, until
 
-STILLPATH = [sys.executable, "-c", "from service.cli import main; main()"]
+STILLPATH = [sys.executable, "-c", "from cli.main import main; main()"]
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def read_body(handler: Handler) -> bytes:
 
 
 def job_document(**fields: Any) -> bytes:
-    from service.api.schemas import JobView
+    from stillpath.service.api.schemas import JobView
 
     (example,) = JobView.model_config["json_schema_extra"]["examples"]
     return json.dumps(example | fields).encode()

@@ -14,11 +14,11 @@ import pytest
 from sqlalchemy import event
 from starlette.testclient import TestClient
 
-from service.api.hub import Hub
-from service.database.engine import open_database
-from service.jobs.state import Cancelled, Claimed, Progressed
-from service.jobs.store import JobStore
-from service.settings import Settings
+from stillpath.service.api.hub import Hub
+from stillpath.service.database.engine import open_database
+from stillpath.service.jobs.state import Cancelled, Claimed, Progressed
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from tests.service.api.serving import post
 from tests.service.database.examples import make_job
 from tests.service.test_api import assert_problem, over, until
@@ -86,7 +86,7 @@ def test_a_cancelled_job_ends_the_stream(client: TestClient):
 
 
 def test_heartbeats_are_comments(client: TestClient, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("service.api.events._HEARTBEAT_S", 0.1)
+    monkeypatch.setattr("stillpath.service.api.events._HEARTBEAT_S", 0.1)
     where = post(client, b"nap 2").headers["location"]
     text = client.get(f"{where}/events").text
     assert ": still here\n\n" in text

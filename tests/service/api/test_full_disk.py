@@ -13,7 +13,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from service.storage.disk import Disk, NoRoom
+from stillpath.service.storage.disk import Disk, NoRoom
 from tests.service.test_server import PRETEND, server, until
 
 MIB = 1 << 20

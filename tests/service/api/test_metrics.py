@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.database.engine import DatabaseAway
-from service.storage.base import StorageError
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.storage.base import StorageError
 from tests.service.api.serving import opened, post
 from tests.service.test_api import assert_problem, over, until
 
@@ -54,7 +54,7 @@ def test_figures(tmp_path: Path):
 
 @pytest.mark.slow
 def test_how_long_jobs_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("service.api.metrics._SETTLED_S", 0.0)
+    monkeypatch.setattr("stillpath.service.api.metrics._SETTLED_S", 0.0)
     with opened(tmp_path) as client:
         made = [post(client, content) for content in (b"nap 1", b"G1 X1", b"bad")]
         jobs = [until(client, answer.headers["location"], over) for answer in made]
@@ -96,7 +96,7 @@ def test_who_waits_for_a_slow_part_holds_no_thread(tmp_path: Path, monkeypatch):
 
 
 def test_not_ready_says_which_part(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("service.api.health._FRESH_S", 0.0)
+    monkeypatch.setattr("stillpath.service.api.health._FRESH_S", 0.0)
     with opened(tmp_path) as client:
         state = client.app.state
 

@@ -12,9 +12,9 @@ import pytest
 from starlette.exceptions import HTTPException
 from starlette.types import Message
 
-from service.api.limits import Limits
-from service.api.patience import LEAST_BYTES, Patience
-from service.api.problems import Problem
+from stillpath.service.api.limits import Limits
+from stillpath.service.api.patience import LEAST_BYTES, Patience
+from stillpath.service.api.problems import Problem
 from tests.service.security.test_limits import caller
 from tests.service.test_server import PRETEND, finished, server, until
 
@@ -81,7 +81,7 @@ def test_what_the_service_takes_itself_is_not_the_sender_s() -> None:
 
 
 def test_who_has_been_silent_for_long_yields_his_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.api.patience._YIELDS_AFTER_S", 0.1)
+    monkeypatch.setattr("stillpath.service.api.patience._YIELDS_AFTER_S", 0.1)
 
     async def ask() -> None:
         limits, ended = Limits(100, uploads=2), []

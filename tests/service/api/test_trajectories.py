@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import create_app
-from service.settings import Settings
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.service.test_api import JOBS, assert_problem, over, until

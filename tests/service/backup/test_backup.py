@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from service.backup import archive
-from service.backup.archive import BackupError, back_up, restore
-from service.cli import run
-from service.database.engine import open_database
-from service.deliveries.rows import deliveries_of
-from service.exclusive import exclusive
-from service.jobs.state import JobState
-from service.jobs.store import JobStore
-from service.settings import Settings
+from stillpath.cli.main import run
+from stillpath.service.backup import archive
+from stillpath.service.backup.archive import BackupError, back_up, restore
+from stillpath.service.database.engine import open_database
+from stillpath.service.deliveries.rows import deliveries_of
+from stillpath.service.exclusive import exclusive
+from stillpath.service.jobs.state import JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from tests.service.database.examples import finished, make_job
 
 

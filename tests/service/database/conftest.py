@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from service.database.engine import open_database
-from service.settings import Settings
+from stillpath.service.database.engine import open_database
+from stillpath.service.settings import Settings
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)])

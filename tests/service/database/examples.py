@@ -6,8 +6,8 @@ import time
 import uuid
 from typing import Any
 
-from service.jobs.state import Finished, Job
-from service.jobs.store import JobStore
+from stillpath.service.jobs.state import Finished, Job
+from stillpath.service.jobs.store import JobStore
 
 __all__ = ["finished", "make_job", "take_all"]
 

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from service.jobs.state import Cancelled, Claimed, Event, Failed, Finished, Lost, Progressed
+from stillpath.service.jobs.state import (
+    Cancelled,
+    Claimed,
+    Event,
+    Failed,
+    Finished,
+    Lost,
+    Progressed,
+)
 
 __all__ = ["events"]
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from service.database import engine as database
-from service.database.engine import DatabaseAway, open_database
-from service.jobs.state import JobState
-from service.jobs.store import JobStore
-from service.settings import Settings
+from stillpath.service.database import engine as database
+from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.jobs.state import JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from tests.service.database.examples import finished, make_job
 from tests.service.database.postgres import PostgresServer
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import run
+from stillpath.cli.main import run
 from tests.service.machines import make_machine
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -68,7 +68,7 @@ def test_a_database_that_is_away_is_one_line(
 @pytest.mark.parametrize("arguments", [["compensate", "--help"], ["machines"]])
 def test_commands_without_a_database_do_not_load_it(arguments: list[str]):
     code = (
-        "import sys; from service.cli import run; "
+        "import sys; from cli.main import run; "
         f"assert run({arguments!r}) == 0; "
         "heavy = {'sqlalchemy', 'alembic', 'psycopg', 'distributed'} & {*sys.modules}; "
         "sys.exit(' '.join(heavy) or 0)"

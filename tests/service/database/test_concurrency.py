@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import URL, Connection, Engine, select
 
-from service.database import tables
-from service.database.engine import (
+from stillpath.service.database import tables
+from stillpath.service.database.engine import (
     DatabaseAway,
     make_engine,
     open_database,
@@ -27,9 +27,9 @@ from service.database.engine import (
     write_together,
     writing,
 )
-from service.jobs.state import Cancelled, Event, Failed, JobState, Lost
-from service.jobs.store import JobStore, Quota, QuotaExceeded
-from service.settings import Settings
+from stillpath.service.jobs.state import Cancelled, Event, Failed, JobState, Lost
+from stillpath.service.jobs.store import JobStore, Quota, QuotaExceeded
+from stillpath.service.settings import Settings
 from tests.service.database.examples import finished, make_job, take_all
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -151,9 +151,9 @@ def test_beats_and_readers_beside_submissions(store: JobStore):
 
 _PRELUDE = """
 import json, sys
-from service.database.engine import open_database
-from service.jobs.store import JobStore
-from service.settings import Settings
+from stillpath.service.database.engine import open_database
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from tests.service.database.examples import make_job, take_all
 print("loaded", flush=True)
 sys.stdin.readline()
@@ -298,7 +298,7 @@ def test_who_loses_patience_hears_the_truth(tmp_path: Path, monkeypatch: pytest.
     engine = make_engine(URL.create("sqlite", database=str(tmp_path / "x.sqlite3")))
     with writing(engine) as connection:
         connection.exec_driver_sql("CREATE TABLE t (n INTEGER)")
-    monkeypatch.setattr("service.database.engine._BUSY_TIMEOUT_MS", 60)
+    monkeypatch.setattr("stillpath.service.database.engine._BUSY_TIMEOUT_MS", 60)
 
     def wish(n: int) -> object:
         def work(connection: Connection) -> int:

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import Engine
 
-from service.database.documents import DocumentTable, open_documents
-from service.database.engine import open_database
-from service.machines.documents import DocumentFolder, Documents
-from service.machines.revision import Conflict, UnknownMachine
-from service.machines.store import MachineStore
-from service.settings import Settings
+from stillpath.applications.machines.documents import DocumentFolder, Documents
+from stillpath.applications.machines.revision import Conflict, UnknownMachine
+from stillpath.applications.machines.store import MachineStore
+from stillpath.service.database.documents import DocumentTable, open_documents
+from stillpath.service.database.engine import open_database
+from stillpath.service.settings import Settings
 from tests.service.machines import make_machine, make_plants, with_accel
 
 PLACES = ["folder", "sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)]

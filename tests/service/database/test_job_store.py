@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import Engine, select, text
 
-from service.database.engine import reading, writing
-from service.database.tables import deliveries
-from service.jobs.expiry import Expiry
-from service.jobs.state import (
+from stillpath.service.database.engine import reading, writing
+from stillpath.service.database.tables import deliveries
+from stillpath.service.jobs.expiry import Expiry
+from stillpath.service.jobs.state import (
     Cancelled,
     Event,
     Failed,
@@ -26,7 +26,7 @@ from service.jobs.state import (
     Stale,
     advance,
 )
-from service.jobs.store import (
+from stillpath.service.jobs.store import (
     BadCursor,
     IdempotencyConflict,
     JobStore,

@@ -10,8 +10,8 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import Engine, inspect, text
 
-import service.database.migrations
-from service.database.engine import (
+from stillpath.service.database import migrations
+from stillpath.service.database.engine import (
     StoreError,
     database_url,
     migrate,
@@ -19,10 +19,10 @@ from service.database.engine import (
     reading,
     writing,
 )
-from service.database.migrations import LATEST
-from service.database.tables import metadata
-from service.jobs.store import JobStore
-from service.settings import Settings
+from stillpath.service.database.migrations import LATEST
+from stillpath.service.database.tables import metadata
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 from tests.service.database.examples import make_job
 
 
@@ -56,7 +56,7 @@ def test_migrations_lead_to_the_tables(engine: Engine):
 
 
 def test_the_latest_is_the_last():
-    folder = Path(service.database.migrations.__file__).parent
+    folder = Path(migrations.__file__).parent
     assert ScriptDirectory(str(folder)).get_heads() == [LATEST]
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from models.store import load_machine
-from service.database.engine import StoreError, open_database
-from service.jobs.state import Job, JobState
-from service.jobs.store import JobStore
-from service.machines.resolve import PinnedMachine
-from service.settings import Settings
+from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.models.store import load_machine
+from stillpath.service.database.engine import StoreError, open_database
+from stillpath.service.jobs.state import Job, JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[3]
 

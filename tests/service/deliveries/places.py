@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from service.database.engine import open_database
-from service.deliveries.printers import load_printers
-from service.deliveries.rows import Delivery, deliveries_of
-from service.deliveries.sender import Sender
-from service.jobs.state import Claimed, Failed, Finished, Job
-from service.jobs.store import JobStore
-from service.settings import Settings
-from service.storage.opened import open_storage
+from stillpath.service.database.engine import open_database
+from stillpath.service.deliveries.printers import load_printers
+from stillpath.service.deliveries.rows import Delivery, deliveries_of
+from stillpath.service.deliveries.sender import Sender
+from stillpath.service.jobs.state import Claimed, Failed, Finished, Job
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.settings import Settings
+from stillpath.service.storage.opened import open_storage
 from tests.service.database.examples import make_job
 from tests.service.deliveries.listeners import until
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from models.firmware import Klipper
-from models.machine import Machine
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import Machine
 
 __all__ = ["status_of"]
 

@@ -3,7 +3,7 @@
 import sys
 import threading
 
-from service.settings import Settings
+from stillpath.service.settings import Settings
 from tests.service.deliveries.places import Place
 
 if __name__ == "__main__":

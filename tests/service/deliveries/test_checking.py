@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from models.machine import Machine
-from models.store import load_machine
-from service.api import create_app
-from service.deliveries.checking import Checker, PrinterUnknown
-from service.deliveries.printers import Printer
-from service.machines.documents import DocumentFolder
-from service.settings import Settings
+from stillpath.applications.machines.documents import DocumentFolder
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.service.api import create_app
+from stillpath.service.deliveries.checking import Checker, PrinterUnknown
+from stillpath.service.deliveries.printers import Printer
+from stillpath.service.settings import Settings
 from tests.service.deliveries.listeners import Listener, moonraker, octoprint, until, uploads
 from tests.service.deliveries.places import Place, open_place
 from tests.service.deliveries.recorded_printer import status_of
@@ -366,7 +366,7 @@ def _delivery(client: TestClient, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_on_the_command_line(tmp_path: Path, monkeypatch, capsys):
-    from service.cli import run
+    from stillpath.cli.main import run
 
     monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.delenv("STILLPATH_SERVER", raising=False)

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from service.deliveries import posting
-from service.deliveries.targets import read_url
+from stillpath.service.deliveries import posting
+from stillpath.service.deliveries.targets import read_url
 
 
 @pytest.fixture(params=["body", "headers"])

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.deliveries.printers import PrinterFileError, load_printers, printer_for
-from service.deliveries.targets import TargetRefused
+from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
+from stillpath.service.deliveries.targets import TargetRefused
 from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads
 from tests.service.deliveries.places import RESULT, SECRET, Place, open_place
 

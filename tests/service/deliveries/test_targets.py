@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.deliveries.targets import (
+from stillpath.service.deliveries.targets import (
     TargetRefused,
     Unresolved,
     addresses_of,
     check_webhook,
     read_url,
 )
-from service.settings import Settings
+from stillpath.service.settings import Settings
 
 
 def settings(*targets: str, secret: str | None = "s") -> Settings:

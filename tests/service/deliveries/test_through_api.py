@@ -8,10 +8,10 @@ from pathlib import Path
 
 from starlette.testclient import TestClient
 
-from models.store import load_machine
-from service.api import create_app
-from service.deliveries.webhooks import verify
-from service.settings import Settings
+from stillpath.models.store import load_machine
+from stillpath.service.api import create_app
+from stillpath.service.deliveries.webhooks import verify
+from stillpath.service.settings import Settings
 from tests.service.deliveries.listeners import Listener, moonraker, until, uploads
 from tests.service.deliveries.places import SECRET
 from tests.service.deliveries.recorded_printer import status_of

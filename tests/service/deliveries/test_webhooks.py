@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.deliveries.rows import claim, settle
-from service.deliveries.webhooks import SignatureRefused, sign, verify
+from stillpath.service.deliveries.rows import claim, settle
+from stillpath.service.deliveries.webhooks import SignatureRefused, sign, verify
 from tests.service.deliveries.listeners import Listener, Seen, until
 from tests.service.deliveries.places import SECRET, Place, open_place
 

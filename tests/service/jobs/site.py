@@ -15,12 +15,12 @@ from typing import Any
 
 import psutil
 
-from service.database.engine import DatabaseAway, open_database
-from service.jobs.state import Cancelled, Job, JobState
-from service.jobs.store import JobStore
-from service.jobs.sweep import sweep_files
-from service.settings import Settings
-from service.storage.opened import open_storage
+from stillpath.service.database.engine import DatabaseAway, open_database
+from stillpath.service.jobs.state import Cancelled, Job, JobState
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.sweep import sweep_files
+from stillpath.service.settings import Settings
+from stillpath.service.storage.opened import open_storage
 from tests.service.database.examples import make_job
 
 __all__ = ["ROOT", "Process", "Site", "until"]
@@ -127,7 +127,7 @@ class Site:
     @contextlib.contextmanager
     def command(self, *arguments: str, **settings: Any) -> Iterator[Process]:
         """Run a command of `stillpath`."""
-        main = [sys.executable, "-c", "from service.cli import main; main()"]
+        main = [sys.executable, "-c", "from cli.main import main; main()"]
         with self.process([*main, *arguments], **settings) as process:
             yield process
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from service.jobs import worker
-from service.jobs.state import WAITING_FOR_ROOM, Cancelled, Job, JobState, Lost
-from service.jobs.watch import STUCK_EXIT_CODE
-from service.jobs.worker import Workplace, execute
-from service.pipeline.progress import Progress
-from service.storage import StorageError
+from stillpath.pipeline.progress import Progress
+from stillpath.service.jobs import worker
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Cancelled, Job, JobState, Lost
+from stillpath.service.jobs.watch import STUCK_EXIT_CODE
+from stillpath.service.jobs.worker import Workplace, execute
+from stillpath.service.storage import StorageError
 from tests.service.jobs.site import Site, until
 from tests.service.runners import light
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.database.engine import DatabaseAway
-from service.jobs.state import JobState
+from stillpath.service.database.engine import DatabaseAway
+from stillpath.service.jobs.state import JobState
 from tests.service.jobs.site import ROOT, Process, Site, until
 
 pytestmark = [
@@ -197,7 +197,7 @@ def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
 
 def test_the_real_road_survives_the_death_of_its_worker(site: Site):
     source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
-    main = [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"]
+    main = [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"]
     with site.process(main) as process:
         job_id = site.submit(source.read_text())
         job = until(lambda: (j := site.running(job_id)).stage == "compensating" and j)

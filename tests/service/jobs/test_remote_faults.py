@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from service.jobs.state import JobState
+from stillpath.service.jobs.state import JobState
 from tests.service.database.postgres import PostgresServer
 from tests.service.database.postgres import postgres_server as postgres_server
 from tests.service.jobs.site import Process, Site, until

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.jobs.state import Cancelled
-from service.jobs.sweep import Sweep, sweep_files
+from stillpath.service.jobs.state import Cancelled
+from stillpath.service.jobs.sweep import Sweep, sweep_files
 from tests.service.database.examples import finished
 from tests.service.jobs.site import Site
 

@@ -5,13 +5,13 @@ import sys
 import threading
 
 if __name__ == "__main__":
-    from service.database.engine import open_database
-    from service.environment import prepare_environment
-    from service.jobs.store import JobStore
-    from service.jobs.work import Work
-    from service.logs import configure_logging
-    from service.settings import Settings
-    from service.storage.opened import open_storage
+    from stillpath.service.database.engine import open_database
+    from stillpath.service.environment import prepare_environment
+    from stillpath.service.jobs.store import JobStore
+    from stillpath.service.jobs.work import Work
+    from stillpath.service.logs import configure_logging
+    from stillpath.service.settings import Settings
+    from stillpath.service.storage.opened import open_storage
     from tests.service import runners
 
     prepare_environment()

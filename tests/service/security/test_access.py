@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api import create_app
-from service.settings import Settings
+from stillpath.service.api import create_app
+from stillpath.service.settings import Settings
 from tests.service.runners import pretend
 
 FIRST = "sp_" + "f" * 32

@@ -9,10 +9,10 @@ from fastapi import FastAPI, Request
 from starlette.responses import HTMLResponse
 from starlette.testclient import TestClient
 
-from service.api import problems
-from service.api.guard import Guard, hosts_of
-from service.api.limits import COUNTED
-from service.settings import Settings
+from stillpath.service.api import problems
+from stillpath.service.api.guard import Guard, hosts_of
+from stillpath.service.api.limits import COUNTED
+from stillpath.service.settings import Settings
 
 
 def open_client(

@@ -11,17 +11,17 @@ import pytest
 from pydantic import SecretStr
 from sqlalchemy import Engine, text
 
-from service.database.engine import open_database
-from service.security.audit import AuditLog
-from service.security.callers import Scope
-from service.security.keys import (
+from stillpath.service.database.engine import open_database
+from stillpath.service.security.audit import AuditLog
+from stillpath.service.security.callers import Scope
+from stillpath.service.security.keys import (
     KeyRefused,
     KeyStore,
     UnsafeBinding,
     announce_first_key,
     keys_needed,
 )
-from service.settings import Settings
+from stillpath.service.settings import Settings
 
 
 class Clock:
@@ -199,7 +199,7 @@ def test_a_reachable_address_without_keys_is_refused(tmp_path: Path, host: str):
 def test_commands(
     tmp_path: Path, engine: Engine, store: KeyStore, capsys: pytest.CaptureFixture[str]
 ):
-    from service.cli import run
+    from stillpath.cli.main import run
 
     def call(*words: str) -> tuple[int, str, str]:
         code = run([*words, "--data-dir", str(tmp_path)])
@@ -244,7 +244,7 @@ def test_a_service_that_would_be_unsafe_does_not_start(
     value: str,
     words: str,
 ):
-    from service.cli import run
+    from stillpath.cli.main import run
 
     monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
     monkeypatch.setenv(setting, value)

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.api.limits import Limits, name_of
-from service.api.problems import Problem
-from service.security.callers import Caller, Scope
+from stillpath.service.api.limits import Limits, name_of
+from stillpath.service.api.problems import Problem
+from stillpath.service.security.callers import Caller, Scope
 
 
 def caller(key_id: str | None = None, remote: str | None = "203.0.113.7") -> Caller:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.security.masking import mask, mask_secrets
+from stillpath.service.security.masking import mask, mask_secrets
 
 ROOT = Path(__file__).resolve().parents[3]
 KEY = "sp_" + "Ab0_-9" * 6
@@ -87,7 +87,7 @@ def test_a_real_services_logs_hold_no_secret(tmp_path: Path):
     }
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-c", "from service.cli import main; main()", "serve", "--port", "0"],
+            [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"],
             cwd=ROOT,
             env=environment,
             stdout=subprocess.PIPE,

@@ -10,8 +10,8 @@ import httpx2
 import pytest
 from pydantic import ValidationError
 
-from service.api.proxies import Proxies
-from service.settings import Settings
+from stillpath.service.api.proxies import Proxies
+from stillpath.service.settings import Settings
 from tests.nginx import nginx
 from tests.service.test_server import PRETEND, finished, server
 

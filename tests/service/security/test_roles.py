@@ -12,10 +12,10 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from service.api import create_app
-from service.jobs.state import Claimed, Failed
-from service.security.callers import Scope
-from service.settings import Settings
+from stillpath.service.api import create_app
+from stillpath.service.jobs.state import Claimed, Failed
+from stillpath.service.security.callers import Scope
+from stillpath.service.settings import Settings
 from tests.service.database.examples import make_job
 from tests.service.runners import pretend
 

@@ -18,11 +18,11 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from service.settings import Settings
-from service.storage import Storage, StorageError
-from service.storage.local import LocalStorage
-from service.storage.opened import open_storage
-from service.storage.s3 import S3Storage
+from stillpath.service.settings import Settings
+from stillpath.service.storage import Storage, StorageError
+from stillpath.service.storage.local import LocalStorage
+from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.s3 import S3Storage
 from tests.service.storage.s3_server import BUCKET, CREDENTIALS, Cable, free_port, s3_server
 
 MIB = 1 << 20

@@ -1,0 +1,1 @@
+"""What is done around a machine: identify, design, prove, add controllers, scan, print live."""

@@ -1,0 +1,334 @@
+"""Looks at the design for one axis of a machine, from the plant to what errors of it cost.
+
+The command lives on increments (docs/method.md), so the metrics and the ladder are those of the
+plant with two integrators in front, lifted over the preview window. Sources: dissertation of K. S.
+Ramani (paper 003), equation numbers beside each figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.applications.design.figures import (
+    AxisFigures,
+    DesignReport,
+    LiftedFigures,
+    Member,
+    Metrics,
+    ModeFigures,
+    RobustMetric,
+    Robustness,
+    RungFigures,
+    ZeroFigures,
+)
+from stillpath.applications.design.robustness import Trial
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.basis import BASES, ZERO
+from stillpath.compensation.fbf import ROBUST, PreviewFbf
+from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set
+from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
+from stillpath.compensation.metrics import (
+    effort_metric,
+    effort_of_ce_opt,
+    error_of_functions,
+    robust_error_metric,
+    robust_error_of_spread,
+)
+from stillpath.compensation.nominal import two_step
+from stillpath.compensation.preview_axis import Designs, designs, functions_within
+from stillpath.compensation.shapers import SHAPERS
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
+from stillpath.pipeline.caution import measured_set
+from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_each
+from stillpath.version import __version__
+
+__all__ = ["AXES", "ERRORS_PERCENT", "design_report"]
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y")
+ERRORS_PERCENT = tuple(range(-20, 21, 2))
+"""Errors of frequency at which every command is tried."""
+
+
+def design_report(
+    machine: Machine,
+    axis: str,
+    *,
+    basis: str = "ce-opt",
+    robust: str = "off",
+    along: float | None = None,
+    dt_s: float = 1e-3,
+    window_s: float = 0.3,
+    update_s: float = 0.15,
+    errors_percent: Sequence[float] = ERRORS_PERCENT,
+    shapers: Sequence[str] = SHAPERS,
+    motion: tuple[Array, NDArray[np.bool_]] | None = None,
+    tuned: Mapping[str, BestShaper] | None = None,
+) -> DesignReport:
+    """Compute every figure of a design.
+
+    Parameters
+    ----------
+    machine : Machine
+    axis : str
+        x or y.
+    basis, robust, along : str, str, float or None
+        What `compensation.fbf.PreviewFbf` is told; `auto` is what jobs take by default of it, as it
+        is before a shaper's smoothing comes in.
+    dt_s, window_s, update_s : float
+        Sampling time, preview window, and how much of it is committed.
+    errors_percent : sequence of float
+        Errors of this axis' frequencies at which every command is tried.
+    shapers : sequence of str
+        Firmware shapers to compare with.
+    motion : (path, extruding), optional
+        Shapes (2, n) in mm and (n,); default: the reference motion, some 25 s.
+    tuned : mapping, optional
+        Shapers tuned before on this machine and motion
+        (`pipeline.measuring.reference_shaper.tune_each`).
+
+    Raises
+    ------
+    DesignError
+        For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
+        error: the report says which and why.
+    """
+    if robust == "auto":
+        robust = "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
+    _check_names(axis, basis, robust)
+    row = AXES.index(axis)
+    plants = plant_set(machine.axes["x" if axis == "x" else "y"], dt_s)
+    settings = {"basis": basis, "along": along, "window_s": window_s, "update_s": update_s}
+    designers, missing = _designers(machine, dt_s, settings)
+    # Without a set all robust modes are one.
+    mode = robust if robust in designers or len(plants.members) > 1 else "off"
+    window = round(window_s / dt_s)
+    if mode in designers:
+        lifted = designers[mode].lifted[row]
+    else:
+        lifted = lifted_window(plants.members, plants.weights, window, round(update_s / dt_s))
+    # What the product refuses as a whole, no rung of it can be used for.
+    whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
+    most = functions_within(machine.axes["x" if axis == "x" else "y"].band_hz, dt_s)
+    ladder = _ladder(plants, lifted, basis, dt_s, whole, most)
+    names = [f"n {rung.n}, price {rung.price:g}" for rung in ladder]
+
+    trial = Trial(machine, axis, dt_s, motion, errors_percent)
+    missing += trial.notes
+    curves, chosen = [trial.uncompensated()], None
+    for name, designer in designers.items():
+        try:
+            curves.append(trial.compensated(designer, name, names))
+        except DesignError as error:
+            missing.append(f"fbf {name}: {error}")
+            continue
+        if name == mode:
+            chosen = designer.rungs[row]
+    if tuned is None:
+        tuned = tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers)
+    curves += [trial.shaped(tuned[kind]) for kind in shapers]
+    guarded = lifted.weights if mode == "minimax" else plants.weights
+    limit = next((d.accel_limit_mm_s2(trial.y_d_mm) for d in designers.values()), None)
+    path_peak, path_rms = trial.path_acceleration()
+    return DesignReport.model_validate(
+        {
+            "version": __version__,
+            "machine": machine.name,
+            "machine_title": machine.title,
+            "machine_revision": machine.revision,
+            "axis": axis,
+            "basis": basis,
+            "robust": robust,
+            "along": designers[mode].along if mode in designers else along or 1.0,
+            "sampling_s": dt_s,
+            "window_s": window_s,
+            "update_s": update_s,
+            "plant": _plant(plants, designers.get("minimax"), row),
+            "lifted": _singular_values(lifted.plants, lifted.weights, window),
+            "metrics": _metrics(plants, guarded, window),
+            "ladder": ladder,
+            "chosen": chosen,
+            "path_peak_accel_mm_s2": path_peak,
+            "path_rms_accel_mm_s2": path_rms,
+            "accel_limit_mm_s2": limit,
+            "robustness": Robustness(
+                errors_percent=trial.errors_percent, curves=tuple(curves), missing=tuple(missing)
+            ),
+        }
+    )
+
+
+def _check_names(axis: str, basis: str, robust: str) -> None:
+    for what, given, known in (
+        ("axis", axis, AXES),
+        ("basis", basis, tuple(BASES)),
+        ("robust mode", robust, ROBUST),
+    ):
+        if given not in known:
+            raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
+
+
+def _designers(
+    machine: Machine, dt_s: float, settings: Mapping[str, Any]
+) -> tuple[dict[str, PreviewFbf], list[str]]:
+    """Return the compensators of all robust modes that differ, and why others are missing."""
+    sets = any(len(axis.weighted_members()) > 1 for axis in machine.axes.values())
+    made, missing = {}, []
+    for mode in ROBUST if sets else ROBUST[:1]:
+        try:
+            made[mode] = PreviewFbf(machine, dt_s, robust=mode, **settings)
+        except DesignError as error:
+            missing.append(f"fbf {mode}: {error}")
+    return made, missing
+
+
+def _plant(plants: PlantSet, guarded: PreviewFbf | None, row: int) -> AxisFigures:
+    nominal = plants.nominal
+    zeros = nominal.zeros()
+    outside = sorted(zeros[(np.abs(zeros) > 1.0) & (zeros.imag >= 0)], key=abs)
+    minimax = [None] * len(plants.members) if guarded is None else guarded.lifted[row].weights
+    return AxisFigures(
+        order=nominal.order,
+        settling_s=nominal.settling_time_s(),
+        modes=_modes(nominal),
+        zeros_outside=tuple(
+            ZeroFigures(
+                real=float(z.real),
+                imag=float(z.imag),
+                radius=float(abs(z)),
+                f_hz=float(np.angle(z) / (2 * np.pi * nominal.dt_s)),
+            )
+            for z in outside
+        ),
+        members=tuple(
+            Member(modes=_modes(member), weight=weight, minimax_weight=guard)
+            for member, weight, guard in zip(plants.members, plants.weights, minimax, strict=True)
+        ),
+        notes=plants.notes,
+    )
+
+
+def _modes(plant: DiscretePlant) -> tuple[ModeFigures, ...]:
+    return tuple(ModeFigures(f_hz=float(f), zeta=float(zeta)) for f, zeta in plant.modes())
+
+
+def _singular_values(
+    members: Sequence[DiscretePlant], weights: Array, window: int
+) -> LiftedFigures:
+    """Return the singular values of the stack of sqrt(l_j) G_j: the plant's own if there is one."""
+    markov = np.array([p.impulse_response(window) for p in members])
+    roots = np.sqrt(weights)
+    position, increments = (
+        np.linalg.svd(
+            np.concatenate([r * lift(h, window).dense() for r, h in zip(roots, rows, strict=True)]),
+            compute_uv=False,
+        )
+        for rows in (markov, integrated(markov))
+    )
+    return LiftedFigures(
+        samples=window, position=tuple(position.tolist()), increments=tuple(increments.tolist())
+    )
+
+
+def _metrics(plants: PlantSet, weights: Array, window: int) -> Metrics:
+    """Return the closed forms of the nominal plant, and of the set if there is one."""
+    own = _singular_values((plants.nominal,), np.ones(1), window)
+    per_um = plants.dt_s**-2 / 1e3
+    robust = []
+    if len(plants.members) > 1:
+        members = _increments(plants.members, weights, window)
+        nominal = _increments((plants.nominal,), np.ones(1), window).mean
+        robust = [_robust(members, "plant", nominal), _robust(members, "optimum", None)]
+    return Metrics(
+        error=tuple(error_of_functions(n, window) for n in range(1, window + 1)),
+        effort_position=_effort(own.position, 1.0),
+        effort_increments=_effort(own.increments, per_um),
+        robust=tuple(robust),
+    )
+
+
+def _effort(singular_values: Sequence[float], scale: float) -> tuple[float | None, ...]:
+    sigma = np.asarray(singular_values)
+    return tuple(
+        scale * effort_of_ce_opt(sigma, n) if sigma[n - 1] > ZERO * sigma[0] else None
+        for n in range(1, len(sigma) + 1)
+    )
+
+
+def _robust(members: LiftedSet, name: str, nominal: Array | None) -> RobustMetric:
+    found = two_step(members, nominal=nominal)
+    sigma, window = found.singular_values, members.samples
+    counts = range(1, len(sigma) + 1)
+    return RobustMetric.model_validate(
+        {
+            "nominal": name,
+            "best": found.best,
+            "left_out": found.r,
+            "singular_values": tuple(sigma.tolist()),
+            "error": tuple(robust_error_of_spread(sigma, n, window) for n in counts),
+            "nominal_part": tuple(error_of_functions(n, window) for n in counts),
+            "uncertainty_part": tuple(np.sqrt(np.cumsum(sigma**2) / window).tolist()),
+        }
+    )
+
+
+def _increments(members: Sequence[DiscretePlant], weights: Array, window: int) -> LiftedSet:
+    markov = np.array([p.impulse_response(window) for p in members])
+    return lifted_set(integrated(markov), weights)
+
+
+def _ladder(
+    plants: PlantSet,
+    lifted: LiftedWindow,
+    basis: str,
+    dt_s: float,
+    refused: str | None,
+    most: int,
+) -> tuple[RungFigures, ...]:
+    window = lifted.window
+    nominal = _increments((plants.nominal,), np.ones(1), window)
+    every = None
+    if len(plants.members) > 1:
+        every = _increments(plants.members, plants.weights, window)
+    # The very designs that the product uses.
+    weights = tuple(lifted.weights.tolist())
+    table = designs(lifted.plants, weights, window, lifted.update, basis, most)
+    rungs = range(len(table.ladder))
+    return tuple(_rung(k, table, dt_s, nominal, every, refused) for k in rungs)
+
+
+def _rung(
+    number: int,
+    table: Designs,
+    dt_s: float,
+    nominal: LiftedSet,
+    every: LiftedSet | None,
+    refused: str | None,
+) -> RungFigures:
+    rung, lifted = table.ladder[number], table.lifted
+    n = max(4, round(rung.n * lifted.window / 300))
+    cutoff_hz = n / (2 * lifted.window * dt_s)
+    try:
+        design = table.design(number)
+    except DesignError as error:
+        return RungFigures(n=n, cutoff_hz=cutoff_hz, price=rung.price, refused=str(error))
+    if refused is not None:
+        return RungFigures(n=n, cutoff_hz=cutoff_hz, price=rung.price, refused=refused)
+    seen = np.einsum("k,kwn->nw", lifted.target, design.filtered)
+    controller = design.basis @ np.linalg.solve(np.eye(n) + rung.price * design.effort, seen)
+    return RungFigures(
+        n=n,
+        cutoff_hz=cutoff_hz,
+        price=rung.price,
+        spectral_radius=design.spectral_radius,
+        condition=design.condition,
+        error=robust_error_metric(nominal, controller),
+        robust_error=None if every is None else robust_error_metric(every, controller),
+        effort=effort_metric(controller) / dt_s**2 / 1e3,
+    )

@@ -1,0 +1,192 @@
+"""From files to a machine with new plants; nothing is stored here."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from pydantic import ValidationError
+
+from stillpath.applications.identification.figures import IdentificationReport
+from stillpath.applications.identification.report import identification_report
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.conditioned import followed
+from stillpath.models.identification.conditions import Condition
+from stillpath.models.identification.identify import Measured, Progress, identify
+from stillpath.models.identification.readers import ReadSettings, read_content
+from stillpath.models.identification.types import AxisIdentification
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSpec
+from stillpath.models.provenance import SourceFile
+from stillpath.models.schedule import AxisSchedule, MassSchedule, resonances_hz
+from stillpath.models.store import explain
+
+__all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
+
+LARGEST_BYTES = 200_000_000
+Axis: TypeAlias = Literal["x", "y"]
+
+
+@dataclass(frozen=True, slots=True)
+class InputFile:
+    """A file to identify from.
+
+    Attributes
+    ----------
+    name : str
+        Without folder; tells axis and date.
+    condition : Condition
+        What was different when it was measured.
+    """
+
+    name: str
+    content: bytes
+    condition: Condition = field(default_factory=Condition)
+
+    @property
+    def source(self) -> SourceFile:
+        """Name and hash, for the record."""
+        return SourceFile(name=self.name, sha256=hashlib.sha256(self.content).hexdigest())
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """A machine with new plants, and how they were found."""
+
+    machine: Machine
+    report: IdentificationReport
+
+
+def read_inputs(arguments: Sequence[str]) -> list[InputFile]:
+    """Read files given as `PATH` or `PATH@CONDITION` (see `Condition.parse`).
+
+    Raises
+    ------
+    ModelError
+        If a file cannot be read, is too large, or a condition is not understood.
+    """
+    return [_read_input(argument) for argument in arguments]
+
+
+def identify_files(
+    files: Sequence[InputFile],
+    base: Machine,
+    settings: ReadSettings | None = None,
+    *,
+    name: str | None = None,
+    title: str | None = None,
+    max_order: int = 4,
+    progress: Progress | None = None,
+) -> Identified:
+    """Identify the axes that were measured and put them into a machine.
+
+    Parameters
+    ----------
+    files : sequence of InputFile
+    base : Machine
+        Everything else comes from it.
+    settings : ReadSettings, optional
+    name, title : str, optional
+        Of the machine, if it is a new one.
+    max_order : int
+        Most pole pairs to try.
+
+    Raises
+    ------
+    ModelError
+        If a file cannot be used (the message names it), or its plants do not fit the machine.
+    """
+    settings = settings or ReadSettings()
+    measured: list[Measured] = []
+    for file in files:
+        if progress is not None:
+            progress(f"reading {file.name}", 0.0)
+        read = read_content(file.content, file.name, settings=settings)
+        measured += [Measured(measurement, file.condition) for measurement in read]
+    sources = [file.source for file in files]
+    identified = identify(
+        measured, settings, sources=sources, max_order=max_order, progress=progress
+    )
+    found = {axis: _with_what_is_known(base, axis, one) for axis, one in identified.items()}
+    machine = _with_plants(base, found, name, title)
+    report = identification_report(machine, base, found, settings, sources)
+    return Identified(machine, report)
+
+
+def _read_input(argument: str) -> InputFile:
+    path, condition = Path(argument), Condition()
+    if not path.exists() and "@" in argument:
+        before, _, after = argument.rpartition("@")
+        path, condition = Path(before), Condition.parse(after)
+    try:
+        if path.stat().st_size > LARGEST_BYTES:
+            raise ModelError(f"{path}: over {LARGEST_BYTES} bytes, no measurement is that large")
+        return InputFile(path.name, path.read_bytes(), condition)
+    except OSError as error:
+        raise ModelError(f"cannot read {path}: {error.strerror}") from None
+
+
+def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) -> AxisIdentification:
+    """Keep the moving mass that was known before, where no weight was put on the bed now."""
+    before, now = base.schedules.get(axis), found.schedule
+    mass, grid = (now.mass, now.grid) if now else (None, None)
+    notes, warnings = list(found.notes), list(found.warnings)
+    if mass is not None:
+        mass = _same_filament(mass, base)
+    elif before is not None and before.mass is not None:
+        mass = _same_modes(before.mass, base.axes[axis].nominal, found.plants.nominal)
+        known = f"the {before.mass.moving_mass_kg:g} kg that axis {axis} moves"
+        if mass is None:
+            warnings.append(f"{known} are left out: the new plant is not given by its resonances")
+        else:
+            notes.append(f"{known} stay: no weight was put on the bed")
+    if grid is None and before is not None and before.grid is not None:
+        # Its plants would hide the new one.
+        warnings.append(
+            f"the plants of {len(before.grid.nodes)} places that the machine had for axis {axis} "
+            "are left out: they belong to the former measurement; measure there again (FILE@z=150)"
+        )
+    schedule = AxisSchedule(mass=mass, grid=grid) if mass or grid else None
+    about = found.plants.provenance
+    if schedule is not None and about is not None:
+        plants, varied = followed(found.plants, about.kind)
+        found, notes = replace(found, plants=plants), [*notes, *varied]
+    return replace(found, schedule=schedule, notes=tuple(notes), warnings=tuple(warnings))
+
+
+def _same_filament(mass: MassSchedule, base: Machine) -> MassSchedule:
+    """Return the mass with the density of what the machine prints with, if that is known."""
+    known = [s.mass.filament_density_g_cm3 for s in base.schedules.values() if s.mass]
+    return mass.model_copy(update={"filament_density_g_cm3": known[0]}) if known else mass
+
+
+def _same_modes(mass: MassSchedule, before: PlantSpec, now: PlantSpec) -> MassSchedule | None:
+    """Return the mass for the resonances that are nearest to those it lowered before."""
+    were, are = resonances_hz(before), resonances_hz(now)
+    if not len(are):
+        return None
+    modes = {int(np.argmin(np.abs(np.log(are / were[k])))) for k in mass.modes}
+    return mass.model_copy(update={"modes": tuple(sorted(modes))})
+
+
+def _with_plants(
+    base: Machine, found: Mapping[Axis, AxisIdentification], name: str | None, title: str | None
+) -> Machine:
+    document = base.model_dump()
+    for axis, one in found.items():
+        document["axes"][axis] = one.plants.model_dump()
+        document["schedules"].pop(axis, None)
+        if one.schedule is not None:
+            document["schedules"][axis] = one.schedule.model_dump()
+    if name is not None and name != base.name:
+        document.update(name=name, title=title or f"{base.title}, measured")
+    elif title is not None:
+        document["title"] = title
+    try:
+        return Machine.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"machine {document['name']!r:.80}: {explain(error)}") from None

@@ -1,0 +1,243 @@
+"""The filter of a machine for print time: which one, and what its set says of it.
+
+Filters of several bandwidths, each with some of the best shaper's smoothing, are tried on the
+reference motion. Taken is the best for the likely members among those that are for no member worse
+than the shaper; the shaper itself is always among them, for a shaper is such a filter too.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
+from stillpath.compensation.shapers import shaper_pulses
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.pipeline.caution import error_ranges, member_pairs, most_share, pair_weights
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
+from stillpath.simulation.measures import PathDistances
+from stillpath.simulation.response import response
+
+__all__ = ["LiveDesign", "design_live", "filter_of", "live_filter"]
+
+Array = NDArray[np.float64]
+
+DT_S = 1e-3
+_CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
+_REACHES = (80, 160)
+"""Samples on either side; the longer one is for axes whose slowest mode rings below 25 Hz or so."""
+_SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
+_STRIDE, _NOTHING = 5, 1e-12
+_AS_GOOD = 1.05
+"""Of two filters as good as that the one with less bandwidth: it asks for less acceleration."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveDesign:
+    """The filter chosen for a machine.
+
+    Attributes
+    ----------
+    taps : ndarray, shape (2, n)
+    shares : (float, float)
+        Of the filter in the taps of X and Y; the rest is the shaper.
+    corner_hz : float
+        Its bandwidth.
+    shaper : BestShaper
+    worst, mean : float
+        Largest and geometric mean over the members of the contour error against the shaper's.
+    contour_um : dict
+        By channel (before, live, shaper): nominal contour error rms on the reference motion, and
+        least and largest over the members.
+    peak_accel_mm_s2 : float
+        Of the command of an axis on the reference motion.
+    """
+
+    taps: Array
+    shares: tuple[float, float]
+    corner_hz: float
+    shaper: BestShaper
+    worst: float
+    mean: float
+    contour_um: dict[str, tuple[float, float, float]]
+    peak_accel_mm_s2: float
+
+    def accel_gain(self, axis: int) -> float:
+        """Return how many times the plan's acceleration the command's can be: sum |taps|."""
+        return float(np.abs(self.taps[axis]).sum())
+
+
+def live_filter(machine: Machine, taps: Array) -> LiveFilter:
+    """Return the filter with the limits that the machine's document gives the command."""
+    bounds = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
+    command = machine.command
+    return LiveFilter(taps, DT_S, command.velocity_mm_s, command.accel_mm_s2, np.array(bounds))
+
+
+def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:
+    """Design and choose the filter of a machine.
+
+    Parameters
+    ----------
+    shaper : BestShaper
+        What the nominal plants lead to, tuned on the same motion.
+
+    Raises
+    ------
+    DesignError
+        For a machine whose firmware is not Klipper.
+    """
+    if machine.firmware.kind != "klipper":
+        raise DesignError(
+            f"machine {machine.name} runs {machine.firmware.kind}: only Klipper has print-time "
+            "compensation; use `stillpath compensate`"
+        )
+    return _Trial(machine, shaper).chosen()
+
+
+def filter_of(machine: Machine, cache_dir: Path | None = None) -> LiveFilter:
+    """Return what `stillpath klipper export` gives a machine, for a simulation.
+
+    Raises
+    ------
+    DesignError
+        As `design_live` does.
+    """
+    shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+    return live_filter(machine, design_live(machine, shaper).taps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A filter, and its contour error against the shaper's, geometric mean over the members."""
+
+    ratio: float
+    corner_hz: float
+    taps: Array
+    shares: tuple[float, float]
+
+
+class _Trial:
+    """Filters on the reference motion, answered by every member."""
+
+    def __init__(self, machine: Machine, shaper: BestShaper) -> None:
+        self._machine, self._shaper = machine, shaper
+        path, extruding = reference_motion(DT_S)
+        centre = [sum((machine.travel[a].min_mm, machine.travel[a].max_mm)) / 2 for a in ("x", "y")]
+        self._path = path + np.array(centre)[:, None]
+        self._at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
+        self._distances = PathDistances(self._path, DT_S)
+        self._pairs = member_pairs(machine, DT_S)
+        self._weights = pair_weights(machine, len(self._pairs))
+        pulses = [shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)]
+        self._smooth_taps = np.stack([shaper_taps(p, DT_S, _REACHES[-1]) for p in pulses])
+        self._smooth = self._command(self._smooth_taps)
+        self._smooth_mm = self._answers(self._smooth)
+        self._shaped = np.array([self._rms(y) for y in self._smooth_mm])
+
+    def chosen(self) -> LiveDesign:
+        """Return the best that keeps the promise."""
+        found = list(self._candidates())
+        least = min(one.ratio for one in found)
+        good = [one for one in found if one.ratio <= _AS_GOOD * least]
+        best = min(good, key=lambda one: (one.taps.shape[1], one.corner_hz, one.ratio))
+        command = self._command(best.taps)
+        ours = np.array([self._rms(y) for y in self._answers(command)])
+        channels = {"before": self._path, "live": command, "shaper": self._smooth}
+        return LiveDesign(
+            best.taps,
+            best.shares,
+            best.corner_hz,
+            self._shaper,
+            float((ours / self._shaped).max()),
+            float(np.exp(self._weights @ np.log(ours / self._shaped))),
+            self._figures(channels),
+            _peak(command),
+        )
+
+    def _candidates(self) -> Iterator[_Candidate]:
+        """Yield what keeps promise and limits; the shaper first."""
+        sets = [plant_set(self._machine.axes[a].without_delay(), DT_S) for a in ("x", "y")]
+        most = [most_share(self._machine.axes[a]) for a in ("x", "y")]
+        yield _Candidate(1.0, 0.0, _shortened(self._smooth_taps), (0.0, 0.0))
+        for reach, corner_hz in itertools.product(_REACHES, _CORNERS_HZ):
+            exact = np.stack([design_taps(s.members, s.weights, corner_hz, reach) for s in sets])
+            command = self._command(exact)
+            if _peak(command) > self._machine.command.accel_mm_s2:
+                continue
+            exact_mm = self._answers(command)
+            tried: dict[tuple[float, float], float] = {}
+            for share in _SHARES:
+                both = (min(share, most[0]), min(share, most[1]))
+                tried[both] = self._ratio(exact_mm, both)
+            for axis in (0, 1):
+                best = min(tried, key=tried.__getitem__)
+                for share in _SHARES:
+                    one = (share, best[1]) if axis == 0 else (best[0], share)
+                    if share <= most[axis] and one not in tried:
+                        tried[one] = self._ratio(exact_mm, one)
+            shares = min(tried, key=tried.__getitem__)
+            if shares != (0.0, 0.0) and np.isfinite(tried[shares]):
+                yield _Candidate(tried[shares], corner_hz, self._mixed(exact, shares), shares)
+
+    def _mixed(self, exact: Array, shares: tuple[float, float]) -> Array:
+        """Return taps with some of the shaper's, as long as either needs."""
+        a = np.array(shares)[:, None]
+        more = (self._smooth_taps.shape[1] - exact.shape[1]) // 2
+        exact = np.pad(exact, ((0, 0), (more, more)))
+        return _shortened(a * exact + (1.0 - a) * self._smooth_taps)
+
+    def _ratio(self, exact_mm: list[Array], shares: tuple[float, float]) -> float:
+        """Return the mean against the shaper; infinite where any member is worse."""
+        a = np.array(shares)[:, None]
+        ours = np.array(
+            [
+                self._rms(a * exact + (1.0 - a) * smooth)
+                for exact, smooth in zip(exact_mm, self._smooth_mm, strict=True)
+            ]
+        )
+        ratio = ours / np.maximum(self._shaped, 1e-12)
+        return float(np.exp(self._weights @ np.log(ratio))) if ratio.max() <= 1.0 else np.inf
+
+    def _command(self, taps: Array) -> Array:
+        live = live_filter(self._machine, taps)
+        return live.command(np.pad(self._path, ((0, 0), (live.margin, live.margin)), mode="edge"))
+
+    def _answers(self, command: Array) -> list[Array]:
+        return [response(pair, command)[:, self._at] for pair in self._pairs]
+
+    def _rms(self, points: Array) -> float:
+        return float(np.sqrt(np.mean(self._distances.at(points, self._at) ** 2)))
+
+    def _figures(self, channels: dict[str, Array]) -> dict[str, tuple[float, float, float]]:
+        plants = [plant_set(self._machine.axes[a], DT_S).nominal for a in ("x", "y")]
+        spread = error_ranges(self._machine, channels, lambda y: self._rms(y[:, self._at]), DT_S)
+        out = {}
+        for name, command in channels.items():
+            usual = 1e3 * self._rms(response(plants, command)[:, self._at])
+            out[name] = (usual, usual * spread[name][0], usual * spread[name][1])
+        return out
+
+
+def _shortened(taps: Array) -> Array:
+    """Return the shortest of the lengths that loses nothing."""
+    for reach in _REACHES:
+        more = taps.shape[1] // 2 - reach
+        lost = np.delete(taps, np.s_[more : taps.shape[1] - more], axis=1)
+        if not np.any(np.abs(lost) > _NOTHING):
+            kept = taps[:, more : taps.shape[1] - more]
+            return np.stack([exact_moments(row) for row in kept])
+    raise ValueError(f"{taps.shape[1]} taps are more than any filter has")
+
+
+def _peak(command: Array) -> float:
+    return float(np.abs(np.diff(command, 2)).max()) / DT_S**2

@@ -1,0 +1,270 @@
+"""What to look at before a job: how old the measurement is, whether the printer was changed."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware.common import FirmwareFacts
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.store import explain
+
+__all__ = [
+    "Difference",
+    "age_warnings",
+    "check_before_job",
+    "derived_envelope",
+    "differences",
+    "envelope_warnings",
+    "machine_from_config",
+    "not_followed",
+    "typed_in",
+]
+
+_DEFAULT_HZ = 50.0
+_DEFAULT_ZETA = 0.07
+_FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
+_DAMPING_SCALE = (0.5, 1.0, 1.5)
+_ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
+"""What motors are taken to bear when nobody says: these multiples of the acceleration, speed and
+corner speed that the printer allows a file."""
+_LEAST_STEP_MM_S = 20.0
+_NOT_MORE = 1.001
+_RELATIVE = 1e-6
+
+
+class Difference(BaseModel):
+    """The printer's configuration says one thing, the machine document another."""
+
+    model_config = ConfigDict(frozen=True)
+
+    section: str
+    option: str
+    place: str
+    machine: Any
+    printer: Any
+
+    @property
+    def text(self) -> str:
+        """One line: section, option, both values, remedy."""
+        where = f"[{self.section}] {self.option}".rstrip()
+        return (
+            f"{where}: the printer has {_word(self.printer)}, the machine {_word(self.machine)}; "
+            f"put {_word(self.printer)} at {self.place} of the machine, or set the printer back"
+        )
+
+
+def check_before_job(
+    machine: Machine,
+    now: datetime,
+    *,
+    max_age_days: float,
+    config: PrinterConfig | None = None,
+) -> list[str]:
+    """Return what speaks against using a machine now, one line each; nothing is all well.
+
+    Parameters
+    ----------
+    machine : Machine
+    now : datetime
+    max_age_days : float
+        How long a measurement counts.
+    config : PrinterConfig, optional
+        The printer's configuration as it is now.
+    """
+    found = [] if config is None else differences(machine, config)
+    return [*age_warnings(machine, now, max_age_days), *(entry.text for entry in found)]
+
+
+def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[str]:
+    """Return a line for each axis whose plants are old, undated or were never measured.
+
+    Axes without provenance (the built-in machines) are not judged.
+    """
+    found = []
+    for axis in ("x", "y"):
+        known = machine.axes[axis].provenance
+        start = f"axis {axis} of {machine.name}"
+        if known is None:
+            continue
+        if known.kind == "typed in":
+            found.append(f"{start}: its plants were typed in, not measured; measure the machine")
+        elif known.measured_on is None:
+            found.append(f"{start}: nobody knows when it was measured; measure it again")
+        elif (age := (now.date() - known.measured_on).days) > max_age_days:
+            found.append(
+                f"{start}: measured on {known.measured_on}, {age} days ago (limit "
+                f"{max_age_days:g}, STILLPATH_MEASUREMENT_MAX_AGE_DAYS); measure it again"
+            )
+    return found
+
+
+def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
+    """Return where a configuration and a machine disagree.
+
+    Raises
+    ------
+    ModelError
+        If the configuration lacks what Klipper requires, or holds words for numbers; if the
+        machine is no Klipper machine.
+    """
+    if machine.firmware.kind != "klipper":
+        raise ModelError(
+            f"{machine.name} runs {machine.firmware.kind}; a printer.cfg is Klipper's and says "
+            "nothing of it"
+        )
+    document = machine.model_dump(mode="json")
+    extruder = document["firmware"]["extruder"]
+    if extruder["max_extrude_cross_section_mm2"] is None:
+        extruder["max_extrude_cross_section_mm2"] = 4.0 * extruder["nozzle_diameter_mm"] ** 2
+    found = []
+    for fact in facts(config):
+        stands = _at(document, fact.place)
+        if not _same(stands, fact.value):
+            found.append(
+                Difference(
+                    section=fact.section,
+                    option=fact.option,
+                    place=fact.place,
+                    machine=stands,
+                    printer=fact.value,
+                )
+            )
+    return found
+
+
+def machine_from_config(
+    config: PrinterConfig,
+    name: str,
+    *,
+    title: str = "",
+    f_hz: tuple[float | None, float | None] = (None, None),
+    zeta: float = _DEFAULT_ZETA,
+) -> Machine:
+    """Return a machine with the facts of a printer.cfg and plants that were not measured.
+
+    The plants are one resonance each with a wide set around it, marked as typed in; a measurement
+    takes their place.
+
+    Parameters
+    ----------
+    config : PrinterConfig
+    name, title : str
+    f_hz : tuple of float
+        Resonances of x and y; by default the input shaper's frequencies, else 50 Hz.
+    zeta : float
+        Damping ratio of both.
+
+    Raises
+    ------
+    ModelError
+        If the configuration lacks something or is not of a machine we know.
+    """
+    document: dict[str, Any] = {
+        "name": name,
+        "title": title or name,
+        "source": config.name,
+        "axes": {
+            axis: typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
+            for axis, given in zip("xy", f_hz, strict=True)
+        },
+    }
+    for fact in facts(config):
+        _put(document, fact)
+    try:
+        machine = Machine.model_validate(document)
+    except ValidationError as error:
+        hint = "".join(f"; {line}" for line in not_followed(config))
+        raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
+    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
+
+
+def not_followed(config: PrinterConfig) -> list[str]:
+    """Return a line for each file that the configuration includes: nobody looked into it."""
+    return [
+        f"[include {name}] in {config.name}: not followed; what stands there was not looked at"
+        for name in config.includes
+    ]
+
+
+def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
+    """Return an axis of one resonance with a wide set around it, which nobody measured.
+
+    Without a frequency (0) it is 50 Hz.
+    """
+    mode = {"f_hz": f_hz or _DEFAULT_HZ, "zeta": zeta}
+    return {
+        "nominal": {"kind": "modes", "modes": [mode]},
+        "members": {"frequency_scale": _FREQUENCY_SCALE, "damping_scale": _DAMPING_SCALE},
+        "provenance": {"kind": "typed in"},
+    }
+
+
+def derived_envelope(firmware: FirmwareFacts) -> CommandLimits:
+    """Return what the motors are taken to bear, from what the printer allows a file.
+
+    A little more than that, since a command has to lead the nozzle; who knows more says so in the
+    machine's `command`.
+    """
+    step = _CORNERS * firmware.corner_mm_s
+    return CommandLimits(
+        velocity_mm_s=_SPEED_ROOM * firmware.fastest_mm_s,
+        accel_mm_s2=_ACCEL_ROOM * firmware.largest_accel_mm_s2,
+        speed_step_mm_s=min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
+    )
+
+
+def envelope_warnings(machine: Machine) -> list[str]:
+    """Return a line if a command may ask for more than the printer's own limits suggest.
+
+    Until 2026-11 machines were made with 20 000 mm/s2 whatever the printer's limit was.
+    """
+    derived, stated = derived_envelope(machine.firmware), machine.command
+    if stated.accel_mm_s2 <= _NOT_MORE * derived.accel_mm_s2:
+        return []
+    text = (
+        f"{machine.name}: a command may ask the motors for {stated.accel_mm_s2:.0f} mm/s2 "
+        f"(command.accel_mm_s2), more than {_ACCEL_ROOM:g} times what the printer allows a file "
+        f"({machine.firmware.largest_accel_mm_s2:.0f}): right if the motors were tried at it; "
+        f"otherwise put {derived.accel_mm_s2:.0f} there"
+    )
+    return [text]
+
+
+def _at(document: Any, place: str) -> Any:
+    for part in place.split("."):
+        if document is None:
+            return None
+        document = document[part]
+    return document
+
+
+def _put(document: dict[str, Any], fact: Fact) -> None:
+    *parts, last = fact.place.split(".")
+    for part in parts:
+        document = document.setdefault(part, {})
+    document[last] = fact.value
+
+
+def _same(stands: Any, value: Any) -> bool:
+    if isinstance(stands, float) and isinstance(value, float):
+        return abs(stands - value) <= _RELATIVE * max(abs(stands), abs(value))
+    return bool(stands == value)
+
+
+def _word(value: Any) -> str:
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return "on" if value else "off"
+        case float():
+            return f"{value:g}"
+        case dict():
+            return ", ".join(f"{key} {_word(entry)}" for key, entry in value.items())
+        case _:
+            return str(value)

@@ -1,0 +1,159 @@
+"""Where small documents lie by name: what is asked of such a place, and a folder as one.
+
+`service.database.documents` is the other, for several computers.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Protocol
+
+from stillpath.applications.machines.publish import publish, sync_folder
+from stillpath.pipeline.files import replacing
+
+__all__ = ["DocumentFolder", "Documents"]
+
+
+class Documents(Protocol):
+    """Texts by path (``folder/name``), written whole or not at all, by several at once.
+
+    Paths are made by the program, never by a caller.
+    """
+
+    def folders(self, within: str = "") -> list[str]:
+        """Return the names of the folders in a folder, sorted; at least of those not empty."""
+
+    def names(self, folder: str) -> list[str]:
+        """Return the names of the documents in a folder, which need not be there."""
+
+    def read(self, path: str) -> bytes:
+        """Return a document.
+
+        Raises
+        ------
+        FileNotFoundError
+        """
+
+    def create(self, path: str, text: str, *, beside: str | None = None) -> None:
+        """Write a new document; it is durable when this returns.
+
+        Parameters
+        ----------
+        path, text : str
+        beside : str, optional
+            Another document, without which this one would make no sense.
+
+        Raises
+        ------
+        FileExistsError
+            If `path` is taken; of several callers one succeeds.
+        FileNotFoundError
+            If `beside` is not there (any more).
+        """
+
+    def create_folder(self, folder: str, contents: Mapping[str, str]) -> None:
+        """Write a new folder with all its documents, or nothing of it.
+
+        Raises
+        ------
+        FileExistsError
+            If there are documents in a folder of that name.
+        """
+
+    def move(self, folder: str, target: str) -> None:
+        """Give a folder with everything in it another name.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such folder.
+        FileExistsError
+            If there are documents in `target`.
+        """
+
+    def replace(self, path: str, text: str) -> None:
+        """Write a document, over an earlier one if there is one."""
+
+    def place(self, path: str) -> str:
+        """Return how to name a document, or a folder, to a person."""
+
+
+class DocumentFolder:
+    """`Documents` as files in a folder.
+
+    Parameters
+    ----------
+    root : Path
+        Made with the first document.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def folders(self, within: str = "") -> list[str]:
+        """See `Documents`."""
+        folder = self._root / within
+        return sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+
+    def names(self, folder: str) -> list[str]:
+        """See `Documents`."""
+        try:
+            return sorted(path.name for path in (self._root / folder).iterdir())
+        except (FileNotFoundError, NotADirectoryError):
+            return []
+
+    def read(self, path: str) -> bytes:
+        """See `Documents`."""
+        return (self._root / path).read_bytes()
+
+    def create(self, path: str, text: str, *, beside: str | None = None) -> None:
+        """See `Documents`."""
+        file = self._root / path
+        if beside is None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        publish(file, text)
+        if beside is not None and not (self._root / beside).exists():
+            # The folder was moved away and made anew meanwhile: this does not belong into that one.
+            file.unlink(missing_ok=True)
+            raise FileNotFoundError(f"{self._root / beside} is gone")
+        sync_folder(self._root)
+
+    def create_folder(self, folder: str, contents: Mapping[str, str]) -> None:
+        """See `Documents`."""
+        self._root.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self._root, prefix=".incoming-") as incoming:
+            made = Path(incoming) / "made"
+            made.mkdir()
+            for name, text in contents.items():
+                publish(made / name, text)
+            self._move(made, folder)
+
+    def move(self, folder: str, target: str) -> None:
+        """See `Documents`."""
+        (self._root / target).parent.mkdir(parents=True, exist_ok=True)
+        self._move(self._root / folder, target)
+
+    def replace(self, path: str, text: str) -> None:
+        """See `Documents`."""
+        file = self._root / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+    def place(self, path: str) -> str:
+        """See `Documents`."""
+        return str(self._root / path)
+
+    def _move(self, folder: Path, target: str) -> None:
+        try:
+            # Fails on a folder that holds a document already, whoever put it there.
+            folder.rename(self._root / target)
+        except FileNotFoundError:
+            raise
+        except OSError:
+            if not self.names(target):
+                raise
+            raise FileExistsError(f"{self._root / target} is there already") from None
+        sync_folder(self._root)

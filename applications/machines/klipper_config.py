@@ -1,0 +1,310 @@
+"""Reads what a Klipper printer.cfg says of the motion; nothing is executed, no include followed.
+
+Rules and defaults are those of klippy/configfile.py, toolhead.py, kinematics/extruder.py,
+extras/input_shaper.py, firmware_retraction.py and gcode_arcs.py (2024 to 2026).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+from stillpath.models.errors import ModelError
+
+__all__ = [
+    "Fact",
+    "Option",
+    "PrinterConfig",
+    "facts",
+    "parse_printer_config",
+    "read_printer_config",
+]
+
+_LARGEST_BYTES = 4_000_000
+_SAVED = "#*# "
+_SECTION = re.compile(r"\[(?P<name>[^]]+)\]\s*$")
+_OPTION = re.compile(r"(?P<name>[^\s:=][^:=]*)[:=]\s*(?P<value>.*)$")
+_COMMENT = re.compile(r"#.*$|(?:^|\s);.*$")
+
+
+class Option(NamedTuple):
+    """Text of an option and its line."""
+
+    value: str
+    line: int
+
+
+_Sections: TypeAlias = dict[str, dict[str, Option]]
+
+
+@dataclass(frozen=True, slots=True)
+class PrinterConfig:
+    """Sections of a printer.cfg, each a dict of options; names in lower case.
+
+    Attributes
+    ----------
+    includes : tuple of str
+        Files that it includes, which were not read: what stands there is not known.
+    """
+
+    name: str
+    sections: _Sections = field(default_factory=dict)
+    includes: tuple[str, ...] = ()
+
+    def text(self, section: str, option: str, default: str | None = None) -> str | None:
+        """Return an option as text, or the default."""
+        found = self.sections.get(section, {}).get(option)
+        return default if found is None else found.value
+
+    def number(self, section: str, option: str, default: float | None = None) -> float:
+        """Return an option as a number, or the default.
+
+        Raises
+        ------
+        ModelError
+            Naming file, line, section and option: no number, or missing without a default.
+        """
+        found = self.sections.get(section, {}).get(option)
+        if found is None:
+            if default is None:
+                raise ModelError(f"{self.name}: [{section}] lacks {option}{self._elsewhere()}")
+            return default
+        try:
+            value = float(found.value)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ModelError(
+                f"{self.name} line {found.line}: [{section}] {option}: {found.value!r:.60} is no "
+                "number"
+            )
+        return value
+
+    def _elsewhere(self) -> str:
+        if not self.includes:
+            return "; is it a printer.cfg?"
+        return (
+            f"; it may stand in {', '.join(self.includes)}, which is not followed: give one file "
+            "that holds all (cat them together)"
+        )
+
+
+class Fact(NamedTuple):
+    """What the configuration says about one field of a machine document."""
+
+    section: str
+    option: str
+    place: str
+    """Field of the machine document; its first parts may be None there."""
+    value: Any
+
+
+def read_printer_config(path: Path) -> PrinterConfig:
+    """Read a printer.cfg with its SAVE_CONFIG block.
+
+    As in Klipper, a later option wins over an earlier one, and one of the file's own over the
+    same in the block.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read or is no configuration.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_BYTES:
+            raise ModelError(f"{path}: over {_LARGEST_BYTES} bytes, not a printer.cfg")
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ModelError(f"cannot read the configuration {path}: {error.strerror}") from None
+    return parse_printer_config(text, path.name)
+
+
+def parse_printer_config(text: str, name: str) -> PrinterConfig:
+    """Return what `read_printer_config` does, of the text of a file called `name`."""
+    lines = text.splitlines()
+    own, includes = _parse(lines, saved=False)
+    saved, _ = _parse(lines, saved=True)
+    if not own:
+        raise ModelError(f"{name}: no [section] in it; give Klipper's printer.cfg")
+    sections = {
+        name: saved.get(name, {}) | own.get(name, {}) for name in dict.fromkeys([*own, *saved])
+    }
+    return PrinterConfig(name, sections, includes)
+
+
+def facts(config: PrinterConfig) -> list[Fact]:
+    """Return what a configuration says, Klipper's defaults where it says nothing.
+
+    Sections that are missing altogether while other files are included say nothing.
+    """
+    known = [_printer, _travel, _extruder, _shaper, _retraction, _arcs]
+    return [fact for find in known for fact in find(config)]
+
+
+def _parse(
+    lines: list[str], *, saved: bool
+) -> tuple[dict[str, dict[str, Option]], tuple[str, ...]]:
+    """Return sections and includes of the file itself, or of its SAVE_CONFIG block."""
+    sections: _Sections = {}
+    includes: list[str] = []
+    current: dict[str, Option] = {}
+    begun_at: int | None = None  # indentation of the option that deeper lines go on with
+    for number, full in enumerate(lines, 1):
+        if full.startswith("#*#") is not saved:
+            continue
+        indented = _COMMENT.sub("", full[len(_SAVED) :] if saved else full).rstrip()
+        line = indented.lstrip()
+        indent = len(indented) - len(line)
+        if not line or (begun_at is not None and indent > begun_at):
+            continue  # lines that go on, of macros and lists, say nothing about motion
+        begun_at = None
+        if section := _SECTION.match(line):
+            name = section["name"].strip()
+            if name.startswith("include "):
+                includes.append(name[len("include ") :].strip())
+            else:
+                current = sections.setdefault(name.lower(), {})
+        elif option := _OPTION.match(line):
+            current[option["name"].strip().lower()] = Option(option["value"], number)
+            begun_at = indent
+    return sections, tuple(includes)
+
+
+def _printer(config: PrinterConfig) -> list[Fact]:
+    section = "printer"
+    if section not in config.sections and config.includes:
+        return []
+    velocity = config.number(section, "max_velocity")
+    accel = config.number(section, "max_accel")
+    ratio, option = 0.5, "minimum_cruise_ratio"
+    if config.text(section, option) is None and config.text(section, "max_accel_to_decel"):
+        option = "max_accel_to_decel"
+        ratio = 1.0 - min(1.0, config.number(section, option) / accel)
+    else:
+        ratio = config.number(section, option, ratio)
+    planner = "firmware.planner"
+    return [
+        Fact(section, "kinematics", "kinematics", config.text(section, "kinematics")),
+        Fact(section, "max_velocity", f"{planner}.max_velocity_mm_s", velocity),
+        Fact(section, "max_accel", f"{planner}.max_accel_mm_s2", accel),
+        Fact(section, option, f"{planner}.minimum_cruise_ratio", ratio),
+        *_numbers(
+            config,
+            section,
+            ("square_corner_velocity", f"{planner}.square_corner_velocity_mm_s", 5.0),
+            ("max_z_velocity", f"{planner}.max_z_velocity_mm_s", velocity),
+            ("max_z_accel", f"{planner}.max_z_accel_mm_s2", accel),
+        ),
+    ]
+
+
+def _travel(config: PrinterConfig) -> list[Fact]:
+    return [
+        fact
+        for axis in "xyz"
+        if f"stepper_{axis}" in config.sections
+        for fact in _numbers(
+            config,
+            f"stepper_{axis}",
+            ("position_min", f"travel.{axis}.min_mm", 0.0),
+            ("position_max", f"travel.{axis}.max_mm", None),
+        )
+    ]
+
+
+def _extruder(config: PrinterConfig) -> list[Fact]:
+    section, place = "extruder", "firmware.extruder"
+    if section not in config.sections:
+        return []
+    nozzle = config.number(section, "nozzle_diameter")
+    filament = config.number(section, "filament_diameter")
+    # Klipper: extrude-only moves may push as much as the widest line at the top speed.
+    ratio = 4.0 * nozzle**2 / (math.pi * (0.5 * filament) ** 2)
+    shared: list[Fact] = []
+    if "printer" in config.sections:
+        shared = _numbers(
+            config,
+            section,
+            (
+                "max_extrude_only_velocity",
+                f"{place}.max_extrude_only_velocity_mm_s",
+                ratio * config.number("printer", "max_velocity"),
+            ),
+            (
+                "max_extrude_only_accel",
+                f"{place}.max_extrude_only_accel_mm_s2",
+                ratio * config.number("printer", "max_accel"),
+            ),
+        )
+    return [
+        Fact(section, "nozzle_diameter", f"{place}.nozzle_diameter_mm", nozzle),
+        Fact(section, "filament_diameter", f"{place}.filament_diameter_mm", filament),
+        *shared,
+        *_numbers(
+            config,
+            section,
+            (
+                "instantaneous_corner_velocity",
+                f"{place}.instantaneous_corner_velocity_mm_s",
+                1.0,
+            ),
+            ("max_extrude_only_distance", f"{place}.max_extrude_only_distance_mm", 50.0),
+            ("max_extrude_cross_section", f"{place}.max_extrude_cross_section_mm2", 4 * nozzle**2),
+            ("pressure_advance", "pressure_advance_s", 0.0),
+        ),
+    ]
+
+
+def _shaper(config: PrinterConfig) -> list[Fact]:
+    section, place = "input_shaper", "firmware.shaper"
+    if section not in config.sections:
+        return [] if config.includes else [Fact(section, "", place, None)]
+    common = config.text(section, "shaper_type", "mzv")
+    found = []
+    for axis in "xy":
+        kind = config.text(section, f"shaper_type_{axis}", common)
+        found.append(Fact(section, f"shaper_type_{axis}", f"{place}.type_{axis}", kind))
+        found += _numbers(
+            config,
+            section,
+            (f"shaper_freq_{axis}", f"{place}.freq_{axis}_hz", 0.0),
+            (f"damping_ratio_{axis}", f"{place}.damping_{axis}", 0.1),
+        )
+    return found
+
+
+def _retraction(config: PrinterConfig) -> list[Fact]:
+    section, place = "firmware_retraction", "firmware.retraction"
+    if section not in config.sections:
+        return [] if config.includes else [Fact(section, "", place, None)]
+    return _numbers(
+        config,
+        section,
+        ("retract_length", f"{place}.retract_length_mm", 0.0),
+        ("retract_speed", f"{place}.retract_speed_mm_s", 20.0),
+        ("unretract_extra_length", f"{place}.unretract_extra_length_mm", 0.0),
+        ("unretract_speed", f"{place}.unretract_speed_mm_s", 10.0),
+    )
+
+
+def _arcs(config: PrinterConfig) -> list[Fact]:
+    section = "gcode_arcs"
+    if section not in config.sections:
+        return [] if config.includes else [Fact(section, "", "firmware.arcs", False)]
+    resolution = config.number(section, "resolution", 1.0)
+    return [
+        Fact(section, "", "firmware.arcs", True),
+        Fact(section, "resolution", "firmware.arc_resolution_mm", resolution),
+    ]
+
+
+def _numbers(
+    config: PrinterConfig, section: str, *wanted: tuple[str, str, float | None]
+) -> list[Fact]:
+    return [
+        Fact(section, option, place, config.number(section, option, default))
+        for option, place, default in wanted
+    ]

@@ -1,0 +1,260 @@
+"""What Marlin prints for M503, read as the firmware section of a machine."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from stillpath.applications.machines.checks import derived_envelope, typed_in
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import explain
+
+__all__ = [
+    "ASSUMED",
+    "firmware_section",
+    "looks_like_m503",
+    "machine_from_m503",
+    "read_travel",
+    "with_m503",
+]
+
+ASSUMED = {
+    "variant": "2.1",
+    "board": "32bit",
+    "min_steps_per_segment": 6,
+    "block_buffer_size": 16,
+    "s_curve": False,
+}
+"""What M503 does not say, and a stream depends on; the figures are those of most builds."""
+
+_COMMAND = re.compile(r"(M\d{2,3})((?:\s+[A-Z](?:-?\d+(?:\.\d*)?)?)+)\s*(?:;.*)?$")
+_WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d*)?)?")
+_PER_TOOL = {"M92", "M201", "M203", "M900"}
+_LONGEST_LINE = 500
+
+_Words = dict[str, float | None]
+
+
+def looks_like_m503(text: str) -> bool:
+    """Return whether a text is an answer to M503, whole or in part."""
+    return not {"M92", "M201", "M203", "M204", "M205"}.isdisjoint(_commands(text))
+
+
+def firmware_section(text: str, name: str) -> dict[str, Any]:
+    """Return the fields of a Marlin section that a printed M503 says, without those it does not.
+
+    Parameters
+    ----------
+    text : str
+        What the printer sent, or a host's log of it; of a command that stands there twice the
+        later words count, of several tools the first.
+    name : str
+        The file, for messages.
+
+    Raises
+    ------
+    ModelError
+        If a command that every Marlin prints is missing or lacks a word, or units are inches.
+    """
+    if re.search(r"(?m)^(?:.*:)?\s*G20\b", text):
+        raise ModelError(f"{name}: the printer works in inches; send G21, then M503 again")
+    found = _commands(text)
+
+    def word(command: str, letter: str, default: float | None = None) -> float:
+        value = found.get(command, {}).get(letter)
+        if value is None and default is None:
+            raise ModelError(
+                f"{name}: no {command} {letter} in it; send M503 and save all of the answer"
+            )
+        return float(value if value is not None else default or 0.0)
+
+    def per_axis(command: str) -> dict[str, float]:
+        return {axis: word(command, axis.upper()) for axis in "xyze"}
+
+    planner: dict[str, Any] = {
+        "max_feedrate_mm_s": per_axis("M203"),
+        "max_accel_mm_s2": per_axis("M201"),
+        "accel_mm_s2": word("M204", "P"),
+        "retract_accel_mm_s2": word("M204", "R"),
+        "travel_accel_mm_s2": word("M204", "T"),
+        "min_segment_time_us": word("M205", "B", 20_000.0),
+        "min_feedrate_mm_s": word("M205", "S", 0.0),
+        "min_travel_feedrate_mm_s": word("M205", "T", 0.0),
+    }
+    by_deviation = found.get("M205", {}).get("J") is not None
+    if by_deviation:
+        planner["junction_deviation_mm"] = word("M205", "J")
+    else:
+        planner["jerk_mm_s"] = per_axis("M205")
+    return {
+        "kind": "marlin",
+        "steps_per_mm": per_axis("M92"),
+        "planner": planner,
+        "junction": "deviation" if by_deviation else "classic_jerk",
+        # Each is printed by every build that has it.
+        "linear_advance": "M900" in found,
+        "linear_advance_k_s": word("M900", "K", 0.0),
+        "shaper": _shaper(found),
+        "ft_motion": word("M493", "S", 0.0) > 0.0,
+        "retraction": _retraction(found, word),
+    }
+
+
+def machine_from_m503(
+    text: str,
+    file: str,
+    name: str,
+    *,
+    travel_mm: Sequence[float],
+    kinematics: str = "cartesian",
+    title: str = "",
+    f_hz: tuple[float | None, float | None] = (None, None),
+    zeta: float = 0.07,
+    fields: Sequence[str] = (),
+) -> Machine:
+    """Return a machine with the limits that M503 says and plants that were not measured.
+
+    Parameters
+    ----------
+    text, file : str
+        What the printer answered, and the name of the file it stands in.
+    travel_mm : sequence of float
+        How far X, Y and Z reach from 0.
+    f_hz : tuple of float
+        Resonances of x and y; by default those of the firmware's shaper (M593), else 50 Hz.
+    fields : sequence of str
+        ``FIELD=VALUE`` of the firmware section that M503 does not say.
+
+    Raises
+    ------
+    ModelError
+        If something is missing, or is none of a machine.
+    """
+    section = {**ASSUMED, **firmware_section(text, file)}
+    shaper = section["shaper"]
+    tuned = (shaper["freq_x_hz"], shaper["freq_y_hz"])
+    _set_fields(section, fields)
+    document = {
+        "name": name,
+        "title": title or name,
+        "source": f"M503 in {file}",
+        "kinematics": kinematics,
+        "travel": {
+            axis: {"min_mm": 0.0, "max_mm": reach}
+            for axis, reach in zip("xyz", travel_mm, strict=True)
+        },
+        "firmware": section,
+        "axes": {
+            axis: typed_in(given or of_shaper, zeta)
+            for axis, given, of_shaper in zip("xy", f_hz, tuned, strict=True)
+        },
+    }
+    try:
+        machine = Machine.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}") from None
+    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
+
+
+def with_m503(machine: Machine, text: str, file: str) -> Machine:
+    """Return a machine with the limits of a printed M503; what that does not say stays.
+
+    A machine of another firmware becomes one with Marlin, with what most builds have (`ASSUMED`)
+    where M503 says nothing.
+
+    Raises
+    ------
+    ModelError
+        As of `machine_from_m503`.
+    """
+    said = firmware_section(text, file)
+    before: dict[str, Any] = dict(ASSUMED)
+    if machine.firmware.kind == "marlin":
+        before = machine.firmware.model_dump(mode="json", exclude_unset=True)
+    for part in ("planner", "shaper"):
+        said[part] = {**(before.get(part) or {}), **said[part]}
+    document = {**machine.model_dump(mode="json"), "firmware": {**before, **said}}
+    try:
+        return Machine.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}") from None
+
+
+def read_travel(text: str) -> tuple[float, float, float]:
+    """Return what ``235x235x250`` says, in mm."""
+    parts = re.split(r"[x,]", text.strip().lower())
+    try:
+        x, y, z = map(float, parts)
+    except ValueError:
+        raise ModelError(f"--travel {text!r}: give X, Y and Z in mm, like 235x235x250") from None
+    return x, y, z
+
+
+def _set_fields(section: dict[str, Any], fields: Sequence[str]) -> None:
+    """Put ``FIELD=VALUE`` into a section; a dot leads into a part of it."""
+    for field in fields:
+        place, equals, value = field.partition("=")
+        if not (place and equals and value):
+            raise ModelError(f"--set {field!r}: give FIELD=VALUE, like min_steps_per_segment=1")
+        *parts, last = place.strip().split(".")
+        inner = section
+        for part in parts:
+            inner = inner.setdefault(part, {})
+            if not isinstance(inner, dict):
+                raise ModelError(f"--set {field!r}: {part} has no fields")
+        if isinstance(inner.get(last), str):
+            inner[last] = value.strip()  # a version like 2.0 is no number
+            continue
+        try:
+            inner[last] = json.loads(value)
+        except ValueError:
+            inner[last] = value.strip()
+
+
+def _commands(text: str) -> dict[str, _Words]:
+    """Return each command's words; M593 stands under ``M593 X`` and ``M593 Y``."""
+    found: dict[str, _Words] = {}
+    for line in text.splitlines():
+        if len(line) > _LONGEST_LINE or (match := _COMMAND.search(line)) is None:
+            continue
+        if ";" in line[: match.start()]:
+            continue
+        command = match[1]
+        words: _Words = {
+            letter: float(value) if value else None for letter, value in _WORD.findall(match[2])
+        }
+        if command in _PER_TOOL and (words.pop("T", None) or 0) > 0:
+            continue
+        names = [command]
+        if command == "M593":
+            names = [f"M593 {axis}" for axis in "XY" if axis in words] or ["M593 X", "M593 Y"]
+        for name in names:
+            found.setdefault(name, {}).update(words)
+    return found
+
+
+def _shaper(found: dict[str, _Words]) -> dict[str, float]:
+    shaper = {}
+    for axis in "xy":
+        words = found.get(f"M593 {axis.upper()}", {})
+        shaper[f"freq_{axis}_hz"] = words.get("F") or 0.0
+        if (damping := words.get("D")) is not None:
+            shaper[f"damping_{axis}"] = damping
+    return shaper
+
+
+def _retraction(found: dict[str, _Words], word: Any) -> dict[str, float] | None:
+    if "M207" not in found:
+        return None
+    speed_mm_s = word("M207", "F") / 60.0
+    return {
+        "retract_length_mm": word("M207", "S"),
+        "retract_speed_mm_s": speed_mm_s,
+        "unretract_extra_length_mm": word("M208", "S", 0.0),
+        "unretract_speed_mm_s": word("M208", "F", 60.0 * speed_mm_s) / 60.0,
+    }

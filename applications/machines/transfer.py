@@ -1,0 +1,150 @@
+"""Machines in files: a document, or the whole history, out of a store and into another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import from_json
+
+from stillpath.applications.machines.marlin_settings import looks_like_m503, with_m503
+from stillpath.applications.machines.revision import (
+    Approval,
+    Revision,
+    document_text,
+    source_file,
+)
+from stillpath.applications.machines.store import MachineStore
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.provenance import SourceFile
+from stillpath.models.store import explain, read_machine
+
+__all__ = ["export_history", "import_file", "with_firmware_file"]
+
+_LARGEST_BYTES = 64_000_000
+
+
+class _History(BaseModel):
+    """A machine with all its revisions.
+
+    Approvals are there to be read: they do not hold in another store.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal["stillpath machine history"] = "stillpath machine history"
+    name: str
+    revisions: tuple[Revision, ...]
+    approvals: tuple[Approval, ...] = ()
+
+
+def export_history(store: MachineStore, name: str) -> str:
+    """Return a machine with all its revisions as JSON."""
+    return document_text(
+        _History(
+            name=name,
+            revisions=tuple(store.history(name)),
+            approvals=tuple(store.approvals(name).values()),
+        )
+    )
+
+
+def import_file(
+    store: MachineStore, file: Path, *, author: str, message: str = "", name: str | None = None
+) -> Revision:
+    """Add the machine of a file, a machine document or an exported history, as a new machine.
+
+    Parameters
+    ----------
+    name : str, optional
+        Another name for it. Of a history, only the newest machine is taken then.
+
+    Returns
+    -------
+    Revision
+        The current one.
+
+    Raises
+    ------
+    Conflict
+        If there is a machine of that name.
+    ModelError
+        If the file is neither, or the name cannot be used.
+    """
+    content = _content(file)
+    history = _as_history(content, file)
+    machine = read_machine(content, str(file)) if history is None else history.revisions[-1].machine
+    if history is not None and name in (None, history.name):
+        store.add_history(history.name, history.revisions)
+        return store.current(history.name)
+    name = machine.name if name is None else name
+    return store.add_revision(
+        name,
+        machine.model_copy(update={"name": name}),
+        author=author,
+        message=message or f"imported from {file.name}",
+        sources=[source_file(file.name, content)],
+        expected=0,
+    )
+
+
+def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFile]:
+    """Return the machine with the firmware section of a file, and that file as a source.
+
+    Parameters
+    ----------
+    machine : Machine
+    file : Path
+        A section as JSON, or what Marlin answers to M503: then what that does not say stays.
+
+    Raises
+    ------
+    ModelError
+        Naming the first field of the section that is wrong.
+    """
+    content = _content(file)
+    text = content.decode(errors="replace")
+    if looks_like_m503(text):
+        return with_m503(machine, text, file.name), source_file(file.name, content)
+    try:
+        section = from_json(content)
+    except ValueError as error:
+        raise ModelError(
+            f"{file}: neither a section as JSON ({error}) nor an answer to M503, which has M92 and "
+            "M203 in it"
+        ) from None
+    if not isinstance(section, dict) or "kind" not in section:
+        raise ModelError(f"{file}: a firmware section is an object that says its kind")
+    try:
+        changed = Machine.model_validate({**machine.model_dump(mode="json"), "firmware": section})
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}") from None
+    return changed, source_file(file.name, content)
+
+
+def _content(file: Path) -> bytes:
+    try:
+        if file.stat().st_size > _LARGEST_BYTES:
+            raise ModelError(f"{file}: over {_LARGEST_BYTES} bytes, neither machine nor history")
+        return file.read_bytes()
+    except OSError as error:
+        raise ModelError(f"cannot read {file}: {error.strerror}") from None
+
+
+def _as_history(content: bytes, file: Path) -> _History | None:
+    """Return the history in a file, None if it is something else."""
+    try:
+        document = from_json(content)
+    except ValueError:
+        return None
+    if not isinstance(document, dict) or "revisions" not in document:
+        return None
+    try:
+        history = _History.model_validate(document)
+    except ValidationError as error:
+        raise ModelError(f"{file}: {explain(error)}; export the machine again") from None
+    if not history.revisions:
+        raise ModelError(f"{file}: the history holds no revision; export the machine again")
+    return history

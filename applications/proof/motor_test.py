@@ -1,0 +1,202 @@
+"""A search for lost steps: motions of a stream at rising limits, and what a console says of them.
+
+Each level homes X and Y, moves as streams do (starts, stops and corners, along both axes and both
+motors of a CoreXY) and homes again. Where the host's step counters then differ by a full step from
+what they were at first, a motor has lost some.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+from stillpath.gcode.firmware.klipper.limits import KlipperLimits
+from stillpath.gcode.firmware.klipper.voice import KlipperVoice
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Klipper
+from stillpath.models.machine import CommandLimits, Machine
+
+__all__ = ["Level", "borne", "envelope", "levels_of", "motor_test"]
+
+_RISE, _MOST_LEVELS = 1.25, 12
+_STROKES, _CORNERS = 8, 60
+_LONGEST_MM, _SHARE = 120.0, 0.6
+_LEG_MM, _TURN_RAD = 2.0, math.radians(30.0)
+_SMALL_CORNER = math.sqrt(8.0 * (math.sqrt(2.0) - 1.0))
+"""Around small angles velocity steps by so many times the speed through a square corner."""
+_HEIGHT_MM = 20.0
+_DIRECTIONS = (
+    (1.0, 0.0),
+    (0.0, 1.0),
+    (math.sqrt(0.5), math.sqrt(0.5)),
+    (math.sqrt(0.5), -math.sqrt(0.5)),
+)
+_LEVEL = re.compile(r"^; level (\d+): accel ([\d.]+) mm/s2, step ([\d.]+) mm/s$", re.MULTILINE)
+_COUNTED = re.compile(r"mcu: stepper_x:(-?\d+) stepper_y:(-?\d+)")
+
+
+@dataclass(frozen=True)
+class Level:
+    """Limits that motors were tried at."""
+
+    accel_mm_s2: float
+    speed_step_mm_s: float
+
+
+def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
+    """Return the G-code of a search up to an acceleration.
+
+    Raises
+    ------
+    ModelError
+        For another firmware than Klipper, whose counters the search reads; for a machine that
+        allows more already.
+    """
+    firmware = machine.firmware
+    if not isinstance(firmware, Klipper):
+        raise ModelError(
+            f"{machine.name} runs {firmware.kind}: the search reads Klipper's step counters; say "
+            "what the motors bear in `command` of the machine's document"
+        )
+    levels = _levels(firmware, most_accel_mm_s2)
+    voice = KlipperVoice(firmware)
+    middle = [0.5 * (machine.travel[a].min_mm + machine.travel[a].max_mm) for a in ("x", "y")]
+    room_mm = min(machine.travel[a].max_mm - machine.travel[a].min_mm for a in ("x", "y"))
+    home = ["G28 X Y", "M400", "GET_POSITION"]
+    place = f"G1 X{middle[0]:.3f} Y{middle[1]:.3f} F6000"
+    lines = ["; STILLPATH_OFF", "; a search for lost steps: nothing is heated, nothing printed"]
+    lines += ["G28", "G90", "M83", f"G1 Z{_HEIGHT_MM:g} F600", *home]
+    # A shaper would spare the motors what a stream asks of them.
+    lines += voice.shaper_off.decode().splitlines()
+    for number, level in enumerate(levels, 1):
+        accel, step = level.accel_mm_s2, level.speed_step_mm_s
+        text = f"level {number}: accel {accel:.0f} mm/s2, step {step:.1f} mm/s"
+        lines += [
+            f"; {text}",
+            f"M118 {text}",
+            place,
+            voice.limits(_limits(firmware, level)).decode().strip(),
+        ]
+        for direction in _DIRECTIONS:
+            lines += _strokes(
+                middle, direction, min(_LONGEST_MM, _SHARE * room_mm), level, firmware
+            )
+            lines += _corners(middle, direction, level)
+        lines += [voice.limits(_own(firmware)).decode().strip(), *home]
+    shaper = voice.shaper_on
+    over = "; the shaper stays off until FIRMWARE_RESTART" if shaper is None else shaper.decode()
+    return "\n".join([*lines, *over.splitlines(), "M118 the search is over", ""])
+
+
+def levels_of(text: str) -> list[Level]:
+    """Return the levels of a file that `motor_test` wrote."""
+    found = [Level(float(accel), float(step)) for _, accel, step in _LEVEL.findall(text)]
+    if not found:
+        raise ModelError("the file has no levels; it must be what `stillpath motor-test` wrote")
+    return found
+
+
+def borne(levels: list[Level], console: str, full_step: int) -> int:
+    """Return how many levels the motors bore, from what the console said.
+
+    Parameters
+    ----------
+    levels : list of Level
+    console : str
+        The console's text or klippy.log; its last answers to GET_POSITION count.
+    full_step : int
+        Microsteps of a full step, of X and Y.
+
+    Raises
+    ------
+    ModelError
+        The text holds fewer answers than the search asks for.
+    """
+    counts = [(int(x), int(y)) for x, y in _COUNTED.findall(console)]
+    if len(counts) <= len(levels):
+        raise ModelError(
+            f"the console holds {len(counts)} answers to GET_POSITION, the search asks for "
+            f"{len(levels) + 1}: run the whole file, then hand in the console's text or klippy.log"
+        )
+    first, *later = counts[-len(levels) - 1 :]
+    lost = [max(abs(a - b) for a, b in zip(first, one, strict=True)) >= full_step for one in later]
+    return lost.index(True) if True in lost else len(levels)
+
+
+def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:
+    """Return what the machine may ask of motors that bore a level."""
+    changed = {
+        "accel_mm_s2": round(margin * level.accel_mm_s2),
+        "speed_step_mm_s": round(margin * level.speed_step_mm_s, 1),
+    }
+    return machine.command.model_copy(update=changed)
+
+
+def _levels(firmware: Klipper, most_accel_mm_s2: float) -> list[Level]:
+    own = firmware.largest_accel_mm_s2
+    if most_accel_mm_s2 <= own:
+        raise ModelError(
+            f"the printer allows a file {own:g} mm/s2 already: search up to more than that"
+        )
+    step = _SMALL_CORNER * max(firmware.corner_mm_s, 5.0)
+    count = min(math.ceil(math.log(most_accel_mm_s2 / own) / math.log(_RISE)), _MOST_LEVELS - 1)
+    rise = (most_accel_mm_s2 / own) ** (1.0 / count)
+    return [Level(round(own * rise**k), round(step * rise**k, 1)) for k in range(count + 1)]
+
+
+def _limits(firmware: Klipper, level: Level) -> KlipperLimits:
+    corner = level.speed_step_mm_s / _SMALL_CORNER
+    return KlipperLimits(firmware.fastest_mm_s, level.accel_mm_s2, corner, 0.0)
+
+
+def _own(firmware: Klipper) -> KlipperLimits:
+    planner = firmware.planner
+    return KlipperLimits(
+        planner.max_velocity_mm_s,
+        planner.max_accel_mm_s2,
+        planner.square_corner_velocity_mm_s,
+        planner.minimum_cruise_ratio,
+    )
+
+
+def _strokes(
+    middle: list[float],
+    direction: tuple[float, float],
+    length_mm: float,
+    level: Level,
+    firmware: Klipper,
+) -> list[str]:
+    """Go to and fro at all the speed that a length allows; the shortest only start and stop."""
+    lines = []
+    for share in (1.0, 0.25, 0.05):
+        far_mm = share * length_mm
+        speed = min(firmware.fastest_mm_s, math.sqrt(0.8 * level.accel_mm_s2 * far_mm))
+        ends = (-0.5 * far_mm, 0.5 * far_mm)
+        lines += [_move(middle, direction, ends[k % 2], 0.0, speed) for k in range(_STROKES)]
+    return lines
+
+
+def _corners(middle: list[float], direction: tuple[float, float], level: Level) -> list[str]:
+    """Write a zigzag whose corners step velocity by the level's step."""
+    speed = 1.5 * level.speed_step_mm_s / (2.0 * math.sin(0.5 * _TURN_RAD))
+    rise_mm = _LEG_MM * math.sin(0.5 * _TURN_RAD)
+    along_mm, lines = _LEG_MM * math.cos(0.5 * _TURN_RAD), []
+    there = 10
+    for k in range(_CORNERS):
+        way = k % (2 * there)
+        far = way if way <= there else 2 * there - way
+        lines.append(_move(middle, direction, far * along_mm, rise_mm * (k % 2), speed))
+    return lines
+
+
+def _move(
+    middle: list[float],
+    direction: tuple[float, float],
+    far_mm: float,
+    aside_mm: float,
+    speed: float,
+) -> str:
+    x = middle[0] + far_mm * direction[0] - aside_mm * direction[1]
+    y = middle[1] + far_mm * direction[1] + aside_mm * direction[0]
+    return f"G1 X{x:.3f} Y{y:.3f} F{60.0 * speed:.0f}"

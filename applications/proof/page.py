@@ -1,0 +1,97 @@
+"""Turns a `ReadbackReport` into readback.html and readback.json."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from stillpath.applications.proof.figures import AxisReadback, Curve, ReadbackReport
+from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.pages import rendered, style_of, write_texts
+
+__all__ = ["render_readback", "write_readback"]
+
+_SIZE = (480.0, 290.0)
+
+
+def write_readback(report: ReadbackReport, directory: Path) -> None:
+    """Write readback.html and readback.json into a folder, each whole or not at all.
+
+    Parameters
+    ----------
+    report : ReadbackReport
+    directory : Path
+        Made if it does not exist.
+
+    Raises
+    ------
+    OSError
+        If the folder or a file cannot be written.
+    """
+    page = render_readback(report)
+    write_texts(directory, {"readback.json": report.model_dump_json(), "readback.html": page})
+
+
+def render_readback(report: ReadbackReport) -> str:
+    """Return the comparison as one HTML page."""
+    return rendered(
+        "stillpath.applications.proof",
+        "readback.html.j2",
+        style_of(),
+        {},
+        d=report,
+        axes=[(axis, _figures(axis)) for axis in report.axes],
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Figure:
+    """A chart with its caption."""
+
+    title: str
+    note: str
+    svg: str
+
+
+def _figures(axis: AxisReadback) -> list[_Figure]:
+    name = axis.axis.upper()
+    marks = [Mark(axis.f_hz, f"{axis.f_hz:.1f} Hz")]
+    return [
+        _figure(
+            Chart(
+                about=f"Power spectrum of the acceleration of {name}, measured and predicted.",
+                x_title="frequency, Hz",
+                y_title="(m/s²)²/Hz",
+                lines=_lines(axis.spectrum, 1e-6),
+                log=True,
+                marks=marks,
+            ),
+            f"Axis {name}: spectrum of the acceleration",
+            "measured, by the model, and fitted: with the frequency found here",
+        ),
+        _figure(
+            Chart(
+                about=f"Acceleration of {name} around one corner, measured and predicted.",
+                x_title="time, ms",
+                y_title="m/s²",
+                lines=_lines(axis.excerpt, 1e-3),
+            ),
+            f"Axis {name}: around one corner",
+            "the one that rings most, 5 to 200 Hz",
+        ),
+    ]
+
+
+def _figure(chart: Chart, title: str, note: str) -> _Figure:
+    return _Figure(title, note, draw(chart, *_SIZE))
+
+
+def _lines(curve: Curve, scale: float) -> list[Line]:
+    measured, predicted, fitted = (
+        [scale * v for v in values] for values in (curve.measured, curve.predicted, curve.fitted)
+    )
+    return [
+        Line(curve.x, measured, "before main", "measured"),
+        Line(curve.x, predicted, "after", "model"),
+        Line(curve.x, fitted, "after thin d2", "fitted"),
+    ]

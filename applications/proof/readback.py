@@ -1,0 +1,199 @@
+"""An accelerometer log taken during a print, against what the model says of that print."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.applications.proof.figures import ReadbackReport
+from stillpath.applications.proof.judging import AxisMotion, judge
+from stillpath.applications.proof.matching import Match, Signal, band_pass, log_signal, match
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import read_measurements
+from stillpath.models.identification.types import AccelerationLog
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSpec, discretise
+from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.simulate import plan_file
+from stillpath.simulation.response import PlantStream
+from stillpath.version import __version__
+
+__all__ = ["verify_log"]
+
+Array = NDArray[np.float64]
+
+_RATE_HZ = 1000.0
+_LONGEST_S = 240.0
+"""More of a log tells nothing new."""
+_MOUNT_BAND_HZ = (3.0, 20.0)
+_SEEN = 0.3
+"""An axis is in the log if the sensor answers to it by this much of the other one."""
+_MATCHED = 0.5
+
+
+def verify_log(
+    printed: Path,
+    log: Path,
+    machine: Machine,
+    *,
+    progress: ProgressCallback | None = None,
+) -> ReadbackReport:
+    """Compare a log that was recorded during a print with the prediction for it.
+
+    Parameters
+    ----------
+    printed : Path
+        The G-code that was printed, compensated or not.
+    log : Path
+        Klipper's or RepRapFirmware's raw accelerations; any part of the print.
+    machine : Machine
+    progress : callable, optional
+        Called while the file is planned.
+
+    Raises
+    ------
+    GcodeError
+        The G-code cannot be read.
+    ModelError
+        The log cannot be read, or holds no accelerations.
+    """
+    (recorded, *_) = read_measurements(log)
+    if not isinstance(recorded, AccelerationLog):
+        raise ModelError(
+            f"{log.name} holds no raw accelerations but a {type(recorded).__name__}; record with "
+            "ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) while the print runs"
+        )
+    measured = log_signal(recorded)
+    command = _planned(printed, machine, progress)
+    specs = {a: machine.axes[a].nominal for a in ("x", "y")}
+    answer = PlantStream([discretise(s, command.dt_s) for s in specs.values()]).push(command.rows)
+    predicted = Signal(0.0, command.dt_s, _acceleration(answer, command.dt_s))
+    found = match(predicted, measured)
+    report = {
+        "version": __version__,
+        "machine": machine.name,
+        "machine_title": machine.title,
+        "machine_revision": machine.revision,
+        "printed": printed.name,
+        "log": log.name,
+        "explained": found.explained,
+        "log_s": found.log_s,
+    }
+    if found.explained < _MATCHED or found.plan_end_s <= found.plan_start_s:
+        verdict = (
+            "This log is not of this print: the best place explains "
+            f"{100 * found.explained:.0f} % of what the sensor felt between 2 and 22 Hz."
+        )
+        return ReadbackReport(
+            **report,
+            outcome="another print",
+            verdicts=[verdict],
+            notes=[],
+            compared_s=0.0,
+            plan_start_s=0.0,
+            clock_ppm=0.0,
+            sensor=[],
+            axes=[],
+        )
+    axes, sensor, notes = _in_machine_axes(command, predicted, measured, found, specs)
+    judged = [judge(axis, command.dt_s) for axis in axes]
+    return ReadbackReport(
+        **report,
+        outcome="the model holds" if all(a.holds for a in judged) else "the machine has changed",
+        verdicts=[a.verdict for a in judged],
+        notes=[*recorded.notes, *_notes(found, machine), *notes],
+        compared_s=len(axes[0].measured) * command.dt_s,
+        plan_start_s=found.plan_start_s,
+        clock_ppm=1e6 * (found.rate - 1.0),
+        sensor=[[float(v) for v in column] for column in sensor.T],
+        axes=judged,
+    )
+
+
+def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None) -> Signal:
+    """Commanded positions of X and Y, without the jumps of homing and macros."""
+    with tempfile.TemporaryDirectory(prefix="stillpath-verify-") as folder:
+        target = Path(folder, "motion.npz")
+        plan_file(printed, target, machine, rate_hz=_RATE_HZ, progress=progress)
+        with np.load(target) as motion:
+            rows = np.stack([motion["x"], motion["y"]])
+    fastest = max(machine.command.velocity_mm_s, machine.firmware.fastest_mm_s)
+    step = np.diff(rows)
+    step[np.abs(step) > 2.0 * fastest / _RATE_HZ] = 0.0
+    rows[:, 1:] = rows[:, :1] + np.cumsum(step, axis=1)
+    return Signal(0.0, 1.0 / _RATE_HZ, rows)
+
+
+def _acceleration(position: Array, dt_s: float) -> Array:
+    inner = np.diff(position, 2) / dt_s**2
+    return np.pad(inner, ((0, 0), (1, 1)))
+
+
+def _in_machine_axes(
+    command: Signal, predicted: Signal, log: Signal, found: Match, specs: dict[str, PlantSpec]
+) -> tuple[list[AxisMotion], Array, list[str]]:
+    """Turn the log into the machine's axes: the orthogonal matrix nearest to D of m = D p."""
+    dt = command.dt_s
+    start = max(round(found.plan_start_s / dt), 1)
+    count = min(round((found.plan_end_s - found.plan_start_s) / dt), round(_LONGEST_S / dt))
+    count = min(count, command.rows.shape[1] - start)
+    t = dt * (start + np.arange(count))
+    own = log.t0_s + log.dt_s * np.arange(log.rows.shape[1])
+    inside = (found.log_time_s(t) >= own[0]) & (found.log_time_s(t) <= own[-1])
+    t, part = t[inside], slice(start + int(np.argmax(inside)), None)
+    part = slice(part.start, part.start + len(t))
+    # Above what is compared nothing may alias into it.
+    smooth = Signal(log.t0_s, log.dt_s, band_pass(log.rows, log.dt_s, 0.5, 0.4 * _RATE_HZ))
+    m = smooth.at(found.log_time_s(t))
+    p = predicted.rows[:, part]
+    low_p, low_m = (band_pass(rows, dt, *_MOUNT_BAND_HZ) for rows in (p, m))
+    moving = [k for k in range(2) if np.std(low_p[k]) > 0.02 * np.std(low_p)]
+    d = np.linalg.lstsq(low_p[moving].T, low_m.T, rcond=None)[0].T
+    gains = np.linalg.norm(d, axis=0)
+    seen = [k for k, gain in enumerate(gains) if gain > _SEEN * gains.max()]
+    names = [list(specs)[moving[k]] for k in seen]
+    u, _, vt = np.linalg.svd(d[:, seen], full_matrices=False)
+    sensor = u @ vt
+    measured = sensor.T @ m
+    accel = _acceleration(command.rows[:, part.start - 1 : part.stop + 1], dt)[:, 1:-1]
+    notes = [
+        f"The log holds no motion of {a.upper()}: is the sensor on the other moving part?"
+        for a in specs
+        if a not in names
+    ]
+    if len(seen) == 2:
+        cosine = float(d[:, 0] @ d[:, 1] / (gains[0] * gains[1]))
+        if abs(cosine) > 0.2:
+            angle = float(np.degrees(np.arccos(cosine)))
+            notes.append(
+                f"X and Y appear {angle:.0f} degrees apart: coupled axes, or a loose sensor"
+            )
+    axes = [
+        AxisMotion(name, specs[name], accel[k], p[k], measured[row])
+        for row, (name, k) in enumerate(zip(names, (moving[i] for i in seen), strict=True))
+    ]
+    return axes, sensor, notes
+
+
+def _notes(found: Match, machine: Machine) -> list[str]:
+    notes = []
+    if machine.schedules:
+        notes.append(
+            "The machine's model follows mass or position; compared is its nominal plant: a mode "
+            "may be lower here because the print is heavy."
+        )
+    if found.places > 1:
+        notes.append(
+            f"The log fits at {found.places} places of the print about as well (layers repeat); "
+            f"the one from {found.plan_start_s:.0f} s on was compared."
+        )
+    compared = found.plan_end_s - found.plan_start_s
+    if compared < 0.7 * found.log_s and found.log_s - compared > 8.0:
+        notes.append(
+            f"{compared:.0f} s of the log's {found.log_s:.0f} s follow the plan without a gap; "
+            "the rest was left out: heating, homing, pauses, little motion, or not in the file."
+        )
+    return notes

@@ -1,0 +1,127 @@
+"""The lines by which each firmware logs its accelerometer during a ring test."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from stillpath.models.firmware import Firmware
+
+__all__ = ["Recorder", "RingSettings", "recorder_for"]
+
+_RATES_HZ = (1300.0, 1700.0)
+"""Of the accelerometers that RepRapFirmware knows, with some room."""
+_MOST_SAMPLES = 65535
+"""S of M956 holds 16 bits (RepRapFirmware src/Accelerometers/Accelerometers.cpp, 3.4 to 3.6)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RingSettings:
+    """What the machine's model does not know.
+
+    Attributes
+    ----------
+    chip_x, chip_y : str, optional
+        The sensor that moves with X, and with Y if that is another one: CHIP of
+        ACCELEROMETER_MEASURE, P of M956. None: the firmware's default; the same for Y as for X.
+    start_gcode : str, optional
+        Instead of the line that homes.
+    """
+
+    chip_x: str | None = None
+    chip_y: str | None = None
+    start_gcode: str | None = None
+
+
+class Recorder:
+    """Lines around a ring test; of itself, for a firmware without a sensor, it has none.
+
+    Parameters
+    ----------
+    settings : RingSettings
+    """
+
+    instruction: tuple[str, ...] = (
+        "This firmware logs no accelerations: fix a sensor with a logger of its own to the part",
+        "that moves, at 1000 samples per second or more, and let it log from before the file until",
+        "behind it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
+    )
+    """What a person is to do, for the first lines of the file."""
+
+    def __init__(self, settings: RingSettings) -> None:
+        self._chips = (settings.chip_x, settings.chip_y or settings.chip_x)
+
+    def first(self) -> tuple[str, ...]:
+        """Lines before the first round, at rest."""
+        return ()
+
+    def before(self, number: int, seconds: float) -> tuple[str, ...]:  # noqa: ARG002
+        """Lines before a round, counted from 1, that takes `seconds`."""
+        return ()
+
+    def after(self, seconds: float) -> tuple[str, ...]:  # noqa: ARG002
+        """Lines behind a round that took `seconds`."""
+        return ()
+
+    def last(self) -> tuple[str, ...]:
+        """Lines behind the last round, at rest."""
+        return ()
+
+
+def recorder_for(firmware: Firmware, settings: RingSettings) -> Recorder:
+    """Return the recorder of a firmware."""
+    kinds: dict[str, type[Recorder]] = {"klipper": _Klipper, "reprapfirmware": _RepRap}
+    return kinds.get(firmware.kind, Recorder)(settings)
+
+
+class _Klipper(Recorder):
+    """One log of every sensor over the whole file."""
+
+    instruction = (
+        "Klipper writes the log, or one per sensor, to /tmp/*-ring.csv. Give what was logged to",
+        "`stillpath verify THIS-FILE LOG...`.",
+    )
+
+    def first(self) -> tuple[str, ...]:
+        """Start every sensor."""
+        return self._each("")
+
+    def last(self) -> tuple[str, ...]:
+        """Stop every sensor; each writes its file."""
+        return self._each(" NAME=ring")
+
+    def _each(self, more: str) -> tuple[str, ...]:
+        chips = dict.fromkeys(self._chips)
+        return tuple(
+            "ACCELEROMETER_MEASURE" + (f" CHIP={chip}" if chip else "") + more for chip in chips
+        )
+
+
+class _RepRap(Recorder):
+    """A log for each round: the number of samples has an end."""
+
+    instruction = (
+        "The logs are ring-1*.csv and ring-2*.csv in 0:/sys/accelerometer. Give all of them to",
+        "`stillpath verify THIS-FILE LOG...`.",
+    )
+
+    def before(self, number: int, seconds: float) -> tuple[str, ...]:
+        """Stand still and start."""
+        chips = list(dict.fromkeys(chip or "0" for chip in self._chips))
+        names = [f"ring-{number}" + (f"-{chip}" if len(chips) > 1 else "") for chip in chips]
+        return (
+            "M400",
+            *(
+                f'M956 P{chip} S{_samples(seconds)} A0 F"{name}.csv"'
+                for chip, name in zip(chips, names, strict=True)
+            ),
+        )
+
+    def after(self, seconds: float) -> tuple[str, ...]:
+        """Wait until a slow sensor has all its samples: M956 refuses to start before."""
+        left_s = _samples(seconds) / _RATES_HZ[0] - seconds
+        return ("M400", f"G4 P{1e3 * max(left_s, 1.0):.0f}")
+
+
+def _samples(seconds: float) -> int:
+    return min(math.ceil(_RATES_HZ[1] * seconds), _MOST_SAMPLES)

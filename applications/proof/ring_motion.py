@@ -1,0 +1,173 @@
+"""The motion of a ring test's file: where it stops dead, and what the model says of that."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.applications.proof.matching import Signal
+from stillpath.applications.proof.ring_test import (
+    AXES,
+    PARTS,
+    REST,
+    ROUNDS,
+    TITLE,
+    Axis,
+    plants_line,
+    region,
+)
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.plants import PlantSpec, discretise
+from stillpath.pipeline.reading import dialect_for
+from stillpath.pipeline.simulate import TextMotion
+from stillpath.simulation.response import PlantStream
+
+__all__ = ["RingMotion", "Stop", "is_ring_test", "predicted", "read_ring_motion"]
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 1000.0
+_HEAD_BYTES = 4096
+_HEX = "([0-9a-f]{12})"
+_FAST = 0.95
+"""Share of a move's top speed below which it brakes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A stop: `from_s` when the braking begins, `at_s` from when on the axis is to stand still.
+
+    Stops of one `kind` are from the same speed in the same direction.
+    """
+
+    axis: Axis
+    compensated: bool
+    from_s: float
+    at_s: float
+    kind: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingMotion:
+    """What a ring test commands.
+
+    Attributes
+    ----------
+    command : Signal
+        Positions of X and Y in mm.
+    stops : tuple of Stop
+    quiet_s : dict
+        By axis from when until when it stands still long before it moves (the other one creeps, as
+        behind the stops).
+    about : dict
+        By axis which samples are about it.
+    plants : dict
+        By axis the digest of the plants that the file was compensated for.
+    """
+
+    command: Signal
+    stops: tuple[Stop, ...]
+    quiet_s: dict[Axis, list[tuple[float, float]]]
+    about: dict[Axis, NDArray[np.bool_]]
+    plants: dict[Axis, str]
+
+    def of(self, axis: Axis, *, compensated: bool) -> list[Stop]:
+        """Return the stops of a half of an axis."""
+        return [s for s in self.stops if s.axis == axis and s.compensated is compensated]
+
+
+def is_ring_test(printed: Path) -> bool:
+    """Whether a file says of itself that it is a ring test."""
+    with printed.open("rb") as file:
+        return file.read(_HEAD_BYTES).startswith(f"; {TITLE}".encode())
+
+
+def read_ring_motion(printed: Path, machine: Machine) -> RingMotion:
+    """Plan a ring test as the firmware does, and find its stops.
+
+    Raises
+    ------
+    GcodeError
+        The file cannot be read.
+    ModelError
+        It is not a ring test, or lacks its stops.
+    """
+    if not is_ring_test(printed):
+        raise ModelError(
+            f"{printed.name} is not a ring test: write one (`stillpath ring-test`), and give the "
+            "file as it was written"
+        )
+    rows, numbers = [], []
+    with printed.open("rb") as file:
+        motion = TextMotion(file, machine, dialect_for(machine, None), 1.0 / RATE_HZ)
+        for part in motion:
+            rows.append(part.samples.xyz_mm[:2])
+            numbers.append(part.moves.feature[part.samples.move_index - part.first_move])
+        names = motion.reader.feature_names
+    command, feature = np.concatenate(rows, axis=1), np.concatenate(numbers)
+    stops: list[Stop] = []
+    quiet: dict[Axis, list[tuple[float, float]]] = {}
+    about: dict[Axis, NDArray[np.bool_]] = {}
+    for k, axis in enumerate(AXES):
+        wanted = [region(axis, part) for part in PARTS]
+        if not set(wanted) <= set(names):
+            raise ModelError(f"{printed.name} has no stops of {axis}: give the file as written")
+        own = {part: feature == names.index(region(axis, part)) for part in PARTS}
+        speed = np.abs(np.diff(command[k], prepend=command[k, 0])) * RATE_HZ
+        for half in ("off", "on"):
+            stops += _stops(axis, half == "on", speed, own[half], own[half + REST])
+        quiet[axis] = _runs_s(own["quiet"])
+        about[axis] = np.any(list(own.values()), axis=0)
+    stops.sort(key=lambda stop: stop.at_s)
+    return RingMotion(
+        Signal(0.0, 1.0 / RATE_HZ, command), tuple(stops), quiet, about, _plants(printed)
+    )
+
+
+def predicted(command: Array, spec: PlantSpec) -> Array:
+    """Return the acceleration [mm/s^2] of one axis, shape (n,), by one of its plants."""
+    plant = discretise(spec, 1.0 / RATE_HZ)
+    return np.asarray(accelerations(PlantStream([plant]).push(command[None]))[0])
+
+
+def accelerations(position: Array) -> Array:
+    """Return second differences of rows of positions, as long as these."""
+    return np.asarray(np.pad(np.diff(position, 2) * RATE_HZ**2, ((0, 0), (1, 1))))
+
+
+def _stops(
+    axis: Axis,
+    compensated: bool,
+    speed: Array,
+    moves: NDArray[np.bool_],
+    rests: NDArray[np.bool_],
+) -> list[Stop]:
+    """Find where a rest follows a move, and where the braking before it began."""
+    begins = np.flatnonzero(moves & ~np.append(False, moves[:-1]))
+    ends = np.flatnonzero(rests[1:] & moves[:-1]) + 1
+    kinds = max(len(ends) // ROUNDS, 1)
+    out = []
+    for k, end in enumerate(ends):
+        first = begins[begins < end][-1]
+        own = speed[first:end]
+        fast = np.flatnonzero(own > _FAST * own.max())
+        out.append(Stop(axis, compensated, (first + fast[-1]) / RATE_HZ, end / RATE_HZ, k % kinds))
+    return out
+
+
+def _runs_s(inside: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Return from when until when something holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
+    return [(a / RATE_HZ, b / RATE_HZ) for a, b in edges.reshape(-1, 2).tolist()]
+
+
+def _plants(printed: Path) -> dict[Axis, str]:
+    """Return what the first lines say of the plants."""
+    with printed.open("rb") as file:
+        head = file.read(_HEAD_BYTES).decode("utf-8", "replace")
+    return {axis: digest for axis in AXES for digest in re.findall(plants_line(axis, _HEX), head)}

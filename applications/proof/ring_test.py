@@ -1,0 +1,259 @@
+"""A ring test: fast moves that stop dead, as planned and compensated, and a rest behind each.
+
+Nothing is printed and nothing is heated. While an axis rests the other one creeps: motion goes on
+as behind a corner of a print, so that compensation can act behind the stop as it does there. All
+rests differ, so that a log of one axis cannot be mistaken for one of the other, nor one stop for
+the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from stillpath.applications.proof.drive import RingingMode, ringing_mode
+from stillpath.applications.proof.halves import ProofPrint, Ringing, write_proof
+from stillpath.applications.proof.recorders import RingSettings, recorder_for
+from stillpath.gcode.firmware.registry import kit
+from stillpath.models.confirmation import plants_digest
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.result import Result
+
+__all__ = [
+    "AXES",
+    "PARTS",
+    "REST",
+    "ROUNDS",
+    "TITLE",
+    "Axis",
+    "RingTest",
+    "plants_line",
+    "region",
+    "write_ring_test",
+]
+
+Axis: TypeAlias = Literal["x", "y"]
+AXES: tuple[Axis, Axis] = ("x", "y")
+
+REST = " rest"
+PARTS = ("quiet", "off", "off" + REST, "on", "on" + REST)
+TITLE = "Ring test for "
+"""The first line of the file begins so."""
+_SPEEDS_MM_S = (60.0, 100.0, 150.0)
+_NEAR = 0.15
+"""Share by which a speed may differ from these, where the two ends of the braking cancel."""
+ROUNDS = 2
+_REST_S = (0.6, 1.0)
+_QUIET_S = 2.0
+_CREEP_MM_S = 3.0
+"""Below what firmwares let pass at a corner without braking."""
+_GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+_CRUISE = 2.5
+"""Length of a move in units of v^2 / a: Klipper lowers the acceleration of those below 2."""
+_SHORTEST_MM, _MARGIN_MM, _HEIGHT_MM = 20.0, 10.0, 20.0
+_TRAVEL_MM_S = 100.0
+
+
+class RingTest:
+    """Write a ring test; it moves, and nothing else.
+
+    Parameters
+    ----------
+    machine : Machine
+    settings : RingSettings
+
+    Raises
+    ------
+    ModelError
+        The travel is too small, or an axis does not ring.
+
+    Attributes
+    ----------
+    speeds_mm_s : dict
+        By axis, in the order of the file.
+    """
+
+    def __init__(self, machine: Machine, settings: RingSettings) -> None:
+        self._machine, self._settings = machine, settings
+        self._voice = kit(machine).voice()
+        firmware = machine.firmware
+        self.accel_mm_s2 = firmware.largest_accel_mm_s2
+        self._z_mm_s = min(10.0, firmware.fastest_z_mm_s)
+        self._travel_mm_s = min(_TRAVEL_MM_S, firmware.fastest_mm_s)
+        self._middle = {
+            a: 0.5 * (machine.travel[a].min_mm + machine.travel[a].max_mm) for a in ("x", "y", "z")
+        }
+        self.speeds_mm_s: dict[Axis, tuple[float, ...]] = {
+            axis: self._speeds(ringing_mode(machine.axes[axis].nominal), axis) for axis in AXES
+        }
+        self._rests = _rests()
+        self._at_mm: dict[Axis, float] = {}
+        self._out: list[str] = []
+        self._write()
+
+    def text(self) -> str:
+        """Return all lines."""
+        return "\n".join(self._out) + "\n"
+
+    def _write(self) -> None:
+        start = self._settings.start_gcode
+        self._add(*(["G28"] if start is None else start.splitlines()))
+        self._add("; STILLPATH_OFF", "G90", "M83", "M220 S100")
+        # Both halves are predicted, and felt, without the firmware's shaper.
+        self._add(*self._voice.shaper_off.decode().splitlines())
+        self._add(*self._voice.acceleration(self.accel_mm_s2).decode().splitlines())
+        travel = self._machine.travel["z"]
+        height_mm = min(max(travel.min_mm, 0.0) + _HEIGHT_MM, self._middle["z"])
+        self._add(f"G1 Z{height_mm:.3f} F{60 * self._z_mm_s:.0f}")
+        self._centre()
+        recorder = recorder_for(self._machine.firmware, self._settings)
+        self._add(*recorder.first())
+        for number in range(1, ROUNDS + 1):
+            begins = len(self._out)
+            seconds = 0.0
+            for axis in AXES:
+                self._add(f";TYPE:{region(axis, 'quiet')}")
+                self._creep(axis, _QUIET_S)
+                seconds += _QUIET_S
+            seconds += self._stops("off")
+            self._add("; STILLPATH_ON")
+            seconds += self._stops("on")
+            self._add("; STILLPATH_OFF", ";TYPE:end")
+            self._out[begins:begins] = recorder.before(number, seconds)
+            self._centre()
+            self._add(*recorder.after(seconds))
+        self._add(*recorder.last())
+        self._add(*(self._voice.shaper_on or b"").decode().splitlines())
+
+    def _stops(self, half: Literal["off", "on"]) -> float:
+        """Write a to and fro of each axis at every speed; return about how long it lasts.
+
+        X and Y take turns: were one behind the other, a clock that runs wrong could not be told
+        from an axis that is late.
+        """
+        seconds = 0.0
+        for k in range(len(_SPEEDS_MM_S)):
+            for axis in AXES:
+                speed = self.speeds_mm_s[axis][k]
+                length_mm = self._length_mm(speed)
+                for side in (1.0, -1.0):
+                    place = self._middle[axis] + side * 0.5 * length_mm
+                    rest_s = next(self._rests)
+                    self._add(f";TYPE:{region(axis, half)}")
+                    self._at_mm[axis] = place
+                    self._add(f"G1 {axis.upper()}{place:.3f} F{60 * speed:.0f}")
+                    self._add(f";TYPE:{region(axis, half + REST)}")
+                    self._creep(axis, side * rest_s)
+                    seconds += length_mm / speed + speed / self.accel_mm_s2 + rest_s
+        return seconds
+
+    def _creep(self, axis: Axis, seconds: float) -> None:
+        """Let the other axis creep, backwards for negative times."""
+        other: Axis = "y" if axis == "x" else "x"
+        self._at_mm[other] += _CREEP_MM_S * seconds
+        place = self._at_mm[other]
+        self._add(f"G1 {other.upper()}{place:.3f} F{60 * _CREEP_MM_S:.0f}")
+
+    def _speeds(self, mode: RingingMode, axis: Axis) -> tuple[float, ...]:
+        """Return speeds near those wanted, within the limits, at which the axis rings most."""
+        travel = self._machine.travel[axis]
+        room_mm = travel.max_mm - travel.min_mm - 2 * _MARGIN_MM
+        fastest = min(
+            self._machine.firmware.fastest_mm_s, math.sqrt(room_mm * self.accel_mm_s2 / _CRUISE)
+        )
+        if room_mm < _SHORTEST_MM or fastest < 0.5 * _SPEEDS_MM_S[0]:
+            raise ModelError(
+                f"the ring test moves {axis} by {_SHORTEST_MM:g} mm at least, at "
+                f"{0.5 * _SPEEDS_MM_S[0]:g} mm/s: its travel of {room_mm:.0f} mm (with a margin) "
+                f"allows {fastest:.0f} mm/s; correct the machine's travel or its limits"
+            )
+        out = []
+        for wanted in _SPEEDS_MM_S:
+            tried = np.linspace(1.0 - _NEAR, 1.0 + _NEAR, 13) * wanted
+            tried = np.minimum(tried, fastest)
+            rings = [mode.ringing_um(v, self.accel_mm_s2) for v in tried]
+            out.append(round(float(tried[int(np.argmax(rings))]), 1))
+        return tuple(out)
+
+    def _length_mm(self, speed_mm_s: float) -> float:
+        return max(_CRUISE * speed_mm_s**2 / self.accel_mm_s2, _SHORTEST_MM)
+
+    def _centre(self) -> None:
+        x, y = self._middle["x"], self._middle["y"]
+        self._at_mm = {"x": x, "y": y}
+        self._add(f"G1 X{x:.3f} Y{y:.3f} F{60 * self._travel_mm_s:.0f}")
+        self._add(f"G4 P{1e3 * _REST_S[0]:.0f}")
+
+    def _add(self, *lines: str) -> None:
+        self._out.extend(lines)
+
+
+def write_ring_test(
+    machine: Machine,
+    target: Path,
+    settings: RingSettings | None = None,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+) -> ProofPrint:
+    """Write the ring test for a machine, half of it compensated. Less than two minutes.
+
+    Parameters
+    ----------
+    machine : Machine
+    target : Path
+        Written whole or not at all.
+    settings : RingSettings, optional
+    cache_dir, progress
+        As of `pipeline.compensate.compensate_file`.
+
+    Raises
+    ------
+    ModelError
+        The travel is too small, or an axis does not ring.
+    DesignError, GcodeError
+        As of `pipeline.compensate.compensate_file`.
+    """
+    settings = settings or RingSettings()
+    program = RingTest(machine, settings)
+
+    def legend(_: dict[str, Ringing], result: Result) -> list[str]:
+        recorder = recorder_for(machine.firmware, settings)
+        speeds = {a.upper(): " ".join(f"{v:g}" for v in program.speeds_mm_s[a]) for a in AXES}
+        return [
+            f"{TITLE}{machine.title} (model {machine.revision})",
+            "Nothing is printed, nothing is heated: the head stops dead from "
+            + ", ".join(f"{v} mm/s in {a}" for a, v in speeds.items())
+            + f" at {program.accel_mm_s2:g} mm/s2,",
+            "half of the times as planned, half compensated. Do not touch machine or table.",
+            *recorder.instruction,
+            ", ".join(plants_line(a, plants_digest(machine.axes[a])) for a in AXES),
+            f"Time {result.time_s:.0f} s without homing.",
+        ]
+
+    return write_proof(program, machine, target, legend, cache_dir=cache_dir, progress=progress)
+
+
+def region(axis: Axis, part: str) -> str:
+    """Return the name of a part of the file, one of `PARTS`."""
+    return f"ring {axis} {part}"
+
+
+def plants_line(axis: Axis, digest: str) -> str:
+    """Return what the file's first lines say of the plants of an axis."""
+    return f"plants of {axis}: {digest}"
+
+
+def _rests() -> Iterator[float]:
+    """Rests of which no two are alike."""
+    low, high = _REST_S
+    share = 0.0
+    while True:
+        share = (share + _GOLDEN) % 1.0
+        yield low + (high - low) * share

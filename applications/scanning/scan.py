@@ -1,0 +1,334 @@
+"""A hatch file on a scanner: its command with a prefilter, and what each track is left with.
+
+Variants of the prediction, all with the same disturbance: the path as sent, behind the prefilter,
+and with the add-on controller too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.applications.controllers.loading import LoadedController
+from stillpath.applications.controllers.options import Disturbance
+from stillpath.applications.controllers.response import answer, disturbance_of, told
+from stillpath.applications.scanning.figures import ScanReport, TrackFigures, VariantFigures
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.feedback.preview_command import preview_command
+from stillpath.compensation.feedback.zero_phase import design_prefilter
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.hatches import Hatches, ScanSamples, Timing, read_hatches, sample_hatches
+from stillpath.models.diagrams import Block
+from stillpath.models.disturbances import sample
+from stillpath.models.loops import Loop, LoopSpec
+from stillpath.simulation.closed_loop import simulate
+from stillpath.simulation.scanning import TrackErrors, track_errors
+from stillpath.version import __version__
+
+__all__ = ["Prefiltering", "Scan", "ScanSettings", "scan_file"]
+
+Array = NDArray[np.float64]
+Prefiltering = Literal["zpetc", "fbf", "none"]
+
+_LARGEST_FILE = 64 << 20
+_LONGEST_WARM_UP = 200_000
+_FIR_SAMPLES = 5
+_SEED = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ScanSettings:
+    """How a file is drawn.
+
+    Attributes
+    ----------
+    um_per_unit : float, optional
+        How far the beam moves on the work per unit of the machine; needed unless that is mm or um.
+    prefilter : "zpetc", "fbf" or "none"
+    cutoff_hz : float, optional
+        Of a zero-phase low-pass behind zpetc.
+    timing : Timing
+    disturbance : optional
+        In the machine's unit. Left out, the controller's own, scaled to `disturbance_um`.
+    enters : "output" or "input", optional
+    disturbance_um : float
+        rms that it leaves at the output without an add-on.
+    """
+
+    um_per_unit: float | None = None
+    prefilter: Prefiltering = "zpetc"
+    cutoff_hz: float | None = None
+    timing: Timing = field(default_factory=Timing)
+    disturbance: Disturbance | None = None
+    enters: Literal["output", "input"] | None = None
+    disturbance_um: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """A scan: its figures, and the command.
+
+    Attributes
+    ----------
+    report : ScanReport
+    t_s : ndarray, shape (n,)
+    command : ndarray, shape (2, n)
+        References of both axes in the machine's unit.
+    track : ndarray of int64, shape (n,)
+        Number of the track, -1 with the beam off.
+    """
+
+    report: ScanReport
+    t_s: Array
+    command: Array
+    track: NDArray[np.int64]
+
+
+def scan_file(
+    source: Path,
+    spec: LoopSpec,
+    settings: ScanSettings,
+    controller: LoadedController | None = None,
+) -> Scan:
+    """Make the command of a hatch file and predict every track; both axes are alike.
+
+    Raises
+    ------
+    GcodeError
+        If the file cannot be read as hatches, or is too long.
+    DesignError
+        If the prefilter cannot be designed, or the controller is one for another machine.
+    ModelError
+        If the machine or its disturbance is not valid.
+    """
+    loop = spec.nominal()
+    scale = _scale(spec, settings)
+    if controller is not None and _machine(controller.spec) != _machine(spec):
+        raise DesignError(
+            f"the controller was designed for {controller.spec.name!r}, not for the loop of "
+            f"{spec.name!r}; design it anew"
+        )
+    hatches = read_hatches(_text(source))
+    samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, settings.timing), hatches)
+    wanted = 1e3 * samples.xy_mm
+    prefilter = _Prefilter(loop, settings)
+    command = np.array([prefilter.apply(axis) for axis in wanted])
+    warm_up = 0 if controller is None else min(controller.settling, _LONGEST_WARM_UP)
+    disturbed = _disturbance(loop, spec, settings, controller, warm_up + wanted.shape[1], scale)
+    plain = _Drive(loop, spec, (), 1, disturbed, warm_up)
+    outputs = {"sent": ("as sent", plain.run(wanted, wanted))}
+    if settings.prefilter != "none":
+        outputs["prefilter"] = (prefilter.label, plain.run(command, wanted))
+    if controller is not None:
+        blocks = _expecting(controller.blocks, loop, controller.every)
+        added = _Drive(loop, spec, blocks, controller.every, disturbed, warm_up)
+        label = f"{prefilter.label} and {controller.method}".removeprefix("none and ")
+        outputs["add-on"] = (label, added.run(command, wanted))
+    errors = {
+        name: (label, track_errors(wanted, y, samples.track))
+        for name, (label, y) in outputs.items()
+    }
+    notes = tuple(f"{name} means nothing to a scanner: passed over" for name in hatches.passed_over)
+    report = ScanReport(
+        version=__version__,
+        source=source.name,
+        machine=spec.name,
+        title=spec.title,
+        unit=spec.unit,
+        um_per_unit=scale,
+        rate_hz=1.0 / loop.dt_s,
+        prefilter=prefilter.label,
+        preview_samples=prefilter.preview,
+        peak_gain=prefilter.peak,
+        controller=None if controller is None else controller.method,
+        disturbance=None if disturbed is None else disturbed.told,
+        enters=None if disturbed is None else disturbed.enters,
+        duration_s=len(samples.t_s) * loop.dt_s,
+        drawn_s=float(np.sum(samples.track >= 0)) * loop.dt_s,
+        drawn_mm=float(np.sum(np.hypot(*(hatches.end_mm - hatches.start_mm).T)[hatches.beam])),
+        variants=tuple(_variant(name, *found) for name, found in errors.items()),
+        tracks=_tracks(hatches, rows, {name: found for name, (_, found) in errors.items()}),
+        notes=notes,
+    )
+    return Scan(report, samples.t_s, command / scale, samples.track)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Disturbed:
+    d_um: Array
+    enters: str
+    told: str
+
+
+class _Prefilter:
+    """From the wanted path to the reference, with what the report says about it."""
+
+    def __init__(self, loop: Loop, settings: ScanSettings) -> None:
+        self._loop = loop
+        self.label: str = settings.prefilter
+        self.preview, self.peak = 0, None
+        self._filter = None
+        if settings.cutoff_hz is not None and settings.prefilter != "zpetc":
+            raise DesignError("a cutoff belongs to the prefilter zpetc")
+        if settings.prefilter == "zpetc":
+            half = 1 if settings.cutoff_hz is None else _FIR_SAMPLES
+            self._filter = design_prefilter(loop, cutoff_hz=settings.cutoff_hz, length=half)
+            self.preview, self.peak = self._filter.preview, self._filter.peak.value
+        elif settings.prefilter == "fbf":
+            self.preview = 64
+
+    def apply(self, wanted: Array) -> Array:
+        if self._filter is not None:
+            return self._filter.apply(wanted)
+        if self.label == "fbf":
+            return preview_command(self._loop, wanted)
+        return wanted
+
+
+class _Drive:
+    """A loop with an add-on that has settled against the disturbance before the scan begins."""
+
+    def __init__(
+        self,
+        loop: Loop,
+        spec: LoopSpec,
+        blocks: Sequence[Block],
+        every: int,
+        disturbed: _Disturbed | None,
+        warm_up: int,
+    ) -> None:
+        self._loop, self._spec, self._blocks = loop, spec, blocks
+        self._every, self._disturbed, self._warm_up = every, disturbed, warm_up
+
+    def run(self, reference: Array, wanted: Array) -> Array:
+        """Return the output, shape (2, n), of a machine that stands where the path begins."""
+        return np.array(
+            [self._axis(r - r[0]) + y_d[0] for r, y_d in zip(reference, wanted, strict=True)]
+        )
+
+    def _axis(self, r: Array) -> Array:
+        inputs = {"r": np.repeat(np.pad(r, (self._warm_up, 0)), self._every)}
+        if self._disturbed is not None:
+            place = "d_out" if self._disturbed.enters == "output" else "d_in"
+            inputs[place] = np.repeat(self._disturbed.d_um, self._every)
+        y = simulate(self._loop, self._blocks, inputs, every=self._every, sensor=self._spec.sensor)[
+            "y"
+        ]
+        return y[:: self._every][self._warm_up :]
+
+
+def _expecting(blocks: Sequence[Block], loop: Loop, every: int) -> tuple[Block, ...]:
+    """Make an add-on compare the output with what the reference leads to, not with itself.
+
+    A plug-in on the control error would take a prefilter's reference, which runs ahead, for an
+    error.
+    """
+    compared = [b for b in blocks if ("ym", 1.0) in b.inputs and ("r", -1.0) in b.inputs]
+    if not compared:
+        return tuple(blocks)
+    expected = Block("expected", (("r", 1.0),), loop.tracking_num, loop.t0_den, every=every)
+    changed = [
+        replace(b, inputs=tuple(("expected" if name == "r" else name, g) for name, g in b.inputs))
+        if b in compared
+        else b
+        for b in blocks
+    ]
+    return (expected, *changed)
+
+
+def _machine(spec: LoopSpec) -> tuple[object, object]:
+    """Return what a controller is made for, apart from names."""
+    return spec.loop, spec.sensor
+
+
+def _scale(spec: LoopSpec, settings: ScanSettings) -> float:
+    scale = settings.um_per_unit or {"mm": 1e3, "um": 1.0, "µm": 1.0}.get(spec.unit)
+    if scale is None:
+        raise DesignError(
+            f"the machine's unit is {spec.unit!r}: say how far the beam moves per {spec.unit} "
+            "(--um-per-unit)"
+        )
+    if not (math.isfinite(scale) and scale > 0):
+        raise DesignError(f"{scale:g} um per {spec.unit}: it must be above 0")
+    return scale
+
+
+def _text(source: Path) -> str:
+    size = source.stat().st_size
+    if size > _LARGEST_FILE:
+        raise GcodeError(f"the file has {size} bytes, up to {_LARGEST_FILE} are read: give a layer")
+    return source.read_text(encoding="utf-8", errors="replace")
+
+
+def _numbered(
+    samples: ScanSamples, hatches: Hatches
+) -> tuple[ScanSamples, list[NDArray[np.int64]]]:
+    """Count the tracks that have samples from 0 on; return the moves of each too."""
+    kept, numbers = np.unique(samples.track, return_inverse=True)
+    first = int(kept[0] < 0)
+    if len(kept) == first:
+        raise GcodeError("no track is long enough for a sample; is F in mm/min?")
+    tracks = hatches.tracks()
+    rows = [np.flatnonzero(tracks == number) for number in kept[first:]]
+    return replace(samples, track=numbers - first), rows
+
+
+def _disturbance(
+    loop: Loop,
+    spec: LoopSpec,
+    settings: ScanSettings,
+    controller: LoadedController | None,
+    count: int,
+    scale: float,
+) -> _Disturbed | None:
+    generator = np.random.default_rng(_SEED)
+    if settings.disturbance is not None:
+        d = scale * sample(settings.disturbance, count, loop.dt_s, generator)
+        return _Disturbed(d, settings.enters or "output", told(settings.disturbance))
+    if controller is None or settings.disturbance_um == 0:
+        return None
+    kind, enters = disturbance_of(controller.options, loop)
+    enters = settings.enters or enters
+    d = sample(kind, count, loop.dt_s, generator)
+    left = answer(loop, (), d, enters, sensor=spec.sensor)["y"]
+    rms = float(np.sqrt(np.mean(left[count // 4 :] ** 2)))
+    if rms == 0:
+        raise DesignError("the controller's disturbance does not reach the output; give another")
+    return _Disturbed(d * settings.disturbance_um / rms, enters, told(kind))
+
+
+def _variant(name: str, label: str, found: TrackErrors) -> VariantFigures:
+    return VariantFigures(
+        name=name,
+        label=label,
+        rms_um=found.total_rms,
+        largest_um=found.total_largest,
+        across_um=found.total_across,
+    )
+
+
+def _tracks(
+    hatches: Hatches, rows: Sequence[NDArray[np.int64]], errors: dict[str, TrackErrors]
+) -> tuple[TrackFigures, ...]:
+    out = []
+    for k, moves in enumerate(rows):
+        corners = np.concatenate([hatches.start_mm[moves[:1]], hatches.end_mm[moves]])
+        out.append(
+            TrackFigures(
+                line=int(hatches.line[moves[0]]),
+                last_line=int(hatches.line[moves[-1]]),
+                length_mm=float(np.sum(np.hypot(*np.diff(corners, axis=0).T))),
+                x_mm=tuple(corners[:, 0].tolist()),
+                y_mm=tuple(corners[:, 1].tolist()),
+                rms_um={name: float(e.rms[k]) for name, e in errors.items()},
+                largest_um={name: float(e.largest[k]) for name, e in errors.items()},
+                across_um={name: float(e.across[k]) for name, e in errors.items()},
+            )
+        )
+    return tuple(out)

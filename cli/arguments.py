@@ -1,0 +1,127 @@
+"""Arguments and options that several commands have, and the checks of what they are given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from stillpath.pipeline.options import Options
+
+__all__ = [
+    "METHODS",
+    "DialectOption",
+    "Input",
+    "MachineOption",
+    "MaxMbOption",
+    "PlateOption",
+    "Refused",
+    "ReportOption",
+    "WhereOption",
+    "check_folder",
+    "check_input",
+    "check_output",
+    "chosen_options",
+]
+
+METHODS = (
+    "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
+    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
+    "it undoes the machine's ripple too; or advise: leave all moves as they are and add firmware "
+    "commands for shaper and acceleration"
+)
+"""The methods of `compensate`, in words."""
+
+Input = Annotated[
+    Path, typer.Argument(metavar="IN", help="The sliced file: .gcode, .bgcode or .gcode.3mf.")
+]
+PlateOption = Annotated[
+    int | None,
+    typer.Option("--plate", metavar="N", min=1, help="Which plate of a .gcode.3mf with several."),
+]
+MachineOption = Annotated[
+    str,
+    typer.Option("--machine", "-m", help="A name of `stillpath machines`, or a JSON file's path."),
+]
+DialectOption = Annotated[
+    str | None,
+    typer.Option(
+        "--dialect",
+        metavar="NAME",
+        help="How the file is read: klipper, marlin, prusa, bambu or reprapfirmware. [default: "
+        "as the machine's firmware reads it]",
+    ),
+]
+ReportOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--report", metavar="DIR", help="Folder for report.html and .json, layers.json and .bin."
+    ),
+]
+
+
+WhereOption = Annotated[
+    str,
+    typer.Option(
+        help="What is compensated: all, visible (outer walls, top and bottom surfaces) or walls "
+        "(outer ones). The rest stays as sliced, and the file is smaller."
+    ),
+]
+MaxMbOption = Annotated[
+    float | None,
+    typer.Option(
+        "--max-mb",
+        metavar="MB",
+        help="The most that the written G-code may have: compensate less, down to the walls, until "
+        "it fits.",
+    ),
+]
+
+
+class Refused(Exception):
+    """The request cannot be met as it was put."""
+
+
+def check_input(source: Path) -> None:
+    """Refuse what cannot be read as a file, and twice."""
+    if source.is_dir():
+        raise Refused(f"{source} is a folder, not a G-code file")
+    if not source.exists():
+        raise Refused(f"there is no file {source}")
+    if not source.is_file():
+        # The road reads a file twice, and opening a pipe waits for somebody to write.
+        raise Refused(f"{source} is a pipe or a device; save it as a file first")
+
+
+def check_output(target: Path) -> Path:
+    """Refuse a place that cannot be written, before anything is computed; return it resolved."""
+    if target.is_dir():
+        raise Refused(f"{target} is a folder; name the file to write")
+    if target.exists() and not target.is_file():
+        raise Refused(f"{target} is a pipe or a device; name a file to write")
+    # A link is followed, so that what it points to is replaced and not the link.
+    target = target.resolve()
+    if not target.parent.is_dir():
+        raise Refused(f"the folder {target.parent} does not exist; make it first")
+    return target
+
+
+def check_folder(folder: Path | None) -> None:
+    """Refuse a folder for a report that is a file."""
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise Refused(f"--report {folder} is a file; name a folder")
+
+
+def chosen_options(**given: Any) -> Options:
+    """Return the options of a job; those given as None have their defaults."""
+    from pydantic import ValidationError
+
+    from stillpath.pipeline.options import Options
+    from stillpath.service.wrong_options import wrong_option
+
+    try:
+        return Options(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        raise Refused(wrong_option(error)) from None

@@ -1,0 +1,230 @@
+"""`stillpath batch` and `stillpath watch`. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stillpath.cli.arguments import MaxMbOption, WhereOption, chosen_options
+from stillpath.models.errors import ModelError
+
+if TYPE_CHECKING:
+    from stillpath.cli.batch.output import Outcome, OutputFolder
+    from stillpath.cli.batch.worker_pool import Crew
+
+__all__ = ["register"]
+
+_AT_A_SERVER = 8
+
+Machine = Annotated[
+    str | None,
+    typer.Option("--machine", "-m", help="A machine, or a group: names separated by commas."),
+]
+Map = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--machine-map",
+        metavar="PATTERN=M",
+        help="Machine or group of the files that fit a pattern, like 'petg_*=mk4'; the first that "
+        "fits counts. May be given several times.",
+    ),
+]
+OutputOption = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for results and reports.")
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1, max=64, help="Files at a time. [default: one per processor; with --server 8]"
+    ),
+]
+Server = Annotated[
+    str | None, typer.Option(metavar="URL", help="Let a Stillpath server do it. [STILLPATH_SERVER]")
+]
+Key = Annotated[str | None, typer.Option(metavar="KEY", help="Key of the server. [STILLPATH_KEY]")]
+Method = Annotated[str, typer.Option(help="See `stillpath compensate --help`; so for all below.")]
+Along = Annotated[float | None, typer.Option(help="Weight of errors along the path.")]
+Tolerance = Annotated[float | None, typer.Option(help="Of the written path. [default: 2]")]
+Budget = Annotated[float | None, typer.Option(help="As fast as this contour error allows.")]
+Dialect = Annotated[str | None, typer.Option(metavar="NAME", help="How files are read.")]
+KeepTimes = Annotated[bool, typer.Option("--keep-times", help="Leave the slicer's times.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add batch and watch to a command line."""
+    for command in (batch, watch):
+        app.command()(command)
+
+
+def batch(
+    sources: Annotated[
+        list[Path], typer.Argument(metavar="FILES|FOLDERS", help="Folders are searched through.")
+    ],
+    output: OutputOption,
+    machine: Machine = None,
+    machine_map: Map = None,
+    jobs: Jobs = None,
+    server: Server = None,
+    key: Key = None,
+    method: Method = "fbf",
+    basis: str = "ce-opt",
+    robust: str = "auto",
+    along: Along = None,
+    tolerance_um: Tolerance = None,
+    budget_um: Budget = None,
+    where: WhereOption = "all",
+    max_mb: MaxMbOption = None,
+    dialect: Dialect = None,
+    keep_times: KeepTimes = False,
+) -> None:
+    """Compensate many files, with one summary.
+
+    Goes on after a file that cannot be done. What was done before is not done again. Exit code 0
+    if all are done, 2 if a file or machine is at fault, 1 if the computer or the server is.
+    """
+    from stillpath.cli.batch.batch import run_batch
+    from stillpath.cli.batch.items import items_of, parse_map
+    from stillpath.cli.batch.summary import print_summary, write_summary
+    from stillpath.service.interruption import Interrupted
+
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        where=where,
+        max_mb=max_mb,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
+    items = items_of(sources, parse_map(machine, machine_map or []), output=output)
+    outcomes: list[Outcome] = []
+
+    def tell(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        _line(outcome, f"{len(outcomes)} of {len(items)}")
+
+    try:
+        with _at_work(output, options, jobs, server, key) as (crew, folder, check):
+            outcomes = run_batch(crew, folder, items, tell=tell, check=check)
+            write_summary(outcomes, output)
+    except Interrupted as interruption:
+        sys.stderr.write(
+            f"stillpath: interrupted; {len(outcomes)} of {len(items)} are over, and the same "
+            "command goes on with the rest\n"
+        )
+        raise SystemExit(interruption.exit_code) from None
+    print_summary(outcomes)
+    typer.echo(f"summary: {output / 'summary.html'}, .json, .csv")
+    troubles = {outcome.trouble for outcome in outcomes if outcome.state == "failed"}
+    if troubles:
+        raise typer.Exit(1 if "computer" in troubles else 2)
+
+
+def watch(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", exists=True, file_okay=False)],
+    output: OutputOption,
+    machine: Machine = None,
+    machine_map: Map = None,
+    jobs: Jobs = None,
+    server: Server = None,
+    key: Key = None,
+    settle_s: Annotated[
+        float, typer.Option(min=0.1, help="A file is complete when unchanged for so long.")
+    ] = 2.0,
+    every_s: Annotated[
+        float,
+        typer.Option(min=0.5, help="Look so often where changes are not told, as on shares."),
+    ] = 10.0,
+    method: Method = "fbf",
+    basis: str = "ce-opt",
+    robust: str = "auto",
+    along: Along = None,
+    tolerance_um: Tolerance = None,
+    budget_um: Budget = None,
+    where: WhereOption = "all",
+    max_mb: MaxMbOption = None,
+    dialect: Dialect = None,
+    keep_times: KeepTimes = False,
+) -> None:
+    """Compensate what arrives in a folder, until interrupted.
+
+    Why a file could not be done stands beside it, in NAME.error.txt.
+    """
+    from stillpath.cli.batch.items import parse_map
+    from stillpath.cli.batch.watching import Watcher, run_watch
+    from stillpath.service.interruption import Interrupted
+
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        where=where,
+        max_mb=max_mb,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
+    group = parse_map(machine, machine_map or [])
+    if output.resolve() == folder.resolve():
+        raise ModelError(f"--output {output} is the watched folder; name one in it or elsewhere")
+    with _at_work(output, options, jobs, server, key) as (crew, kept, check):
+        watcher = Watcher(folder, group, crew, kept, settle_s=settle_s, tell=_line)
+        sys.stderr.write(f"stillpath: watching {folder}\n")
+        try:
+            run_watch(watcher, folder, every_s=every_s, check=check)
+        except Interrupted:
+            sys.stderr.write("stillpath: stopped; what was begun is done at the next start\n")
+
+
+@contextmanager
+def _at_work(
+    output: Path, options: Any, jobs: int | None, server: str | None, key: str | None
+) -> Iterator[tuple[Crew, OutputFolder, Any]]:
+    """Yield a crew, its output folder, and a check to call now and then."""
+    from stillpath.cli.batch.output import OutputFolder
+    from stillpath.cli.batch.worker_pool import Here, Works, crew
+    from stillpath.cli.machines import open_machines
+    from stillpath.service.interruption import interruptible
+
+    server = server or os.environ.get("STILLPATH_SERVER")
+    works: Works
+    if server is None:
+        jobs = jobs or os.cpu_count() or 1
+        works = Here(open_machines(), options, jobs)
+    else:
+        from stillpath.cli.batch.server import There, batch_name
+        from stillpath.service.client import Client, ClientError
+
+        jobs = jobs or _AT_A_SERVER
+        try:
+            client = Client(server, key or os.environ.get("STILLPATH_KEY"))
+            works = There(client, options, batch_name(output))
+        except ClientError as error:
+            sys.stderr.write(f"stillpath: error: {error}\n")
+            raise SystemExit(error.exit_code) from None
+    with (
+        interruptible() as check,
+        OutputFolder.opened(output) as folder,
+        crew(works, folder, options, jobs) as made,
+    ):
+        yield made, folder, check
+
+
+def _line(outcome: Outcome, count: str = "") -> None:
+    """Tell an outcome in one line on stderr."""
+    what = outcome.error or outcome.output
+    name = Path(outcome.source).name
+    machine = f" for {outcome.machine}" if outcome.machine else ""
+    sys.stderr.write(f"{count + ': ' if count else ''}{name}{machine}: {outcome.state}: {what}\n")
+    sys.stderr.flush()

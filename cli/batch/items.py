@@ -1,0 +1,171 @@
+"""What is to be done: which file for which machines, and what the result is called."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stillpath.models.errors import ModelError
+
+__all__ = ["Group", "Item", "is_print_file", "is_stamped", "items_of", "parse_map", "result_name"]
+
+_SUFFIXES = (".gcode", ".gco", ".g", ".nc", ".bgcode", ".bgc", ".3mf")
+_STAMP = b"; Processed by stillpath "
+_SEARCHED_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One file for one machine.
+
+    Attributes
+    ----------
+    source : Path
+    place : str
+        The file's name, below the folder that was named if one was: ``plates/part.gcode``.
+    machine : str
+        A name, or the path of a JSON file; empty if no machine was chosen for this file.
+    """
+
+    source: Path
+    place: str
+    machine: str
+
+    def output(self, machine: str) -> str:
+        """Return where the result lies below the output folder, by the machine's own name."""
+        return f"{machine}/{result_name(self.place)}"
+
+    def report(self, machine: str) -> str:
+        """Return the folder of the report below the output folder."""
+        return f"reports/{machine}/{self.place}"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Which machines a file is for.
+
+    Attributes
+    ----------
+    machines : tuple of str
+        For every file that no pattern fits.
+    map : tuple of (pattern, machines)
+        The first pattern (as in a shell) that fits the file's place or name goes before.
+    """
+
+    machines: tuple[str, ...] = ()
+    map: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def of(self, place: str) -> tuple[str, ...]:
+        """Return the machines for a file; one empty name if there are none."""
+        name = place.rpartition("/")[2]
+        for pattern, machines in self.map:
+            if fnmatch.fnmatch(place, pattern) or fnmatch.fnmatch(name, pattern):
+                return machines
+        return self.machines or ("",)
+
+
+def parse_map(machine: str | None, entries: Sequence[str]) -> Group:
+    """Read ``--machine`` and ``--machine-map``; names are separated by commas.
+
+    Raises
+    ------
+    ModelError
+    """
+    found = []
+    for entry in entries:
+        pattern, equals, names = entry.rpartition("=")
+        if not equals or not pattern or not _names(names):
+            raise ModelError(f"--machine-map {entry!r}: write PATTERN=MACHINE, say 'pla_*=ender3'")
+        found.append((pattern, _names(names)))
+    if machine is None and not found:
+        raise ModelError("name a machine with --machine, or several by --machine-map PATTERN=NAME")
+    return Group(_names(machine or ""), tuple(found))
+
+
+def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Item]:
+    """Return what files and folders stand for, each file once and for each of its machines.
+
+    Folders are searched through. What lies in the output folder, is hidden, is no print file by
+    its name, or was written by us, is passed over there; a file that was named is always tried.
+
+    Raises
+    ------
+    FileNotFoundError
+    ModelError
+        Two files would have the same result.
+    """
+    items: list[Item] = []
+    places: dict[str, Path] = {}
+    seen: set[Path] = set()
+    for source in sources:
+        if not source.exists():
+            raise FileNotFoundError(2, "there is no such file or folder", str(source))
+        found = _below(source, output) if source.is_dir() else [(source, source.name)]
+        for path, place in found:
+            if path.resolve() in seen:
+                continue
+            seen.add(path.resolve())
+            other = places.setdefault(result_name(place).casefold(), path)
+            if other is not path:
+                raise ModelError(
+                    f"{other} and {path} would both become {result_name(place)}; name the folder "
+                    "above them instead, or rename one"
+                )
+            items += [Item(path, place, machine) for machine in group.of(place)]
+    return items
+
+
+def is_print_file(path: Path) -> bool:
+    """Return whether a file in a folder is to be done, by its name."""
+    name = path.name.lower()
+    return (
+        name.endswith(_SUFFIXES)
+        and not name.startswith(".")
+        and ".stillpath." not in name
+        and path.is_file()
+    )
+
+
+def is_stamped(path: Path) -> bool:
+    """Return whether we wrote a file; False for what cannot be read."""
+    from stillpath.gcode.containers.opening import open_text
+    from stillpath.gcode.errors import GcodeError
+
+    try:
+        with open_text(path) as container:
+            size = container.text.seek(0, 2)
+            for start in (0, max(size - _SEARCHED_BYTES, 0)):
+                container.text.seek(start)
+                if _STAMP in container.text.read(_SEARCHED_BYTES):
+                    return True
+    except (GcodeError, OSError):
+        return False
+    return False
+
+
+def result_name(name: str) -> str:
+    """Return what the result of a file is called: ``part.stillpath.gcode``.
+
+    Printers tell a sliced package by both of its suffixes.
+    """
+    path = Path(name)
+    suffix = ".gcode.3mf" if name.lower().endswith(".gcode.3mf") else path.suffix
+    return f"{name[: len(name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+
+
+def _below(folder: Path, output: Path) -> Iterator[tuple[Path, str]]:
+    kept_out = output.resolve()
+    for path in sorted(folder.rglob("*")):
+        inside = path.relative_to(folder)
+        if any(part.startswith(".") for part in inside.parts):
+            continue
+        if not is_print_file(path) or path.resolve().is_relative_to(kept_out):
+            continue
+        if not is_stamped(path):
+            yield path, inside.as_posix()

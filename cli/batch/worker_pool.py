@@ -1,0 +1,229 @@
+"""Does items beside each other, on this computer or a server, and keeps what was made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from stillpath.cli.batch.items import Item
+from stillpath.cli.batch.local_workers import Failure, Lane, Made, Stopped, Task, failure_of
+from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch, sha256_of
+from stillpath.version import __version__
+
+if TYPE_CHECKING:
+    from stillpath.applications.machines.resolve import PinnedMachine, Resolver
+    from stillpath.pipeline.options import Options
+
+__all__ = ["Crew", "Found", "Here", "Settled", "Works", "crew"]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A machine as the works know it: its own name, and the digest of its document."""
+
+    name: str
+    revision: str
+    pinned: PinnedMachine | None = None
+
+
+class Works(Protocol):
+    """Where files are compensated."""
+
+    @property
+    def version(self) -> str:
+        """Version of the program that does it."""
+
+    def machine(self, name: str) -> Found:
+        """Return a machine that may be used now.
+
+        Raises
+        ------
+        ModelError
+            There is none, or it is not approved.
+        """
+
+    def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
+        """Make result and report in `scratch`.
+
+        Raises
+        ------
+        Failure, Stopped, and the errors that `failure_of` knows
+        """
+
+    def close(self) -> None:
+        """End what was started."""
+
+
+class Here:
+    """Works of this computer.
+
+    Parameters
+    ----------
+    machines : Resolver
+    options : Options
+    jobs : int
+        Processes.
+    """
+
+    version = __version__
+
+    def __init__(self, machines: Resolver, options: Options, jobs: int) -> None:
+        self._machines = machines
+        self._options = options
+        self._lanes = [Lane() for _ in range(jobs)]
+        self._free: queue.SimpleQueue[Lane] = queue.SimpleQueue()
+        for lane in self._lanes:
+            self._free.put(lane)
+
+    def machine(self, name: str) -> Found:
+        """See `Works`."""
+        found = self._machines.for_job(name, files=True)
+        return Found(found.machine.name, found.machine.revision, found)
+
+    def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
+        """See `Works`."""
+        pinned = machine.pinned
+        assert pinned is not None
+        task = Task(
+            source, scratch.result, scratch.report, pinned.machine, self._options, pinned.warnings
+        )
+        lane = self._free.get()
+        try:
+            return lane.do(task, stopping)
+        finally:
+            self._free.put(lane)
+
+    def close(self) -> None:
+        """See `Works`."""
+        for lane in self._lanes:
+            lane.end()
+
+
+Settled = Callable[[Item, Outcome, Outcome], bool]
+"""Whether a recorded outcome (second) settles an item, given what it would be now (first)."""
+
+
+class Crew:
+    """Does items in threads; each waits for a process of this computer or for a server."""
+
+    def __init__(self, works: Works, output: OutputFolder, options: Options, jobs: int) -> None:
+        self._works = works
+        self._output = output
+        self._options = options.model_dump_json()
+        self._stopping = threading.Event()
+        self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="farm")
+
+    def add(self, item: Item, settled: Settled) -> Future[Outcome]:
+        """Do an item when its turn comes; the future raises `Stopped` at most."""
+        return self._threads.submit(self._do, item, settled)
+
+    def stop(self) -> None:
+        """Break off what is being done, begin nothing new, and wait until it is quiet."""
+        self._stopping.set()
+        self._threads.shutdown(cancel_futures=True)
+        self._works.close()
+
+    def _do(self, item: Item, settled: Settled) -> Outcome:
+        if self._stopping.is_set():
+            raise Stopped
+        began = time.monotonic()
+        outcome = Outcome(state="failed", source=_shown(item.source), machine=item.machine)
+        try:
+            machine, outcome = self._planned(item)
+            known = self._output.recorded(outcome.output)
+            if known is not None and settled(item, outcome, known):
+                state = "failed" if known.state == "failed" else "done before"
+                return known.model_copy(update={"state": state, "source": outcome.source})
+            outcome = self._made(item, machine, outcome)
+        except Stopped:
+            raise
+        except Exception as error:
+            failure = error if isinstance(error, Failure) else failure_of(error)
+            outcome = outcome.model_copy(
+                update={
+                    "state": "failed",
+                    "error": " ".join(str(failure).split()),
+                    "trouble": failure.trouble,
+                }
+            )
+        return outcome.model_copy(update={"took_s": time.monotonic() - began})
+
+    def _planned(self, item: Item) -> tuple[Found, Outcome]:
+        """Return what the outcome will be, as far as it is known before the work."""
+        if _shown(item.source) != str(item.source):
+            raise Failure("its name is no valid text; rename it", "file")
+        if not item.machine:
+            raise Failure(
+                "no pattern of --machine-map fits, and there is no --machine for the rest",
+                "machine",
+            )
+        machine = self._works.machine(item.machine)
+        digest = sha256_of(item.source)
+        return machine, Outcome(
+            state="failed",
+            source=str(item.source),
+            machine=machine.name,
+            machine_revision=machine.revision,
+            version=self._works.version,
+            source_sha256=digest,
+            key=_key(digest, machine.revision, self._options, self._works.version),
+            output=item.output(machine.name),
+            report=item.report(machine.name),
+        )
+
+    def _made(self, item: Item, machine: Found, outcome: Outcome) -> Outcome:
+        if (self._output.root / outcome.output).resolve() == item.source.resolve():
+            raise Failure(
+                "the result would lie over the file itself; choose another --output", "file"
+            )
+        began = _signature(item.source)
+        scratch = self._output.scratch(outcome.output)
+        try:
+            made = self._works.do(item.source, scratch, machine, self._stopping)
+            if _signature(item.source) != began or sha256_of(item.source) != outcome.source_sha256:
+                raise Failure("it was changed while it was read; hand it in again", "computer")
+            done = outcome.model_copy(
+                update={
+                    "state": "done",
+                    "output_sha256": sha256_of(scratch.result),
+                    "figures": made.figures,
+                    "cpu_s": made.cpu_s,
+                }
+            )
+            self._output.keep(scratch, done)
+        except BaseException:
+            self._output.drop(scratch)
+            raise
+        return done
+
+
+@contextmanager
+def crew(works: Works, output: OutputFolder, options: Options, jobs: int) -> Iterator[Crew]:
+    """Yield a crew that is quiet when the block ends."""
+    made = Crew(works, output, options, jobs)
+    try:
+        yield made
+    finally:
+        made.stop()
+
+
+def _key(*parts: str) -> str:
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _signature(path: Path) -> tuple[int, int, int]:
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns, found.st_ino
+
+
+def _shown(path: Path) -> str:
+    return str(path).encode("utf-8", "surrogateescape").decode("utf-8", "replace")

@@ -1,0 +1,183 @@
+"""`stillpath compensate`, `simulate`. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stillpath.cli.arguments import (
+    METHODS,
+    DialectOption,
+    Input,
+    MachineOption,
+    MaxMbOption,
+    PlateOption,
+    Refused,
+    ReportOption,
+    WhereOption,
+    check_folder,
+    check_input,
+    check_output,
+    chosen_options,
+)
+from stillpath.cli.machines import open_machines
+from stillpath.cli.remote import KeyOption, ServerOption, compensate_on_server
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add compensate and simulate to a command line."""
+    for command in (compensate, simulate):
+        app.command()(command)
+
+
+def compensate(
+    source: Input,
+    machine: MachineOption,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="OUT", help="The file to write.")
+    ] = None,
+    in_place: Annotated[
+        bool, typer.Option("--in-place", help="Write over IN, as slicers ask of their scripts.")
+    ] = False,
+    method: Annotated[str, typer.Option(help=METHODS)] = "fbf",
+    basis: Annotated[
+        str, typer.Option(help="Basis of fbf: ce-opt, robust, bspline or dct.")
+    ] = "ce-opt",
+    robust: Annotated[
+        str,
+        typer.Option(
+            help="What fbf looks at: auto (all that explains the measurement, no more than that "
+            "bears), off (the nominal plant), ensemble or minimax (its set)."
+        ),
+    ] = "auto",
+    along: Annotated[
+        float | None,
+        typer.Option(
+            help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
+            "takes longer. [default: .09 with a set, else 1]"
+        ),
+    ] = None,
+    tolerance_um: Annotated[
+        float | None,
+        typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
+    ] = None,
+    where: WhereOption = "all",
+    max_mb: MaxMbOption = None,
+    budget_um: Annotated[
+        float | None,
+        typer.Option(
+            help="Contour error that every feature may have (rms, worst plant of the set): print "
+            "as fast as that allows. [default: keep all speeds]"
+        ),
+    ] = None,
+    plate: PlateOption = None,
+    dialect: DialectOption = None,
+    keep_times: Annotated[
+        bool,
+        typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),
+    ] = False,
+    report: ReportOption = None,
+    server: ServerOption = None,
+    key: KeyOption = None,
+) -> None:
+    """Write a compensated file, and print what was measured on it."""
+    if in_place == (output is not None):
+        raise Refused("give either -o OUT or --in-place")
+    options = chosen_options(
+        method=method,
+        basis=basis,
+        robust=robust,
+        along=along,
+        tolerance_um=tolerance_um,
+        budget_um=budget_um,
+        where=where,
+        max_mb=max_mb,
+        plate=plate,
+        dialect=dialect,
+        times="kept" if keep_times else None,
+    )
+    check_input(source)
+    target = check_output(output or source)
+    if output is not None and target.exists() and target.samefile(source):
+        raise Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
+    check_folder(report)
+    if server:
+        compensate_on_server(
+            source, target, machine, options, server=server, key=key, report=report
+        )
+        return
+    found = _machine(machine)
+
+    from stillpath.cli.console import print_result, progress_shown
+    from stillpath.pipeline.compensate import compensate_file
+
+    with progress_shown("stillpath") as progress:
+        result = compensate_file(
+            source, target, found.machine, options, progress=progress, layers=report
+        )
+    result.warnings.extend(found.warnings)
+    _write_report(result, report)
+    print_result(result)
+
+
+def simulate(
+    source: Input,
+    machine: MachineOption,
+    report: Annotated[
+        Path,
+        typer.Option(
+            "--report",
+            metavar="DIR",
+            help="Folder for report.html and .json, layers.json and .bin.",
+        ),
+    ],
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="With the compensation inside Klipper (klipper export)."),
+    ] = False,
+    plate: PlateOption = None,
+    dialect: DialectOption = None,
+) -> None:
+    """Report how far the nozzle will be from its path. No G-code is written."""
+    check_input(source)
+    check_folder(report)
+    read_as = chosen_options(dialect=dialect).dialect
+    found = _machine(machine)
+
+    from stillpath.cli.console import print_result, progress_shown
+    from stillpath.pipeline.compensate import simulate_file
+
+    found_filter = None
+    if live:
+        from stillpath.applications.live.design import filter_of
+
+        found_filter = filter_of(found.machine)
+    with progress_shown("stillpath") as progress:
+        result = simulate_file(
+            source,
+            found.machine,
+            plate=plate,
+            dialect=read_as,
+            progress=progress,
+            layers=report,
+            live=found_filter,
+        )
+    result.warnings.extend(found.warnings)
+    _write_report(result, report)
+    print_result(result)
+
+
+def _machine(name: str) -> Any:
+    """Find the machine for a job, with warnings about it."""
+    return open_machines().for_job(name, files=True)
+
+
+def _write_report(result: Any, folder: Path | None) -> None:
+    if folder is not None:
+        from stillpath.reports import write_report
+
+        write_report(result, folder)

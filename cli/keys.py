@@ -1,0 +1,212 @@
+"""`stillpath keys ...` and `stillpath audit`. They work on the database, running service or not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from stillpath.models.errors import ModelError
+
+if TYPE_CHECKING:
+    from sqlalchemy import Engine
+
+__all__ = ["register"]
+
+DataDir = Annotated[
+    Path | None, typer.Option(help="Of the service, with SQLite [STILLPATH_DATA_DIR].")
+]
+
+_keys = typer.Typer(help="Keys of the service: who may call it.", rich_markup_mode=None)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.add_typer(_keys, name="keys")
+    app.command()(audit)
+
+
+@_keys.command()
+def create(
+    name: Annotated[str, typer.Argument(help="What it is for: `slicer of Ada`.")],
+    owner: Annotated[str, typer.Option(help="Whose jobs its jobs are.")],
+    scope: Annotated[
+        list[str] | None,
+        typer.Option(help="read, submit or admin; may be repeated. [default: read and submit]"),
+    ] = None,
+    days: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=36500, help="How long it is good. [default: always]"),
+    ] = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Make a key and print it, this once. Nothing else goes to stdout."""
+    import time
+
+    from stillpath.service.security.callers import Scope
+
+    known = [each.value for each in Scope]
+    for wanted in scope or ():
+        if wanted not in known:
+            raise ModelError(f"there is no scope {wanted!r}; there is {', '.join(known)}")
+    scopes = [Scope(wanted) for wanted in scope or ("read", "submit")]
+    expires_at = None if days is None else time.time() + days * 86400
+    with _opened(data_dir) as engine:
+        key, secret = _store(engine).create(
+            name=name, owner=owner, scopes=scopes, expires_at=expires_at
+        )
+        _note(engine, "key.create", key)
+    typer.echo(secret)
+    typer.echo(f"key {key.id} of {owner}; it cannot be shown again", err=True)
+
+
+@_keys.command("list")
+def list_keys(data_dir: DataDir = None) -> None:
+    """List the keys, without the keys themselves."""
+    with _opened(data_dir) as engine:
+        found = _store(engine).list()
+    rows = [
+        (
+            key.id,
+            key.owner,
+            key.name,
+            " ".join(sorted(key.scopes)),
+            _moment(key.created_at),
+            _moment(key.expires_at),
+            _moment(key.used_at),
+            _moment(key.revoked_at),
+        )
+        for key in found
+    ]
+    _print_table(("id", "owner", "name", "scopes", "made", "expires", "last use", "revoked"), rows)
+
+
+@_keys.command()
+def revoke(
+    key_id: Annotated[str, typer.Argument(metavar="ID", help="From `stillpath keys list`.")],
+    data_dir: DataDir = None,
+) -> None:
+    """End a key at once and for good."""
+    with _opened(data_dir) as engine:
+        key = _store(engine).revoke(key_id)
+        if key is None:
+            raise ModelError(f"there is no key {key_id!r}; `stillpath keys list` shows them")
+        _note(engine, "key.revoke", key)
+    typer.echo(f"key {key.id} of {key.owner} is revoked")
+
+
+@_keys.command()
+def first(data_dir: DataDir = None) -> None:
+    """Make the first key, with all scopes, before the service's first start, and print it."""
+    with _opened(data_dir) as engine:
+        store = _store(engine)
+        secret = store.create_first()
+        if secret is None:
+            raise ModelError(
+                "there are keys already; `stillpath keys create NAME --owner OWNER --scope admin` "
+                "makes another"
+            )
+        _note(engine, "key.create", store.find(secret))
+    typer.echo(secret)
+
+
+def audit(
+    last: Annotated[int, typer.Option(min=1, max=100_000, help="How many rows.")] = 50,
+    action: Annotated[
+        str | None, typer.Option(help="Only these: submit, cancel, delete, denied, ...")
+    ] = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Show who did what with the service, the newest first."""
+    from stillpath.service.security.audit import AuditLog
+
+    with _opened(data_dir) as engine:
+        found = AuditLog(engine).page(limit=last, action=action)
+    rows = [
+        (
+            _moment(row.at),
+            row.owner,
+            row.key_id or "",
+            row.remote or "",
+            row.action,
+            row.subject or "",
+            " ".join(f"{name}={value}" for name, value in row.details.items()),
+        )
+        for row in found
+    ]
+    _print_table(("at", "owner", "key", "from", "action", "on", "details"), rows)
+
+
+@contextmanager
+def _opened(data_dir: Path | None) -> Iterator[Engine]:
+    from pydantic import ValidationError
+
+    from stillpath.service.database.engine import StoreError, open_database
+    from stillpath.service.security.keys import KeyRefused
+    from stillpath.service.settings import Settings
+    from stillpath.service.wrong_options import wrong_setting
+
+    try:
+        settings = Settings() if data_dir is None else Settings(data_dir=data_dir)
+    except ValidationError as error:
+        raise ModelError(wrong_setting(error)) from None
+    try:
+        engine = open_database(settings)
+        try:
+            yield engine
+        finally:
+            engine.dispose()
+    except (StoreError, KeyRefused) as error:
+        raise ModelError(str(error)) from None
+
+
+def _store(engine: Engine) -> Any:
+    from stillpath.service.security.keys import KeyStore
+
+    return KeyStore(engine)
+
+
+def _note(engine: Engine, action: str, key: Any) -> None:
+    """Write into the audit log what was done here, by whoever may read the database."""
+    from stillpath.cli.machines import who
+    from stillpath.service.security.audit import AuditLog
+    from stillpath.service.security.callers import LOCAL, Caller
+
+    caller = Caller(LOCAL.owner, LOCAL.scopes, remote="command line")
+    AuditLog(engine).add(
+        caller,
+        action,
+        key.id,
+        owner=key.owner,
+        name=key.name,
+        scopes=sorted(key.scopes),
+        by=who(None),
+    )
+
+
+def _moment(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:
+    """Print columns by tabs where a program reads, as a table on a terminal."""
+    import sys
+
+    if not sys.stdout.isatty():
+        for row in (head, *rows):
+            typer.echo("\t".join(" ".join(cell.split()) for cell in row))
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(*head)
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console(highlight=False).print(table)

@@ -1,0 +1,577 @@
+"""The sub-commands of `stillpath machines`. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+from typer.core import TyperGroup
+
+from stillpath.models.errors import ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from stillpath.applications.machines.documents import Documents
+    from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.machines.revision import Revision
+    from stillpath.applications.machines.settings import MachineSettings
+    from stillpath.models.machine import Machine
+    from stillpath.service.settings import Settings
+
+__all__ = ["app", "data_dir", "open_documents", "open_machines", "who"]
+
+_LARGEST_LOG_BYTES = 10_000_000
+
+_Made = TypeVar("_Made")
+
+
+class _Group(TyperGroup):
+    """`machines NAME` without a command shows that machine."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """See `typer.core.TyperGroup`."""
+        alone = len(args) == 1 or args[1].startswith("-")
+        if alone and args[0] not in self.commands and not args[0].startswith("-"):
+            args = ["show", *args]
+        return super().resolve_command(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Group,
+    help="Machines, built in and your own. Each change of your own is a revision.",
+    rich_markup_mode=None,
+)
+
+Name = Annotated[str, typer.Argument(metavar="NAME")]
+Number = Annotated[
+    int | None, typer.Option("--revision", min=1, help="A revision. [default: the newest]")
+]
+By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you]")]
+Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
+
+
+def open_machines() -> Resolver:
+    """Return the machines of this user, by the environment's settings."""
+    from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.machines.store import MachineStore
+
+    settings = _settings()
+    return Resolver(
+        MachineStore(open_documents("machines")),
+        require_approval=settings.require_approval,
+        max_age_days=settings.measurement_max_age_days,
+    )
+
+
+def open_documents(name: str) -> Documents:
+    """Return where this user's ``machines``, ``identifications`` or ``printers`` lie.
+
+    A folder, unless STILLPATH_DATABASE_URL names a PostgreSQL database.
+    """
+    from stillpath.applications.machines.documents import DocumentFolder
+
+    if _settings().database_url is not None:
+        from stillpath.service.database import documents, engine
+
+        settings = _service_settings()
+        if engine.database_url(settings).get_backend_name() != "sqlite":
+            # Without a pool nothing is left open behind a command.
+            return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
+    return DocumentFolder(data_dir() / name)
+
+
+def data_dir() -> Path:
+    """Return the folder of this user's machines and identifications."""
+    from stillpath.applications.machines.settings import user_data_dir
+
+    return _settings().data_dir or user_data_dir()
+
+
+@app.callback(invoke_without_command=True)
+def machines(context: typer.Context) -> None:
+    """List the machines: the built-in library and your own."""
+    if context.invoked_subcommand is not None:
+        return
+    from stillpath.models.store import builtin_machines, load_machine
+
+    store = open_machines().store
+    table = _table("name", "machine", "kinematics", "content", "revision", "approved")
+    for machine in map(load_machine, builtin_machines()):
+        table.add_row(machine.name, machine.title, machine.kinematics, machine.revision, "built in")
+    for name in store.names():
+        try:
+            current, approved = store.current(name), store.approvals(name)
+        except ModelError as error:
+            table.add_row(name, str(error))
+            continue
+        machine = current.machine
+        table.add_row(
+            name,
+            machine.title,
+            machine.kinematics,
+            machine.revision,
+            str(current.number),
+            str(max(approved)) if approved else "none",
+        )
+    _print(table)
+    _tell_of_others()
+
+
+@app.command()
+def show(name: Name, revision: Number = None) -> None:
+    """Print a machine as a JSON document, to start from."""
+    resolver = open_machines()
+    if revision is None:
+        machine = resolver.to_look_at(name, files=True).machine
+    else:
+        machine = resolver.store.revision(name, revision).machine
+    typer.echo(machine.model_dump_json(indent=1))
+
+
+@app.command()
+def history(
+    name: Name,
+    since: Annotated[
+        str | None,
+        typer.Option(metavar="DATE", help="Look for drift from this day on (after a rebuild)."),
+    ] = None,
+) -> None:
+    """List the revisions of a machine, and say if its resonances have moved."""
+    from stillpath.applications.machines.drift import drift
+
+    store = open_machines().store
+    revisions, approved = store.history(name), store.approvals(name)
+    day = None if since is None else _day(since)
+    table = _table("revision", "when", "who", "X, Hz", "Y, Hz", "approved by", "why")
+    for revision in revisions:
+        approval = approved.get(revision.number)
+        table.add_row(
+            str(revision.number),
+            f"{revision.when:%Y-%m-%d %H:%M}",
+            revision.author,
+            *(_leading(revision, axis) for axis in ("x", "y")),
+            approval.author if approval else "",
+            revision.message,
+        )
+    _print(table)
+    for entry in drift(revisions, since=day):
+        typer.echo(entry.text)
+
+
+@app.command()
+def diff(
+    name: Name,
+    a: Annotated[int, typer.Argument(min=1, metavar="A", help="A revision.")],
+    b: Annotated[int, typer.Argument(min=1, metavar="B", help="Another one.")],
+) -> None:
+    """Tell what revision B changed against A."""
+    from stillpath.applications.machines.diff import diff as compare
+
+    store = open_machines().store
+    changes = compare(store.revision(name, a).machine, store.revision(name, b).machine)
+    for change in changes:
+        typer.echo(change.text)
+    if not changes:
+        typer.echo("no difference")
+
+
+@app.command()
+def approve(name: Name, revision: Number = None, by: By = None, message: Message = "") -> None:
+    """Say that a revision may be used for jobs."""
+    store = open_machines().store
+    number = revision or store.current(name).number
+    approval = store.approve(name, number, author=who(by), message=message)
+    typer.echo(f"{name} revision {number}: approved by {approval.author}")
+
+
+@app.command()
+def rollback(
+    name: Name,
+    to: Annotated[int, typer.Argument(min=1, metavar="REVISION", help="Goes back to it.")],
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Bring an earlier revision back, as a new one."""
+    store = open_machines().store
+    _told(store.roll_back(name, to, author=who(by), message=message))
+
+
+@app.command()
+def export(
+    name: Name,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE")],
+    revision: Number = None,
+    with_history: Annotated[
+        bool, typer.Option("--history", help="All revisions, with who, when and why.")
+    ] = False,
+) -> None:
+    """Write a machine to a JSON file: the document, or its history."""
+    from stillpath.applications.machines.revision import document_text
+    from stillpath.applications.machines.transfer import export_history
+    from stillpath.pipeline.files import replacing
+
+    if with_history and revision is not None:
+        raise ModelError("give either --history or --revision")
+    resolver = open_machines()
+    if with_history:
+        text = export_history(resolver.store, name)
+    elif revision is not None:
+        text = document_text(resolver.store.revision(name, revision).machine)
+    else:
+        text = document_text(resolver.to_look_at(name).machine)
+    with replacing(output.resolve()) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A machine, or a history.")],
+    name: Annotated[str | None, typer.Option("--as", metavar="NAME", help="Another name.")] = None,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Add a machine from a JSON file, under a name that is free."""
+    from stillpath.applications.machines.transfer import import_file
+
+    store = open_machines().store
+    _told(import_file(store, file, author=who(by), message=message, name=name))
+
+
+@app.command()
+def put(
+    file: Annotated[Path, typer.Argument(metavar="FILE")], by: By = None, message: Message = ""
+) -> None:
+    """Make the machine document in a file the new revision of its machine."""
+    from stillpath.applications.machines.revision import source_file
+    from stillpath.models.store import load_machine
+
+    machine = load_machine(file)
+    store = open_machines().store
+    _told(
+        store.add_revision(
+            machine.name,
+            machine,
+            author=who(by),
+            message=message or f"from {file.name}",
+            sources=[source_file(file.name, file.read_bytes())],
+        )
+    )
+
+
+@app.command("set-firmware")
+def set_firmware(
+    name: Name,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="The firmware section as JSON, or what Marlin answers to M503."
+        ),
+    ],
+    as_name: Annotated[
+        str | None, typer.Option("--as", metavar="NAME", help="A copy under a free name.")
+    ] = None,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Give a machine another firmware: its next revision, or with --as a copy.
+
+    Of an answer to M503, what it does not say stays as the machine has it.
+    """
+    from stillpath.applications.machines.transfer import with_firmware_file
+
+    resolver = open_machines()
+    machine, source = with_firmware_file(resolver.to_look_at(name).machine, file)
+    if as_name is not None:
+        machine = machine.model_copy(update={"name": as_name})
+    revision = resolver.store.add_revision(
+        machine.name,
+        machine,
+        author=who(by),
+        message=message or f"firmware from {file.name}",
+        sources=[source],
+        expected=None if as_name is None else 0,
+    )
+    _told(revision)
+    for line in _refused(machine):
+        typer.echo(line)
+
+
+@app.command()
+def motors(
+    name: Name,
+    written: Annotated[
+        Path, typer.Argument(metavar="TEST", exists=True, help="What `motor-test` wrote.")
+    ],
+    console: Annotated[
+        Path, typer.Argument(metavar="CONSOLE", exists=True, help="Its console, or klippy.log.")
+    ],
+    margin: Annotated[
+        float, typer.Option(min=0.1, max=1.0, help="Of what was borne, what is stored.")
+    ] = 0.75,
+    full_step: Annotated[
+        int, typer.Option(min=1, max=256, help="Microsteps of a full step, of X and Y.")
+    ] = 16,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Store what the motors bore in a search for lost steps, with a margin (`command`)."""
+    from stillpath.applications.proof.motor_test import borne, envelope, levels_of
+
+    levels = levels_of(written.read_text(encoding="utf-8", errors="replace"))
+    count = borne(levels, console.read_text(encoding="utf-8", errors="replace"), full_step)
+    if not count:
+        raise ModelError(
+            "steps were lost at the printer's own limits already (or the endstops do not repeat "
+            "within a full step): lower max_accel, raise the motors' current, or try again"
+        )
+    best, resolver = levels[count - 1], open_machines()
+    machine = resolver.to_look_at(name).machine
+    command = envelope(machine, best, margin)
+    end = "no step was lost" if count == len(levels) else f"level {count + 1} lost steps"
+    typer.echo(
+        f"borne: {best.accel_mm_s2:.0f} mm/s2, steps of {best.speed_step_mm_s:.0f} mm/s ({end}); "
+        f"stored, times {margin:g}: {command.accel_mm_s2:.0f} and {command.speed_step_mm_s:.0f}"
+    )
+    revision = resolver.store.add_revision(
+        name,
+        machine.model_copy(update={"command": command}),
+        author=who(by),
+        message=message or f"motors tried up to {best.accel_mm_s2:.0f} mm/s2",
+    )
+    _told(revision)
+
+
+@app.command()
+def delete(name: Name) -> None:
+    """Move a machine with its history to the trash."""
+    open_machines().store.delete(name)
+    typer.echo(f"{name}: deleted; `stillpath machines restore {name}` brings it back")
+
+
+@app.command()
+def restore(name: Name) -> None:
+    """Bring back the machine that was deleted last under a name."""
+    _told(open_machines().store.restore(name))
+
+
+@app.command()
+def check(
+    name: Name,
+    printer_cfg: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Klipper's configuration as it is now.")
+    ] = None,
+) -> None:
+    """Look whether a machine can still be relied on. Exit code 0 fine, 2 not."""
+    from stillpath.applications.machines.checks import (
+        check_before_job,
+        envelope_warnings,
+        not_followed,
+    )
+    from stillpath.applications.machines.klipper_config import read_printer_config
+
+    resolver = open_machines()
+    config = None if printer_cfg is None else read_printer_config(printer_cfg)
+    machine = resolver.to_look_at(name, files=True).machine
+    found = check_before_job(
+        machine,
+        datetime.now(UTC),
+        max_age_days=resolver.max_age_days,
+        config=config,
+    )
+    found += _refused(machine)
+    notes = envelope_warnings(machine) + ([] if config is None else not_followed(config))
+    for line in [*found, *(f"note: {line}" for line in notes)]:
+        typer.echo(line)
+    if found:
+        raise typer.Exit(2)
+    typer.echo(f"{name}: nothing speaks against it")
+
+
+@app.command("from-config")
+def from_config(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Klipper's printer.cfg.")],
+    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
+    title: Annotated[str, typer.Option(help="What people call it.")] = "",
+    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
+    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
+    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
+    by: By = None,
+) -> None:
+    """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
+    from stillpath.applications.machines.checks import machine_from_config, not_followed
+    from stillpath.applications.machines.klipper_config import read_printer_config
+    from stillpath.applications.machines.revision import source_file
+
+    config = read_printer_config(file)
+    machine = machine_from_config(config, name, title=title, f_hz=(fx, fy), zeta=zeta)
+    revision = open_machines().store.add_revision(
+        name,
+        machine,
+        author=who(by),
+        message=f"from {file.name}; plants typed in",
+        sources=[source_file(file.name, file.read_bytes())],
+        expected=0,
+    )
+    _told(revision)
+    for line in not_followed(config):
+        typer.echo(f"note: {line}")
+
+
+@app.command("from-m503")
+def from_m503(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="What Marlin answers to M503.")],
+    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
+    travel: Annotated[
+        str, typer.Option(metavar="XxYxZ", help="How far the axes reach, mm: 235x235x250.")
+    ],
+    kinematics: Annotated[str, typer.Option(help="cartesian or corexy.")] = "cartesian",
+    title: Annotated[str, typer.Option(help="What people call it.")] = "",
+    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
+    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
+    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
+    fields: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="FIELD=VALUE",
+            help="What M503 does not say, from Configuration.h and _adv.h: "
+            "min_steps_per_segment=1, variant=2.0, s_curve=true, ... (docs/machines.md).",
+        ),
+    ] = None,
+    by: By = None,
+) -> None:
+    """Make a machine from Marlin's M503: limits and steps, with plants still to be measured."""
+    from stillpath.applications.machines import marlin_settings
+    from stillpath.applications.machines.revision import source_file
+
+    content = _m503(file)
+    machine = marlin_settings.machine_from_m503(
+        content.decode(errors="replace"),
+        file.name,
+        name,
+        travel_mm=marlin_settings.read_travel(travel),
+        kinematics=kinematics,
+        title=title,
+        f_hz=(fx, fy),
+        zeta=zeta,
+        fields=fields or (),
+    )
+    revision = open_machines().store.add_revision(
+        name,
+        machine,
+        author=who(by),
+        message=f"M503 in {file.name}; plants typed in",
+        sources=[source_file(file.name, content)],
+        expected=0,
+    )
+    _told(revision)
+    said = {field.partition("=")[0].strip() for field in fields or ()}
+    assumed = [
+        f"{field}={str(value).lower()}"
+        for field, value in marlin_settings.ASSUMED.items()
+        if field not in said
+    ]
+    if assumed:
+        typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
+    for line in _refused(machine):
+        typer.echo(line)
+
+
+def who(by: str | None) -> str:
+    """Return the author that was named, else the user of this computer."""
+    if by is not None:
+        return by
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # a container's user may have no name
+        return "unknown"
+
+
+def _tell_of_others() -> None:
+    """Say if the service keeps machines of its own in this folder, as earlier versions did."""
+    from stillpath.applications.machines.settings import EARLIER_DATA_DIR
+
+    others, own = EARLIER_DATA_DIR / "machines", data_dir() / "machines"
+    if others.is_dir() and others.resolve() != own.resolve():
+        typer.echo(
+            f"note: a service that is started here keeps other machines, in {others}; "
+            f"STILLPATH_DATA_DIR={EARLIER_DATA_DIR.resolve()} shows those",
+            err=True,
+        )
+
+
+def _settings() -> MachineSettings:
+    from stillpath.applications.machines.settings import MachineSettings
+
+    return _checked(MachineSettings.from_environment)
+
+
+def _service_settings() -> Settings:
+    from stillpath.service.settings import Settings
+
+    return _checked(Settings)
+
+
+def _checked(make: Callable[[], _Made]) -> _Made:
+    from pydantic import ValidationError
+
+    from stillpath.service.wrong_options import wrong_setting
+
+    try:
+        return make()
+    except ValidationError as error:
+        raise ModelError(wrong_setting(error)) from None
+
+
+def _day(text: str) -> Any:
+    from datetime import date
+
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise ModelError(f"--since {text!r}: give a day like 2026-03-02") from None
+
+
+def _leading(revision: Revision, axis: Any) -> str:
+    from stillpath.applications.machines.resonances import leading
+
+    mode = leading(revision.machine.axes[axis].nominal)
+    return "" if mode is None else f"{mode[0]:.1f}"
+
+
+def _m503(file: Path) -> bytes:
+    try:
+        if file.stat().st_size > _LARGEST_LOG_BYTES:
+            raise ModelError(f"{file}: over {_LARGEST_LOG_BYTES} bytes; keep M503's answer only")
+        return file.read_bytes()
+    except OSError as error:
+        raise ModelError(f"cannot read {file}: {error.strerror}") from None
+
+
+def _told(revision: Revision) -> None:
+    typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
+
+
+def _refused(machine: Machine) -> list[str]:
+    """Return a line that says why the machine's firmware cannot execute a compensated file."""
+    from stillpath.gcode.firmware.registry import kit
+
+    reason = kit(machine).refusal
+    return [] if reason is None else [f"{machine.name} can be simulated, not compensated: {reason}"]
+
+
+def _table(*columns: str) -> Any:
+    from rich.table import Column, Table
+
+    return Table(Column(columns[0], no_wrap=True), *columns[1:], box=None, pad_edge=False)
+
+
+def _print(table: Any) -> None:
+    from rich.console import Console
+
+    Console(highlight=False, markup=False).print(table)

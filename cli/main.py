@@ -1,0 +1,146 @@
+"""The command line. Heavy imports wait until a command needs them, so that --help is quick.
+
+Exit codes: 0 done, 1 the computer failed us (disk, memory, permission), 2 the request cannot be
+met (bad file, machine, model or option), 130 interrupted. Whatever is not 0 leaves no output
+file, and the input as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from stillpath.cli import (
+    advice,
+    backup,
+    compensate,
+    controllers,
+    design,
+    identify,
+    keys,
+    klipper,
+    machines,
+    printers,
+    proof,
+    remote,
+    scan,
+    serve,
+    trajectories,
+    warm,
+)
+from stillpath.cli.arguments import Refused
+from stillpath.cli.batch import commands as batch
+from stillpath.cli.groups import GroupedCommands
+from stillpath.service.environment import prepare_environment
+from stillpath.service.interruption import Interrupted
+
+__all__ = ["app", "main", "run"]
+
+app = typer.Typer(
+    name="stillpath",
+    cls=GroupedCommands,
+    help="Keeps a printer's nozzle on its path: compensates G-code for the machine's vibration.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+_INTERRUPTED = 130
+_WITH_WORKERS = (["serve"], ["scheduler"], ["worker"])
+"""Commands that compute in processes of their own."""
+
+
+def main() -> NoReturn:
+    """Run the command line and exit; the entry point of the `stillpath` command."""
+    prepare_environment(computing=sys.argv[1:2] not in _WITH_WORKERS)
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command and return its exit code; every failure is one line on stderr."""
+    try:
+        code = typer.main.get_command(app).main(
+            args=arguments, prog_name="stillpath", standalone_mode=False
+        )
+        if code != _INTERRUPTED:
+            return code if isinstance(code, int) else 0
+        return _fail("interrupted; nothing was written", _INTERRUPTED)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail("interrupted; nothing was written", _INTERRUPTED)
+    except Interrupted as interruption:
+        return _fail("interrupted; nothing was written", interruption.exit_code)
+    except typer.TyperException as error:
+        return _fail(f"{_of_usage(error)} (stillpath COMMAND --help lists the options)", 2)
+    except Refused as error:
+        return _fail(str(error), 2)
+    except MemoryError:
+        return _fail("out of memory; close other programs or use a larger machine", 1)
+    except OSError as error:
+        return _fail(_of_system(error), 1)
+    except ValueError as error:
+        if not _is_ours(error):
+            raise
+        return _fail(str(error), 2)
+    except Exception as error:  # of a service that was asked: it knows how bad it is
+        if not hasattr(error, "exit_code"):
+            raise
+        return _fail(str(error), error.exit_code)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Show the version.")] = False,
+) -> None:
+    if version:
+        from stillpath.version import __version__
+
+        typer.echo(f"stillpath {__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+app.add_typer(machines.app, name="machines")
+app.add_typer(klipper.app, name="klipper")
+for _commands in (
+    *(advice, backup, batch, compensate, controllers, design, identify, keys, printers, proof),
+    *(remote, scan, serve, trajectories, warm),
+):
+    _commands.register(app)
+
+
+def _is_ours(error: ValueError) -> bool:
+    from stillpath.compensation.base import DesignError
+    from stillpath.gcode.errors import GcodeError
+    from stillpath.models.errors import ModelError
+
+    return isinstance(error, GcodeError | ModelError | DesignError)
+
+
+def _of_usage(error: typer.TyperException) -> str:
+    """Return what is wrong with the command line; a value that typer refused in our words."""
+    from pydantic import ValidationError
+
+    from stillpath.models.complaints import complaint
+
+    refused, parameter = error.__cause__, getattr(error, "param", None)
+    if not isinstance(refused, ValidationError) or parameter is None:
+        return error.format_message()
+    name = next((name for name in parameter.opts if name.startswith("--")), parameter.metavar)
+    return f"{name or parameter.name}: {complaint(refused.errors(include_url=False)[0])}"
+
+
+def _of_system(error: OSError) -> str:
+    place = f"{error.filename}: " if error.filename else ""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    remedy = "; make room there, or write to another disk" if full else ""
+    return f"{place}{error.strerror or error}{remedy}"
+
+
+def _fail(message: str, code: int) -> int:
+    sys.stderr.write(f"stillpath: error: {' '.join(message.split())}\n")
+    return code

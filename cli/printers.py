@@ -1,0 +1,86 @@
+"""`stillpath printers ...`: how printers that results are sent to compare with their machines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stillpath.cli.remote import KeyOption, ServerOption
+from stillpath.models.errors import ModelError
+
+if TYPE_CHECKING:
+    from stillpath.service.deliveries.checking import PrinterCheck
+
+__all__ = ["register"]
+
+Name = Annotated[str, typer.Argument(metavar="NAME", help="A section [printer.NAME] of the file.")]
+FileOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--printers",
+        metavar="FILE",
+        envvar="STILLPATH_PRINTERS",
+        help="The file of printers, docs/running.md.",
+    ),
+]
+
+_printers = typer.Typer(
+    help="Printers that results are sent to.", rich_markup_mode=None, no_args_is_help=True
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.add_typer(_printers, name="printers")
+
+
+@_printers.command()
+def check(
+    name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
+) -> None:
+    """Compare a printer's configuration with its machine. Exit code 0: all well, 2: not."""
+    found = _found(name, printers, server, key, accept=False)
+    for finding in found.findings:
+        typer.echo(f"{'unsafe: ' if finding.unsafe else ''}{finding.text}")
+    if found.findings:
+        raise typer.Exit(2)
+    typer.echo(f"{name}: as the machine {found.machine} says ({found.software})")
+
+
+@_printers.command()
+def accept(
+    name: Name, printers: FileOption = None, server: ServerOption = None, key: KeyOption = None
+) -> None:
+    """Take a printer's configuration as it is now: later changes count from here."""
+    found = _found(name, printers, server, key, accept=True)
+    typer.echo(f"{name}: configuration remembered, for {found.machine} {found.machine_revision}")
+
+
+def _found(
+    name: str, file: Path | None, server: str | None, key: str | None, *, accept: bool
+) -> PrinterCheck:
+    if server:
+        return _asked(name, server, key, accept=accept)
+    from stillpath.cli.machines import open_documents, open_machines
+    from stillpath.service.deliveries.checking import Checker, PrinterUnknown
+    from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
+    from stillpath.service.deliveries.targets import TargetRefused
+
+    if file is None:
+        raise ModelError("which printers? Name their file: --printers FILE, or STILLPATH_PRINTERS")
+    try:
+        printer = printer_for(load_printers(file), name)
+        machine = open_machines().for_job(printer.machine).machine
+        return Checker(open_documents("printers")).check(printer, machine, accept=accept)
+    except (PrinterFileError, TargetRefused, PrinterUnknown) as error:
+        raise ModelError(str(error)) from None
+
+
+def _asked(name: str, server: str, key: str | None, *, accept: bool) -> PrinterCheck:
+    from stillpath.service.client import Client
+    from stillpath.service.deliveries.checking import PrinterCheck
+
+    with Client(server, key or None) as client:
+        return PrinterCheck.model_validate(client.check_printer(name, accept=accept))

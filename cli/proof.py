@@ -1,0 +1,271 @@
+"""Commands of proof on metal. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from stillpath.cli.arguments import MachineOption, check_folder, check_output
+from stillpath.cli.machines import By, Message, open_machines, who
+
+if TYPE_CHECKING:
+    from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.proof.program import PrintSettings
+    from stillpath.applications.proof.ring_figures import RingReport
+
+__all__ = ["register"]
+
+Output = Annotated[
+    Path, typer.Option("--output", "-o", metavar="OUT", dir_okay=False, help="The file to write.")
+]
+NozzleTemp = Annotated[float, typer.Option("--nozzle-temp", help="°C, 150 to 350.")]
+BedTemp = Annotated[float, typer.Option("--bed-temp", help="°C, 0 to 150.")]
+Fan = Annotated[float, typer.Option("--fan-percent", help="Part cooling above the base.")]
+Flow = Annotated[
+    float, typer.Option("--max-flow", help="What the hotend melts, mm3/s; bounds the speed.")
+]
+Centre = Annotated[
+    str | None,
+    typer.Option("--at", metavar="X,Y", help="Middle of the print. [default: of the travel]"),
+]
+StartGcode = Annotated[
+    Path | None,
+    typer.Option(exists=True, dir_okay=False, help="Lines instead of homing and heating."),
+]
+EndGcode = Annotated[
+    Path | None,
+    typer.Option(exists=True, dir_okay=False, help="Lines instead of switching off and parking."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add coupon, tower, ring-test, motor-test and verify to a command line."""
+    for command in (coupon, tower, ring_test, motor_test, verify):
+        app.command()(command)
+
+
+def coupon(
+    machine: MachineOption,
+    output: Output,
+    nozzle_temp: NozzleTemp = 210.0,
+    bed_temp: BedTemp = 60.0,
+    fan_percent: Fan = 100.0,
+    max_flow: Flow = 12.0,
+    at: Centre = None,
+    start_gcode: StartGcode = None,
+    end_gcode: EndGcode = None,
+) -> None:
+    """Write a first print: half as planned, half compensated."""
+    settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.applications.proof.coupon import write_coupon
+    from stillpath.cli.console import progress_shown
+    from stillpath.cli.proof_tables import print_proof
+
+    with progress_shown("stillpath") as progress:
+        made = write_coupon(found.machine, check_output(output), settings, progress=progress)
+    print_proof(made, found.warnings)
+
+
+def tower(
+    machine: MachineOption,
+    axis: Annotated[Literal["x", "y"], typer.Option(help="Whose ringing is wanted.")],
+    output: Output,
+    bands: Annotated[int, typer.Option(help="Bands of rising acceleration, 2 to 12.")] = 6,
+    nozzle_temp: NozzleTemp = 210.0,
+    bed_temp: BedTemp = 60.0,
+    fan_percent: Fan = 100.0,
+    max_flow: Flow = 12.0,
+    at: Centre = None,
+    start_gcode: StartGcode = None,
+    end_gcode: EndGcode = None,
+) -> None:
+    """Write a ringing tower: half as planned, half compensated."""
+    settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.applications.proof.tower import write_tower
+    from stillpath.cli.console import progress_shown
+    from stillpath.cli.proof_tables import print_proof, print_tower
+
+    with progress_shown("stillpath") as progress:
+        made = write_tower(
+            found.machine, axis, check_output(output), settings, count=bands, progress=progress
+        )
+    print_proof(made.written, found.warnings, lines=3)
+    print_tower(made)
+
+
+def ring_test(
+    machine: MachineOption,
+    output: Output,
+    chip: Annotated[
+        str | None,
+        typer.Option(help="Sensor: CHIP of ACCELEROMETER_MEASURE, P of M956. [default: its own]"),
+    ] = None,
+    chip_y: Annotated[
+        str | None, typer.Option("--chip-y", help="The one that moves with Y, if it is another.")
+    ] = None,
+    start_gcode: StartGcode = None,
+) -> None:
+    """Write stops for an accelerometer, half as planned, half compensated. Nothing is printed."""
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.applications.proof.recorders import RingSettings
+    from stillpath.applications.proof.ring_test import write_ring_test
+    from stillpath.cli.console import progress_shown
+    from stillpath.cli.proof_tables import print_proof
+
+    settings = RingSettings(chip, chip_y, _text(start_gcode))
+    with progress_shown("stillpath") as progress:
+        made = write_ring_test(found.machine, check_output(output), settings, progress=progress)
+    print_proof(made, found.warnings)
+
+
+def motor_test(
+    machine: MachineOption,
+    output: Output,
+    most: Annotated[
+        float, typer.Option("--to", metavar="MM_S2", help="The highest acceleration to try.")
+    ] = 20_000.0,
+) -> None:
+    """Write a search for lost steps at rising limits (Klipper). Nothing is heated or printed.
+
+    Then `stillpath machines motors NAME OUT CONSOLE` reads what the console said.
+    """
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.applications.proof.motor_test import levels_of
+    from stillpath.applications.proof.motor_test import motor_test as written
+
+    text = written(found.machine, most)
+    check_output(output).write_text(text, encoding="utf-8")
+    for number, level in enumerate(levels_of(text), 1):
+        accel, step = level.accel_mm_s2, level.speed_step_mm_s
+        typer.echo(f"level {number}: {accel:.0f} mm/s2, steps of {step:.0f} mm/s")
+    typer.echo(
+        f"Run {output} with a hand on the switch. Then copy the console (or klippy.log) to a file: "
+        f"stillpath machines motors {found.machine.name} {output} CONSOLE"
+    )
+
+
+def verify(
+    printed: Annotated[
+        Path,
+        typer.Argument(metavar="PRINTED", exists=True, dir_okay=False, help="What was printed."),
+    ],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="LOG...",
+            exists=True,
+            dir_okay=False,
+            help="Raw accelerations; several of a ring test, one of a print.",
+        ),
+    ],
+    machine: MachineOption,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            "--report",
+            metavar="DIR",
+            file_okay=False,
+            help="For readback.html, .json; of a ring test for ring-test.json.",
+        ),
+    ] = None,
+    remember: Annotated[
+        bool, typer.Option(help="Let your machine remember what a ring test says of its plants.")
+    ] = True,
+    by: By = None,
+    message: Message = "",
+) -> None:
+    """Compare a log of a print, or those of a ring test, with what the model says of it."""
+    check_folder(report)
+    machines = open_machines()
+    found = machines.to_look_at(machine, files=True).machine
+
+    from stillpath.applications.proof.ring_motion import is_ring_test
+
+    if is_ring_test(printed):
+        from stillpath.applications.proof.confirming import verify_ring
+        from stillpath.cli.proof_tables import print_ring
+        from stillpath.reports.pages import write_texts
+
+        told = verify_ring(printed, logs, found)
+        if report is not None:
+            write_texts(report, {"ring-test.json": told.model_dump_json(indent=1)})
+        print_ring(told)
+        if remember:
+            _remember(machines, machine, told, who(by), message)
+        return
+
+    from stillpath.applications.proof.page import write_readback
+    from stillpath.applications.proof.readback import verify_log
+    from stillpath.cli.console import progress_shown
+    from stillpath.cli.proof_tables import print_readback
+
+    if len(logs) > 1:
+        raise typer.BadParameter("of a print, one log is compared at a time")
+    with progress_shown("stillpath") as progress:
+        made = verify_log(printed, logs[0], found, progress=progress)
+    if report is not None:
+        write_readback(made, report)
+    print_readback(made)
+
+
+def _remember(machines: Resolver, name: str, report: RingReport, author: str, message: str) -> None:
+    """Put what was said of the axes into the machine's document."""
+    said = {a.axis: a.confirmation for a in report.axes if a.confirmation is not None}
+    if not said:
+        return
+    if name not in machines.store:
+        typer.echo(
+            "note: not remembered: only a machine of your own is (`stillpath machines import FILE "
+            "--as NAME`)"
+        )
+        return
+    made = machines.store.confirm(
+        name,
+        said,
+        author=author,
+        message=message or f"ring test: {', '.join(f'{a} {c.verdict}' for a, c in said.items())}",
+        sources=tuple(dict.fromkeys(s for c in said.values() for s in c.sources)),
+    )
+    typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
+
+
+def _settings(
+    nozzle_temp: float,
+    bed_temp: float,
+    fan_percent: float,
+    max_flow: float,
+    at: str | None,
+    start_gcode: Path | None,
+    end_gcode: Path | None,
+) -> PrintSettings:
+    from stillpath.applications.proof.program import PrintSettings
+
+    return PrintSettings(
+        nozzle_temp_c=nozzle_temp,
+        bed_temp_c=bed_temp,
+        fan_percent=fan_percent,
+        max_flow_mm3_s=max_flow,
+        centre_mm=None if at is None else _point(at),
+        start_gcode=_text(start_gcode),
+        end_gcode=_text(end_gcode),
+    )
+
+
+def _text(file: Path | None) -> str | None:
+    return None if file is None else file.read_text(encoding="utf-8", errors="replace")
+
+
+def _point(text: str) -> tuple[float, float]:
+    try:
+        x, y = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"--at {text}: two numbers are needed, as in 110,110") from None
+    return x, y

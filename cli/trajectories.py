@@ -1,0 +1,114 @@
+"""`stillpath plan` and `stillpath trajectories`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stillpath.cli.arguments import (
+    DialectOption,
+    Input,
+    MachineOption,
+    PlateOption,
+    Refused,
+    check_input,
+    check_output,
+    chosen_options,
+)
+from stillpath.cli.machines import open_machines
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add plan and trajectories to a command line."""
+    for command in (plan, trajectories):
+        app.command()(command)
+
+
+def trajectories(
+    source: Input,
+    machine: MachineOption,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="The table.")],
+    form: Annotated[
+        str, typer.Option("--format", help="csv or npz. [default: as OUT is called, else csv]")
+    ] = "",
+    start: Annotated[
+        float, typer.Option("--from", metavar="S", min=0.0, help="Second of the print.")
+    ] = 0.0,
+    stop: Annotated[
+        float | None, typer.Option("--to", metavar="S", help="Second of the print. [default: end]")
+    ] = None,
+    method: Annotated[str, typer.Option(help="As `compensate` has it; none: as it came.")] = "fbf",
+    robust: Annotated[str, typer.Option(help="As `compensate` has it.")] = "off",
+    budget_um: Annotated[
+        float | None, typer.Option("--budget-um", help="As `compensate` has it.")
+    ] = None,
+    plate: PlateOption = None,
+    dialect: DialectOption = None,
+) -> None:
+    """Write planned, commanded and simulated motion with the errors, 1000 rows a second."""
+    chosen = form or ("npz" if output.suffix == ".npz" else "csv")
+    if chosen not in ("csv", "npz"):
+        raise typer.BadParameter(f"--format {form}: there is csv and npz")
+    check_input(source)
+    target = check_output(output)
+    if target.exists() and target.samefile(source):
+        raise Refused(f"{output} is IN; name the file to write")
+    options = chosen_options(
+        method=method, robust=robust, budget_um=budget_um, plate=plate, dialect=dialect
+    )
+
+    from stillpath.cli.machines import open_machines
+
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.cli.console import progress_shown
+    from stillpath.pipeline.trajectories import write_trajectories
+
+    with progress_shown("stillpath") as progress:
+        rows = write_trajectories(
+            source,
+            target,
+            found.machine,
+            options,
+            format="npz" if chosen == "npz" else "csv",
+            start_s=start,
+            stop_s=stop,
+            progress=progress,
+        )
+    typer.echo(f"{rows} rows, {rows / 1000:.3f} s")
+
+
+def plan(
+    source: Input,
+    machine: MachineOption,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUT", help="motion.npz")],
+    rate: Annotated[float, typer.Option(min=1.0, max=100_000.0, help="Samples per second.")] = 1e3,
+    plate: PlateOption = None,
+    dialect: DialectOption = None,
+) -> None:
+    """Write the motion the machine will make. Columns t, x, y, z, e."""
+    check_input(source)
+    target = check_output(output)
+    if target == source.resolve():
+        raise Refused("OUT must not be IN: the motion is no G-code")
+    read_as = chosen_options(dialect=dialect).dialect
+    found = open_machines().for_job(machine, files=True)
+
+    from stillpath.cli.console import print_planned, progress_shown
+    from stillpath.pipeline.compensate import plan_file
+
+    with progress_shown("stillpath") as progress:
+        planned = plan_file(
+            source,
+            target,
+            found.machine,
+            rate_hz=rate,
+            plate=plate,
+            dialect=read_as,
+            progress=progress,
+        )
+    print_planned(planned)

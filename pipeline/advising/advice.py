@@ -1,0 +1,106 @@
+"""What is advised for a file: accelerations by feature, shapers by layer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.base import Adviser
+from stillpath.gcode.pacing import FirstLayer
+from stillpath.gcode.slicers.features import Feature, feature_of
+from stillpath.gcode.types import KEPT, Limits, Moves
+from stillpath.models.shaping import Shaping
+
+__all__ = ["KEPT_FEATURES", "Advice", "Bound", "is_visible", "wanted_accel"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+KEPT_FEATURES = frozenset(
+    {
+        Feature.BRIDGE,
+        Feature.INTERNAL_BRIDGE,
+        Feature.OVERHANG_WALL,
+        Feature.IRONING,
+        Feature.TRAVEL,
+        Feature.CUSTOM,
+    }
+)
+"""Features that print as the file has them: their speeds are chosen for other reasons."""
+_VISIBLE = frozenset({Feature.OUTER_WALL, Feature.THIN_WALL})
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Bounds of a feature's acceleration [mm/s^2]; the file's own is brought between them."""
+
+    at_least: float = 0.0
+    at_most: float = np.inf
+
+    def of(self, file_mm_s2: float) -> float:
+        """Return the acceleration where the file has another."""
+        return min(max(file_mm_s2, self.at_least), self.at_most)
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """Advice for one file.
+
+    Attributes
+    ----------
+    bounds : mapping
+        Feature id to bounds; features that are not named keep what the file has.
+    shapers : sequence of (layer, Shaping)
+        From which layer on a shaper holds, rising; the first holds from the first line.
+        Empty: the firmware's own shaper stays.
+    first_layer : FirstLayer
+        It keeps the file's accelerations.
+    """
+
+    bounds: Mapping[int, Bound] = field(default_factory=dict)
+    shapers: Sequence[tuple[int, Shaping]] = ()
+    first_layer: FirstLayer = field(default_factory=FirstLayer)
+
+    def keeps(self, moves: Moves) -> Mask:
+        """Mark the moves that stay as the file has them, travel as well."""
+        return np.asarray(self.first_layer.has(moves) | ((moves.known & KEPT) != 0))
+
+    def shaping(self, layer: int) -> Shaping | None:
+        """Return the shaper of a layer."""
+        found = None
+        for first, shaping in self.shapers:
+            if found is None or first <= layer:
+                found = shaping
+        return found
+
+
+def is_visible(name: str) -> bool:
+    """Tell whether a feature is seen on the print: walls, and what nobody has named."""
+    feature = feature_of(name)
+    return feature is None or feature in _VISIBLE
+
+
+def wanted_accel(
+    moves: Moves, limits: Sequence[Limits], advice: Advice, adviser: Adviser
+) -> tuple[Array, Array]:
+    """Return the accelerations that moves shall have, and those that the file gives them.
+
+    Returns
+    -------
+    wanted : ndarray, shape (n,)
+        NaN for moves that print nothing in X or Y.
+    file : ndarray, shape (n,)
+    """
+    way = moves.end_mm - moves.start_mm
+    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
+    used, place = np.unique(moves.limits_id, return_inverse=True)
+    file = np.array([adviser.accel_mm_s2(limits[k]) for k in used.tolist()])[place.reshape(-1)]
+    wanted = np.where(prints, file, np.nan)
+    free = prints & ~advice.keeps(moves)
+    for feature, bound in advice.bounds.items():
+        rows = free & (moves.feature == feature)
+        wanted[rows] = np.clip(file[rows], bound.at_least, None).clip(None, bound.at_most)
+    return wanted, file

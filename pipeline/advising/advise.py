@@ -1,0 +1,456 @@
+"""Advise a print file: its moves stay, and firmware commands for shaper and acceleration come in.
+
+The file is measured as it came, samples of it are tried, the choice is written, and what was
+written is read and measured again: by the firmware's rules, with the firmware's own shaper as the
+written lines set it. Where a feature exceeds its bound there, it is made slower and written anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+import numpy as np
+
+from stillpath.gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pacing import FirstLayer
+from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.types import ProgramBlock
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
+from stillpath.models.shaping import OFF
+from stillpath.pipeline.advising.choosing import Choice, choose
+from stillpath.pipeline.advising.earlier import EarlierErrors
+from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
+from stillpath.pipeline.advising.messages import (
+    beyond_bounds,
+    kept_beyond,
+    shaper_warnings,
+    stored_settings,
+)
+from stillpath.pipeline.advising.reading import FirstReading
+from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
+from stillpath.pipeline.measuring.measure import STRIDE, Measurement, channel_names
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.measuring.set_errors import ClassError, SetErrors
+from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.progress import ProgressCallback, Teller, telling
+from stillpath.pipeline.reading import dialect_for, doubts
+from stillpath.pipeline.result import (
+    AdviceFigures,
+    AdvisedFeature,
+    AdvisedShaper,
+    AxisSpectrum,
+    GroupFigures,
+    Result,
+    StageTime,
+)
+from stillpath.pipeline.shaping import ShapedMotion
+from stillpath.pipeline.simulate import STANDING_S, TextMotion
+from stillpath.version import __version__
+
+__all__ = ["advise_file"]
+
+V = TypeVar("V")
+
+_BLOCK_BYTES = 1 << 17
+_ROUNDS = 7
+_TOLERANCE = 1.001
+_ROUNDING_S = 1e-3
+_UNDO = (
+    f"Moves are untouched, and so are the slicer's times in the file; deleting the lines that hold "
+    f"{MARK.decode()!r} gives back the original."
+)
+
+
+def advise_file(
+    source: Path,
+    target: Path,
+    machine: Machine,
+    options: Options,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+    layers: Path | None = None,
+) -> Result:
+    """Write a file with advice.
+
+    Parameters and errors are those of `pipeline.compensate.compensate_file`. The slicer's times
+    in the file stay as they are, whatever `options.times` says: only lines of our own are added.
+    """
+    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    with (
+        contextlib.ExitStack() as files,
+        replacing(target) as temporary,
+        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+    ):
+        writer = None
+        with (
+            rewriting(container, temporary, name=target, told=packing) as text,
+            tempfile.TemporaryFile(dir=target.parent) as spool,
+            EarlierErrors(target.parent, 2) as earlier,
+        ):
+            if layers is not None:
+                names = channel_names(compensated=True)
+                writer = files.enter_context(written_layers(layers, names))
+            job = _Job(container.text, spool, machine, options, cache_dir, progress)
+            result = job.run(source.name, container.facts(), earlier, writer)
+            spool.seek(0)
+            shutil.copyfileobj(spool, text, _BLOCK_BYTES)
+        sizes = {
+            "original_bytes": source.stat().st_size,
+            "written_bytes": temporary.stat().st_size,
+        }
+        return result.model_copy(update=sizes)
+
+
+class _Job:
+    """One file on its way."""
+
+    def __init__(
+        self,
+        source: BinaryIO,
+        spool: BinaryIO,
+        machine: Machine,
+        options: Options,
+        cache_dir: Path | None,
+        progress: ProgressCallback | None,
+    ) -> None:
+        self._source, self._spool = source, spool
+        self._machine, self._options = machine, options
+        self._say = Teller(progress).say
+        self._clock = StageClock()
+        self._kit = kit(machine)
+        self._dialect = dialect_for(machine, options.dialect)
+        self._adviser = self._kit.adviser(self._dialect)
+        stated = self._adviser.stated or OFF
+        self._before, self._unmodelled = stated.modelled, stated.unknown_types
+        self._doubts = doubts(source, machine, options.dialect)
+        self._say("tuning the shaper to compare with", 0.0)
+        with self._clock.stage("yardstick"):
+            self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+
+    def run(
+        self, name: str, facts: SlicerFacts, earlier: EarlierErrors, layers: LayerWriter | None
+    ) -> Result:
+        machine, options = self._machine, self._options
+        size = self._source.seek(0, io.SEEK_END)
+        original = Measurement(
+            machine, DT_S, self._shaper, compensated=False, noted=earlier.note, size=size
+        )
+        before = SetErrors(machine, DT_S, stride=STRIDE)
+        reading = FirstReading(machine, self._adviser)
+        with self._clock.stage("measure the original"):
+            asked = self._go(
+                self._source, [original, before], "measuring the original", (0.0, 0.25), reading.see
+            )
+        was = before.errors()
+        names = asked.reader.feature_names
+        # What is stored for good must be the printer's own shaper.
+        shaped = not reading.stored_lines or self._adviser.stated is not None
+        with self._clock.stage("choose"):
+            self._source.seek(0)
+            samples = take_samples(self._source, machine, self._dialect)
+            choice = choose(
+                samples,
+                names,
+                machine,
+                self._adviser,
+                self._before,
+                options.budget_um,
+                {f: error.rms_um for f, error in was.items()},
+                reading.levels,
+                lambda share: self._say("choosing", 0.3 + 0.3 * share),
+                shaped=shaped,
+            )
+        with self._clock.stage("verify"):
+            writer, now = self._settled(choice, was, asked.time_s, samples.first_layer)
+        earlier.rewind()
+        advised = Measurement(
+            machine,
+            DT_S,
+            self._shaper,
+            compensated=True,
+            names=("after",),
+            take_layer=layers.add if layers else None,
+            beside=earlier.at,
+            size=size,
+        )
+        with self._clock.stage("measure"):
+            written = self._go(self._spool, [advised], "measuring", (0.8, 1.0), lambda _: None)
+        if layers is not None:
+            layers.finish(names)
+        self._say("done", 1.0)
+        figures = self._figures(choice, names, was, now, writer.lines)
+        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
+        return self._result(
+            name,
+            facts,
+            asked,
+            written,
+            original,
+            advised,
+            figures,
+            [
+                *stored_settings(
+                    reading.stored_lines,
+                    shaper=self._before.label if figures.shapers else "" if shaped else None,
+                ),
+                *shaper_warnings(
+                    self._unmodelled,
+                    none_known=not self._adviser.shapers,
+                    left=writer.shaper_left,
+                ),
+                *beyond_bounds(
+                    figures.features,
+                    choice.rungs[0],
+                    helpless,
+                    has_budget=options.budget_um is not None,
+                ),
+            ],
+        )
+
+    def _settled(
+        self,
+        choice: Choice,
+        was: dict[int, ClassError],
+        was_s: float,
+        first_layer: FirstLayer,
+    ) -> tuple[AdviceWriter, dict[int, ClassError]]:
+        """Write and measure until every feature is within its bound or at its slowest."""
+        for attempt in range(_ROUNDS):
+            writer = self._write(choice, first_layer)
+            after = SetErrors(self._machine, DT_S, stride=STRIDE)
+            shares = 0.6 + 0.03 * attempt, 0.8
+            written = self._go(self._spool, [after], "verifying", shares, lambda _: None)
+            now = after.errors()
+            over = {
+                f: now[f].rms_um / self._bound_um(f, was)
+                for f in choice.rung
+                if f in now and now[f].rms_um > _TOLERANCE * self._bound_um(f, was)
+            }
+            # The last round is for a file without advice.
+            if attempt + 2 < _ROUNDS and over and choice.mended(over):
+                continue
+            worse = bool(over) or _rms_um(now) > _TOLERANCE * _rms_um(was)
+            worse |= written.time_s > was_s + _ROUNDING_S
+            unbudgeted = self._options.budget_um is None and attempt + 1 < _ROUNDS
+            # Too little to choose from: what was there is better than any advice.
+            if not (unbudgeted and worse and choice.withdrawn()):
+                break
+        return writer, now
+
+    def _bound_um(self, feature: int, was: dict[int, ClassError]) -> float:
+        if self._options.budget_um is not None:
+            return self._options.budget_um
+        return max(was[feature].rms_um, 1e-3) if feature in was else np.inf
+
+    def _write(self, choice: Choice, first_layer: FirstLayer) -> AdviceWriter:
+        """Write the advised text to the spool."""
+        reader = Interpreter(self._machine, dialect=self._dialect)
+        writer = AdviceWriter(
+            self._adviser,
+            choice.advice(first_layer),
+            reader.feature_names,
+            self._kit.initial_limits(),
+            stamp(self._machine, self._options),
+        )
+        write_advised(self._source, self._spool, reader, writer)
+        return writer
+
+    def _go(
+        self,
+        file: BinaryIO,
+        sinks: Sequence[Measurement | SetErrors],
+        stage: str,
+        shares: tuple[float, float],
+        each: Callable[[ProgramBlock], None],
+    ) -> TextMotion:
+        """Measure the motion of a text."""
+        low, high = shares
+        motion = TextMotion(
+            file,
+            self._machine,
+            self._dialect,
+            DT_S,
+            longest_stand_s=STANDING_S,
+            shaping=self._before,
+            told=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
+            each=each,
+        )
+        operation, shaper = Operation(self._machine), ShapedMotion(DT_S)
+        for part in motion:
+            if part.jumped:
+                _add(shaper.flush(), sinks)
+                for sink in sinks:
+                    sink.jump()
+            moves = part.own_moves()
+            _add(shaper.push(part.motion(), part.shaping, operation.at(moves)), sinks)
+            operation.passed(moves)
+        _add(shaper.flush(), sinks)
+        for sink in sinks:
+            sink.finish()
+        self._notes = operation.notes()
+        return motion
+
+    def _figures(
+        self,
+        choice: Choice,
+        names: Sequence[str],
+        was: dict[int, ClassError],
+        now: dict[int, ClassError],
+        lines: int,
+    ) -> AdviceFigures:
+        bounds = choice.bounds()
+        features = []
+        for f, error in sorted(now.items()):
+            if f not in was:
+                continue
+            bound = bounds.get(f)
+            limit = self._bound_um(f, was) if f in choice.rung else None
+            features.append(
+                AdvisedFeature(
+                    name=names[f] if f >= 0 else "unnamed",
+                    accel_mm_s2=bound.at_least if bound else None,
+                    exact=f in choice.visible,
+                    bound_um=None if limit is None or np.isinf(limit) else limit,
+                    within_bound=limit is None or error.rms_um <= _TOLERANCE * limit,
+                    before_um=was[f].rms_um,
+                    after_um=error.rms_um,
+                    before_s=round(was[f].seconds, 3),
+                    after_s=round(error.seconds, 3),
+                )
+            )
+        return AdviceFigures(
+            before_shaper=self._before.label,
+            shapers=[AdvisedShaper(layer=n, label=s.label) for n, s in choice.shapers],
+            features=features,
+            lines=lines,
+        )
+
+    def _result(
+        self,
+        name: str,
+        facts: SlicerFacts,
+        asked: TextMotion,
+        written: TextMotion,
+        original: Measurement,
+        advised: Measurement,
+        figures: AdviceFigures,
+        warnings: Sequence[str],
+    ) -> Result:
+        machine, names = self._machine, asked.reader.feature_names
+        before, shaper = original.channels()
+        if self._before.is_on or any(label != OFF.label for label in asked.shapers):
+            before = before.model_copy(update={"label": "as sliced, with the firmware's shaper"})
+        after = advised.channels()[0].model_copy(update={"label": "advised"})
+        features = _merged(original.features(names), advised.features(names))
+        return Result(
+            version=__version__,
+            machine=machine.name,
+            machine_title=machine.title,
+            machine_revision=machine.revision,
+            settings=self._options.model_dump(exclude_none=True),
+            source_name=name,
+            channels=[before, after, shaper],
+            best_shaper=self._shaper.label,
+            original_time_s=asked.time_s,
+            time_s=written.time_s,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
+            original_bytes=0,
+            written_bytes=0,
+            segments=0,
+            segments_per_s=0.0,
+            peak_segments_per_s=0.0,
+            peak_velocity_mm_s=0.0,
+            peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
+            emission_rms_um=0.0,
+            emission_max_um=0.0,
+            filament_error_mm=0.0,
+            compensated_s=0.0,
+            extruding_s=sum(group.seconds for group in features),
+            pieces=0,
+            put_back=[],
+            put_back_extruding_share=0.0,
+            warnings=[
+                *self._doubts,
+                *asked.warnings,
+                *warnings,
+                *advised.warnings(),
+            ],
+            notes=[*self._notes, *kept_beyond(figures.features), _UNDO],
+            layers=_merged(original.layers(), advised.layers()),
+            features=features,
+            track=advised.track(),
+            spectra=_merged_spectra(original.spectra(), advised.spectra()),
+            layer_views=advised.layer_views(),
+            advice=figures,
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+        )
+
+
+def _rms_um(errors: dict[int, ClassError]) -> float:
+    """Return the error of all features together."""
+    seconds = sum(one.seconds for one in errors.values())
+    squares = sum(one.seconds * one.rms_um**2 for one in errors.values())
+    return float(np.sqrt(squares / (seconds or 1.0)))
+
+
+def _add(
+    ready: Iterator[tuple[MotionSamples, OperatingPoint]], sinks: Sequence[Measurement | SetErrors]
+) -> None:
+    for samples, point in ready:
+        for sink in sinks:
+            sink.operate_at(point)
+            if isinstance(sink, Measurement):
+                sink.add(samples)
+            else:
+                feature = samples.moves.feature[samples.row]
+                sink.add(samples.path_mm, samples.executed_mm, samples.extruding, feature)
+
+
+def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> list[GroupFigures]:
+    """Put the figures of both files side by side."""
+    known = {group.name: group for group in after}
+    out = []
+    for group in before:
+        other = known.get(group.name)
+        if other is None:
+            continue
+        out.append(
+            GroupFigures(
+                name=group.name,
+                seconds=other.seconds,
+                contour_rms_um=_in_order(group.contour_rms_um | other.contour_rms_um),
+                contour_max_um=_in_order(group.contour_max_um | other.contour_max_um),
+            )
+        )
+    return out
+
+
+def _in_order(values: dict[str, V]) -> dict[str, V]:
+    return {n: values[n] for n in channel_names(compensated=True) if n in values}
+
+
+def _merged_spectra(
+    before: Sequence[AxisSpectrum], after: Sequence[AxisSpectrum]
+) -> list[AxisSpectrum]:
+    out = []
+    for one, other in zip(before, after, strict=False):
+        ordered = _in_order(one.um_per_sqrt_hz | other.um_per_sqrt_hz)
+        out.append(one.model_copy(update={"um_per_sqrt_hz": ordered}))
+    return out

@@ -1,0 +1,470 @@
+"""Choose shaper and accelerations on samples from all over a file.
+
+Every type of shaper that the firmware has is tuned for the plants of the set: the frequencies at
+which the worst member errs least, where the walls count for as much as everything else. With each,
+every feature gets the highest acceleration of a ladder at which it stays within its bound. The
+shaper wins that brings the walls within their bounds, and then prints fastest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stillpath.gcode.firmware.base import Adviser
+from stillpath.gcode.pacing import FirstLayer
+from stillpath.gcode.slicers.features import feature_of
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid
+from stillpath.models.schedule import OperatingPoint
+from stillpath.models.shaping import AxisShaper, Shaping
+from stillpath.pipeline.advising.advice import (
+    KEPT_FEATURES,
+    Advice,
+    Bound,
+    is_visible,
+    wanted_accel,
+)
+from stillpath.pipeline.advising.trials import Trial, members_of
+from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.pipeline.pacing.samples import FileSamples
+from stillpath.pipeline.piece_compensator import DT_S
+
+__all__ = ["Choice", "choose", "ladder"]
+
+DAMPING = 0.1
+_LOW_MM_S2, _RATIO = 500.0, 1.2
+_LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
+"""Below `_LOW_MM_S2` walls go only if nothing else brings them within their bound."""
+_AIM = 0.95
+"""Part of a bound that the samples may use."""
+_POINTS, _MEMBERS = 1000, 5
+"""What frequencies are tuned with; all members decide in the end."""
+_COARSE = 6
+_TUNED_LEVELS = 5
+_MENDING_ROUNDS = 4
+_UNLIKE = 2.0
+"""How much more or less than the whole file samples may be said to err."""
+_SAME_TIME, _ROUNDING = 0.002, 1.001
+LEVEL_STEP = 0.02
+
+Told = Callable[[float], None]
+
+
+@dataclass(slots=True)
+class Choice:
+    """What was chosen for a file, to be mended where the whole file shows that it must.
+
+    Attributes
+    ----------
+    rungs : list of float
+        Accelerations [mm/s^2], rising.
+    rung : dict
+        Feature id to the number of its rung; None: as the file has it.
+    visible : set of int
+        Features that may be made slower than the file has them.
+    own_mm_s2 : dict
+        Feature id to the highest acceleration that the file gives it.
+    helpless : set of int
+        Features of these that no acceleration brings within their bounds: they get the quickest of
+        those with about the least error, and no slower.
+    shapers : list of (layer, Shaping)
+    """
+
+    rungs: list[float]
+    rung: dict[int, int | None]
+    visible: set[int]
+    own_mm_s2: dict[int, float]
+    helpless: set[int] = field(default_factory=set)
+    shapers: list[tuple[int, Shaping]] = field(default_factory=list)
+
+    def bounds(self) -> dict[int, Bound]:
+        """Return the bounds of accelerations by feature."""
+        return {
+            f: _bound(self.rungs[k], visible=f in self.visible)
+            for f, k in self.rung.items()
+            if k is not None
+        }
+
+    def advice(self, first_layer: FirstLayer) -> Advice:
+        """Return what to write."""
+        return Advice(self.bounds(), self.shapers, first_layer)
+
+    def mended(self, over: Mapping[int, float]) -> bool:
+        """Slow features down whose errors exceed their bounds by a ratio; return if any could be.
+
+        Parameters
+        ----------
+        over : mapping
+            Feature id to the ratio.
+        """
+        return bool(sum([self._slower(f, 1.0 / ratio) for f, ratio in over.items()]))
+
+    def withdrawn(self) -> bool:
+        """Leave everything as the file has it; return whether anything was advised."""
+        advised = bool(self.shapers) or any(k is not None for k in self.rung.values())
+        self.shapers, self.rung = [], dict.fromkeys(self.rung)
+        return advised
+
+    def _slower(self, feature: int, ratio: float) -> bool:
+        if feature in self.helpless:
+            return False
+        now = self.rung.get(feature)
+        own = self.own_mm_s2.get(feature, 0.0)
+        if now is None and feature not in self.visible:
+            return False
+        accel = own if now is None else self.rungs[now]
+        lower = [k for k, rung in enumerate(self.rungs) if rung < accel and rung <= ratio * accel]
+        found = lower[-1] if lower else 0
+        if feature not in self.visible:
+            self.rung[feature] = found if lower and self.rungs[found] > own else None
+            return True
+        if self.rungs[found] >= accel:
+            self.helpless.add(feature)
+            return False
+        self.rung[feature] = found
+        return True
+
+
+def choose(
+    samples: FileSamples,
+    names: Sequence[str],
+    machine: Machine,
+    adviser: Adviser,
+    before: Shaping,
+    budget_um: float | None,
+    whole_um: Mapping[int, float],
+    levels: Sequence[tuple[int, OperatingPoint]],
+    told: Told = lambda _share: None,
+    *,
+    shaped: bool = True,
+) -> Choice:
+    """Choose for a file.
+
+    Parameters
+    ----------
+    samples : FileSamples
+    names : sequence of str
+        Of the features.
+    machine : Machine
+    adviser : Adviser
+    before : Shaping
+        What the printer would shape with.
+    budget_um : float, optional
+        What every feature may err; None: what it erred before.
+    whole_um : mapping
+        What every feature erred in the whole file as it came.
+    levels : sequence of (layer, OperatingPoint)
+        Where the machine is from which layer on; more than one where plants follow a schedule.
+    told : callable, optional
+        Is given the share that is done.
+    shaped : bool
+        A shaper may be advised.
+    """
+    members = members_of(machine, DT_S)
+    as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
+    features = [f for f in as_sliced.features if _free(f, names)]
+    visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
+    was = {f: max(um, 1e-3) for f, um in as_sliced.errors(before).items()}
+    limits = _Limits(
+        {f: _bound_um(was[f], whole_um.get(f, was[f]), budget_um) for f in features},
+        has_budget=budget_um is not None,
+    )
+    choice = Choice(
+        ladder(adviser.highest_mm_s2, machine),
+        dict.fromkeys(features),
+        visible,
+        _own_mm_s2(samples, adviser),
+    )
+    if not features:
+        return choice
+    kinds = adviser.shapers if shaped else ()
+    candidates = _candidates(samples, machine, adviser, kinds, before, levels, visible, told)
+    points = [sample.point for sample in samples.samples]
+    by_point = [_by_point(c, points, levels, machine) for c in candidates]
+    every = [_Found() for _ in candidates]
+
+    def tried(rung: int | None) -> None:
+        trial = as_sliced
+        if rung is not None:
+            bounds = {f: _bound(choice.rungs[rung], visible=f in visible) for f in features}
+            trial = Trial(samples, bounds, machine, adviser, DT_S, members)
+        for found, shapings in zip(every, by_point, strict=True):
+            found.add(rung, trial.errors(shapings), trial.seconds)
+        told(0.5 + 0.5 * len(every[0].um) / (1 + len(choice.rungs)))
+
+    usual = [k for k, accel in enumerate(choice.rungs) if accel >= _LOW_MM_S2]
+    for rung in (None, *usual):
+        tried(rung)
+    for rung in reversed(range(len(choice.rungs) - len(usual))):
+        if any(all(limits.fair(found, f) for f in visible) for found in every):
+            break
+        tried(rung)
+    number, choice.rung = _best(every, limits, choice)
+    choice.helpless = {f for f in visible if not limits.reaching(every[number], f)}
+    choice.shapers = candidates[number].table(levels)
+    for _ in range(_MENDING_ROUNDS):
+        trial = Trial(samples, choice.bounds(), machine, adviser, DT_S, members)
+        um = trial.errors(by_point[number])
+        over = {f: limits.ratio(um[f], f, k) for f, k in choice.rung.items()}
+        if not choice.mended({f: ratio for f, ratio in over.items() if ratio > 1.0}):
+            break
+    return choice
+
+
+def ladder(highest_mm_s2: float, machine: Machine) -> list[float]:
+    """Return accelerations to choose from, rising to the highest that the machine is set up for."""
+    rungs = [min(highest_mm_s2, machine.command.accel_mm_s2)]
+    while True:
+        ratio = _RATIO if rungs[-1] >= _LOW_MM_S2 * _RATIO else _LOW_RATIO
+        lower = 10.0 * math.floor(rungs[-1] / ratio / 10.0)
+        if lower < _LOWEST_MM_S2:
+            return rungs[::-1]
+        rungs.append(lower)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What trials with one shaper have shown: by rung (None: as the file has it), by feature."""
+
+    um: dict[int | None, dict[int, float]] = field(default_factory=dict)
+    seconds: dict[int | None, dict[int, float]] = field(default_factory=dict)
+
+    def add(self, rung: int | None, um: dict[int, float], seconds: dict[int, float]) -> None:
+        self.um[rung], self.seconds[rung] = um, seconds
+
+    def error(self, feature: int, rung: int | None) -> float:
+        return self.um[rung].get(feature, math.inf)
+
+    def time_s(self, feature: int, rung: int | None) -> float:
+        return self.seconds[rung].get(feature, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """What features may err in the samples."""
+
+    bound_um: dict[int, float]
+    has_budget: bool
+
+    def ratio(self, error_um: float, feature: int, rung: int | None) -> float:
+        """Return the part of its limit that an error is: the limit lies a margin below the bound.
+
+        Without a budget none is needed where everything is as the file has it.
+        """
+        margin = _AIM if self.has_budget or rung is not None else 1.0
+        return error_um / (_ROUNDING * margin * self.bound_um[feature])
+
+    def reaching(self, found: _Found, feature: int) -> list[int | None]:
+        """Return the rungs within the bound itself."""
+        return [k for k in found.um if found.error(feature, k) <= self.bound_um[feature]]
+
+    def fair(self, found: _Found, feature: int) -> list[int | None]:
+        """Return the rungs within the limit."""
+        return [k for k in found.um if self.ratio(found.error(feature, k), feature, k) <= 1.0]
+
+
+def _best(
+    every: Sequence[_Found], limits: _Limits, choice: Choice
+) -> tuple[int, dict[int, int | None]]:
+    """Return the number of the best shaper, and the rung of every feature with it."""
+    ranked = []
+    for number, found in enumerate(every):
+        rungs = {
+            f: _quickest(found, f, limits, choice.rungs, visible=f in choice.visible)
+            for f in choice.rung
+        }
+        ratios = [limits.ratio(found.error(f, k), f, k) for f, k in rungs.items()]
+        missed = sum(ratio > 1.0 for ratio in ratios)
+        seconds = sum(found.time_s(f, k) for f, k in rungs.items())
+        ranked.append((missed, seconds, max(ratios), number, rungs))
+    least = min(r[0] for r in ranked)
+    fair = [r for r in ranked if r[0] == least]
+    quickest = min(r[1] for r in fair)
+    close = [r for r in fair if r[1] <= quickest * (1.0 + _SAME_TIME)]
+    return min(close, key=lambda r: (r[2], r[3]))[3:]
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A shaper for each level (one for all where it is not ours)."""
+
+    shapings: list[Shaping]
+    ours: bool
+
+    def table(self, levels: Sequence[tuple[int, OperatingPoint]]) -> list[tuple[int, Shaping]]:
+        if not self.ours:
+            return []
+        rows: list[tuple[int, Shaping]] = []
+        for (layer, _), shaping in zip(levels, self.shapings, strict=True):
+            if not rows or rows[-1][1] != shaping:
+                rows.append((layer, shaping))
+        return rows
+
+
+def _candidates(
+    samples: FileSamples,
+    machine: Machine,
+    adviser: Adviser,
+    kinds: Sequence[str],
+    before: Shaping,
+    levels: Sequence[tuple[int, OperatingPoint]],
+    visible: set[int],
+    told: Told,
+) -> list[_Candidate]:
+    """Return every type of shaper at its best frequencies, and what there was before."""
+    count = len(levels)
+    made = [_Candidate([before] * count, ours=False)]
+    members = members_of(machine, DT_S)
+    few = [members[0], *members[1 :: max(1, -(-(len(members) - 1) // _MEMBERS))]]
+    tuned = np.unique(np.linspace(0, count - 1, min(count, _TUNED_LEVELS)).round().astype(int))
+    logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}
+    for n, level in enumerate(tuned.tolist() if kinds else []):
+        point = levels[level][1] if count > 1 else None
+        trial = Trial(samples, {}, machine, adviser, DT_S, few, point=point)
+        at = trial.points(_POINTS, sorted(visible))
+        for m, kind in enumerate(kinds):
+            start = logs[kind][-1] if logs[kind] else None
+            i, j = _tuned(trial, kind, at, len(few), start, same=adviser.same_for_both)
+            logs[kind].append((i, j))
+            told(0.5 * (n + (m + 1) / len(kinds)) / len(tuned))
+    for kind, found in logs.items():
+        axes = []
+        for column in (0, 1):
+            index = np.interp(np.arange(count), tuned, [pair[column] for pair in found])
+            f_hz = FREQUENCIES_HZ[0] * (FREQUENCIES_HZ[1] / FREQUENCIES_HZ[0]) ** np.round(index)
+            axes.append([AxisShaper(kind, round(float(f), 1), DAMPING) for f in f_hz])
+        made.append(_Candidate([Shaping(x, y) for x, y in zip(*axes, strict=True)], ours=True))
+    return made
+
+
+def _tuned(
+    trial: Trial,
+    kind: str,
+    at: np.ndarray,
+    members: int,
+    start: tuple[float, float] | None,
+    *,
+    same: bool,
+) -> tuple[int, int]:
+    """Return the numbers of the frequencies of X and Y at which the worst member errs least."""
+    answers: dict[tuple[int, int, int], np.ndarray] = {}
+    known: dict[tuple[int, int], float] = {}
+    top = len(FREQUENCIES_HZ) - 1
+
+    def answer(member: int, axis: int, number: int) -> np.ndarray:
+        key = (member, axis, number)
+        if key not in answers:
+            f_hz = float(FREQUENCIES_HZ[number])
+            answers[key] = trial.axis_answer(member, axis, kind, f_hz, at)
+        return answers[key]
+
+    def rms(i: int, j: int) -> float:
+        if (i, j) not in known:
+            motions = [(answer(k, 0, i), answer(k, 1, j)) for k in range(members)]
+            known[i, j] = trial.rms(motions, at)
+        return known[i, j]
+
+    coarse = range(0, top + 1, _COARSE)
+    if start is not None:
+        i, j = int(start[0]), int(start[1])
+    elif same:
+        i = j = min(coarse, key=lambda k: rms(k, k))
+    else:
+        i = j = top // 2
+        for _ in range(2):
+            i = min(coarse, key=lambda k: rms(k, j))
+            j = min(coarse, key=lambda k: rms(i, k))
+    while True:
+        steps = [-3, -1, 1, 3]
+        if same:
+            around = [(i + a, i + a) for a in steps]
+        else:
+            around = [(i + a, j) for a in steps] + [(i, j + a) for a in steps]
+            around += [(i + a, j + b) for a in (-2, 2) for b in (-2, 2)]
+        around = [(a, b) for a, b in around if 0 <= a <= top and 0 <= b <= top]
+        a, b = min(around, key=lambda pair: (rms(*pair), pair))
+        if rms(a, b) >= rms(i, j):
+            return i, j
+        i, j = a, b
+
+
+def _by_point(
+    candidate: _Candidate,
+    points: Sequence[OperatingPoint],
+    levels: Sequence[tuple[int, OperatingPoint]],
+    machine: Machine,
+) -> Mapping[OperatingPoint, Shaping] | Shaping:
+    """Return the shaper of every sample's point."""
+    if len(levels) == 1:
+        return candidate.shapings[0]
+    grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
+    known = {grid.level(point): n for n, (_, point) in enumerate(levels)}
+    heights = np.array([(p.mass_kg, p.z_mm) for _, p in levels])
+    out = {}
+    for point in points:
+        number = known.get(grid.level(point))
+        if number is None:
+            scale = np.maximum(np.ptp(heights, axis=0), 1e-9)
+            away = (heights - (point.mass_kg, point.z_mm)) / scale
+            number = int(np.argmin(np.sum(away**2, axis=1)))
+        out[point] = candidate.shapings[number]
+    return out
+
+
+def _quickest(
+    found: _Found,
+    feature: int,
+    limits: _Limits,
+    rungs: Sequence[float],
+    *,
+    visible: bool,
+) -> int | None:
+    """Return the rung with the least time of those within the limit.
+
+    Where there is none: the file's own, or for what is seen the quickest of those with about the
+    least error that are not low.
+    """
+
+    def key(rung: int | None) -> tuple[float, int]:
+        return round(found.time_s(feature, rung), 4), -1 if rung is None else rung
+
+    fair = limits.fair(found, feature)
+    if not fair and not visible:
+        return None
+    fair = fair or limits.reaching(found, feature)
+    if not fair:
+        usual = [k for k in found.um if k is None or rungs[k] >= _LOW_MM_S2]
+        least = min(found.error(feature, k) for k in usual)
+        fair = [k for k in usual if found.error(feature, k) <= 1.05 * least]
+    return min(fair, key=key)
+
+
+def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:
+    own: dict[int, float] = {}
+    for sample in samples.samples:
+        moves, limits = sample.piece.moves, sample.piece.limits
+        wanted, file = wanted_accel(moves, limits, Advice(), adviser)
+        for feature in np.unique(moves.feature[~np.isnan(wanted)]).tolist():
+            rows = (moves.feature == feature) & ~np.isnan(wanted)
+            own[feature] = max(own.get(feature, 0.0), float(np.max(file[rows])))
+    return own
+
+
+def _bound_um(sampled_um: float, whole_um: float, budget_um: float | None) -> float:
+    """Return what a feature may err in the samples, where it errs otherwise than in the file."""
+    if budget_um is None:
+        return sampled_um
+    ratio = sampled_um / max(whole_um, 1e-3)
+    return budget_um * min(max(ratio, 1.0 / _UNLIKE), _UNLIKE)
+
+
+def _bound(accel_mm_s2: float, *, visible: bool) -> Bound:
+    return Bound(accel_mm_s2, accel_mm_s2 if visible else math.inf)
+
+
+def _free(feature: int, names: Sequence[str]) -> bool:
+    return feature_of(names[feature] if feature >= 0 else "") not in KEPT_FEATURES

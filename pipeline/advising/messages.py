@@ -1,0 +1,106 @@
+"""What a person is told about advice: warnings and notes of the report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from stillpath.pipeline.result import AdvisedFeature
+
+__all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings"]
+
+
+def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) -> list[str]:
+    """Say what is not known of the printer's shaper.
+
+    Parameters
+    ----------
+    unmodelled : sequence of str
+        Types that the machine states and that have no model.
+    none_known : bool
+        The firmware takes none from a file.
+    left : bool
+        Ours stays in force behind the file.
+    """
+    found = [
+        f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
+        "as it came are those without it."
+        for kind in unmodelled
+    ]
+    if none_known:
+        found.append(
+            "No shaper is advised: this firmware takes none from a file, or the machine does "
+            "not say that it has one (firmware.shaper)."
+        )
+    if left:
+        found.append(
+            "The printer's own shaper is not known (firmware.shaper in the machine): the one "
+            "advised stays in force after the print, until the firmware restarts."
+        )
+    return found
+
+
+def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
+    """Say what lines store for good that store what is in force.
+
+    Parameters
+    ----------
+    lines : sequence of int
+    shaper : str, optional
+        What the printer gets back before them; empty: it had it all along; None: nobody knows, so
+        none is advised.
+    """
+    if not lines:
+        return []
+    what = "; no shaper is advised, for the printer's is not known (firmware.shaper in the machine)"
+    if shaper is not None:
+        what = f" and the shaper ({shaper})" if shaper else ""
+    said = (
+        f"Line {lines[0]} stores for good what is in force. Before it the printer gets back the "
+        f"acceleration that the file or the machine's document says{what}: see that they are the "
+        "printer's, or take the line out."
+    )
+    return [said]
+
+
+def beyond_bounds(
+    features: Sequence[AdvisedFeature],
+    lowest_mm_s2: float,
+    helpless: Sequence[str],
+    *,
+    has_budget: bool,
+) -> list[str]:
+    """Say which features that are seen err more than they may, and why.
+
+    Parameters
+    ----------
+    features : sequence of AdvisedFeature
+    lowest_mm_s2 : float
+        The lowest acceleration that was tried.
+    helpless : sequence of str
+        Names of features that no acceleration would bring within their bounds.
+    has_budget : bool
+    """
+    return [
+        f"{feature.name}: {feature.after_um:.1f} um are predicted, more than the "
+        f"{feature.bound_um:.1f} um it may have"
+        + (
+            f": no acceleration from {lowest_mm_s2:.0f} mm/s^2 on would do. Corners shake the "
+            "machine too (square corner velocity, jerk, junction deviation)."
+            if feature.name in helpless
+            else "; a larger budget is needed."
+            if has_budget
+            else " as sliced."
+        )
+        for feature in features
+        if not feature.within_bound and feature.exact
+    ]
+
+
+def kept_beyond(features: Sequence[AdvisedFeature]) -> list[str]:
+    """Say what is not seen and errs more than the budget: it is not made slower for that."""
+    names = [
+        f"{f.name} ({f.after_um:.1f} um)" for f in features if not f.within_bound and not f.exact
+    ]
+    if not names:
+        return []
+    return [f"Beyond its bound, and no slower than the file has it: {', '.join(names)}."]

@@ -1,0 +1,80 @@
+"""The first reading of a file that is to be advised: what is in it, and whether it is refused."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.base import Adviser
+from stillpath.gcode.types import EventKind, ProgramBlock, rows_of
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid
+from stillpath.models.schedule import EMPTY, OperatingPoint
+from stillpath.pipeline.advising.choosing import LEVEL_STEP
+from stillpath.pipeline.advising.inserting import MARK
+from stillpath.pipeline.operating_point import Operation
+
+__all__ = ["FirstReading"]
+
+
+class FirstReading:
+    """What is noted while the file is read as it came.
+
+    Attributes
+    ----------
+    levels : list of (layer, OperatingPoint)
+        Where the machine is from which layer on, as far as its plants notice.
+    stored_lines : list of int
+        Lines that store for good what is in force.
+    """
+
+    def __init__(self, machine: Machine, adviser: Adviser) -> None:
+        self._adviser = adviser
+        self._follows = bool(machine.schedules)
+        self._operation = Operation(machine)
+        self._grid = OperatingGrid(machine, step=LEVEL_STEP, blend_step=LEVEL_STEP)
+        self._layer: int | None = None
+        self._level: OperatingPoint | None = None
+        self.levels: list[tuple[int, OperatingPoint]] = [(-1, EMPTY)]
+        self.stored_lines: list[int] = []
+
+    def see(self, block: ProgramBlock) -> None:
+        """Take note of a block; refuse a file that was processed, or could not be restored."""
+        stamps = np.flatnonzero(block.events.kind == EventKind.STAMP)
+        if len(stamps):
+            raise GcodeError(
+                "this file was already processed by stillpath; advise the original",
+                line=int(block.events.line[stamps[0]]),
+            )
+        if MARK in block.text:
+            raise GcodeError(
+                f"the file has lines with {MARK.decode()!r}, so that advice could not be undone; "
+                "take them out (stillpath remove-advice) first"
+            )
+        self._see_stores(block)
+        if not self._follows or len(block.moves) == 0:
+            return
+        edges = np.flatnonzero(np.diff(block.moves.layer)) + 1
+        for first, last in pairwise([0, *edges.tolist(), len(block.moves)]):
+            moves = rows_of(block.moves, slice(first, last))
+            point, layer = self._operation.at(moves), int(moves.layer[0])
+            self._operation.passed(moves)
+            if layer == self._layer:
+                continue
+            level = self._grid.level(point)
+            if level != self._level:
+                self._level = level
+                if self._layer is None:
+                    self.levels = [(layer, point)]
+                else:
+                    self.levels.append((layer, point))
+            self._layer = layer
+
+    def _see_stores(self, block: ProgramBlock) -> None:
+        events, offset = block.events, block.text_offset
+        for k in np.flatnonzero(events.kind == EventKind.UNKNOWN).tolist():
+            line = block.text[int(events.byte_start[k]) - offset : int(events.byte_end[k]) - offset]
+            if self._adviser.stores(line.decode("utf-8", "replace")):
+                self.stored_lines.append(int(events.line[k]))

@@ -1,0 +1,248 @@
+"""Some seconds of a print, tried with other accelerations and other shapers.
+
+Shaper and plant are both linear, so they commute: the plants of the set answer the plan once, and
+the answer to a shaped plan is a few shifted copies of that, needed only where it is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.base import Adviser
+from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.sampler import sample_phases
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
+from stillpath.models.schedule import OperatingPoint
+from stillpath.models.shaping import AxisShaper, Shaping
+from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
+from stillpath.pipeline.measuring.reference_shaper import shaped_at
+from stillpath.pipeline.pacing.samples import FileSamples, Sample
+from stillpath.simulation.measures import PathDistances
+from stillpath.simulation.scheduled import MachineStream
+
+__all__ = ["Trial", "members_of"]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_REST_S = 0.15
+_POINTS = 600
+"""Points that are measured of every feature."""
+
+
+def members_of(machine: Machine, dt_s: float) -> list[int | None]:
+    """Return the numbers of the machines of the set: the nominal one (None), and the members.
+
+    As `pipeline.measuring.set_errors` has them: member k of X with member k of Y.
+    """
+    sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
+    return [None, *range(min(len(one.members) for one in sets))]
+
+
+@dataclass(frozen=True, slots=True)
+class _Motion:
+    """The sampled motion of all samples, one behind the other, rests between them."""
+
+    path_mm: Array
+    feature: NDArray[np.int32]
+    """-2 where nothing is printed."""
+    bounds: list[tuple[int, int, OperatingPoint]]
+    """Samples [first, last) of each, and where the machine is."""
+    seconds: dict[int, float]
+    """How long each feature lasts; -2: all the rest."""
+
+
+class Trial:
+    """One way to move, ready to be measured under any shaper.
+
+    Parameters
+    ----------
+    samples : FileSamples
+    bounds : mapping
+        Feature id to the bounds of its acceleration.
+    machine : Machine
+    adviser : Adviser
+    dt_s : float
+    members : sequence
+        Of `members_of`.
+    point : OperatingPoint, optional
+        Where the machine is; None: where it is when the samples are printed.
+
+    Attributes
+    ----------
+    seconds : dict
+        Time of each feature; -2 of all the rest.
+    total_s : float
+    """
+
+    def __init__(
+        self,
+        samples: FileSamples,
+        bounds: Mapping[int, Bound],
+        machine: Machine,
+        adviser: Adviser,
+        dt_s: float,
+        members: Sequence[int | None],
+        *,
+        point: OperatingPoint | None = None,
+    ) -> None:
+        advice = Advice(bounds, first_layer=samples.first_layer)
+        motion = _motion(samples.samples, advice, machine, adviser, dt_s)
+        self._dt_s = dt_s
+        self._path, self._feature = motion.path_mm, motion.feature
+        self._bounds = [(a, b, p if point is None else point) for a, b, p in motion.bounds]
+        self.seconds = motion.seconds
+        self.total_s = sum(motion.seconds.values())
+        self._distance = PathDistances(self._path, dt_s)
+        self._answers = [self._answer(machine, member) for member in members]
+        self._index = {
+            f: _chosen(self._feature, f) for f in np.unique(self._feature).tolist() if f >= -1
+        }
+        every = [i for i in self._index.values() if len(i)]
+        self._at = np.unique(np.concatenate(every)) if every else np.zeros(0, np.int64)
+
+    @property
+    def features(self) -> list[int]:
+        """Ids of what is printed."""
+        return list(self._index)
+
+    def errors(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping) -> dict[int, float]:
+        """Return the rms contour error [um] of every feature, that of the worst member.
+
+        Parameters
+        ----------
+        shapings : Shaping, or mapping of it
+            For all points at which the samples are.
+        """
+        at = self._at
+        error = self._distances(shapings, at)
+        found = {}
+        for feature, index in self._index.items():
+            rows = error[:, np.searchsorted(at, index)]
+            mean = np.sqrt(np.mean(rows**2, axis=1))
+            found[feature] = 1e3 * float(np.max(mean))
+        return found
+
+    def _distances(self, shapings: Mapping[OperatingPoint, Shaping] | Shaping, at: Ints) -> Array:
+        """Return contour errors [mm] at chosen samples, shape (members, len(at))."""
+        out = np.empty((len(self._answers), len(at)))
+        for row, answer in zip(out, self._answers, strict=True):
+            y = np.empty((2, len(at)))
+            if isinstance(shapings, Shaping):
+                self._shape(answer, shapings, at, y)
+            else:
+                for first, last, point in self._bounds:
+                    part = slice(*np.searchsorted(at, (first, last)).tolist())
+                    self._shape(answer, shapings[point], at[part], y[:, part])
+            row[:] = self._distance.at(y, at)
+        return out
+
+    def points(self, count: int, chosen: Sequence[int]) -> Ints:
+        """Return some samples, one half of the features that are chosen, one half of others."""
+        halves = [
+            [i for f, i in self._index.items() if (f in chosen) is one] for one in (True, False)
+        ]
+        found = []
+        for half in halves:
+            if half:
+                every = np.unique(np.concatenate(half))
+                step = max(1, -(-len(every) * len([h for h in halves if h]) // count))
+                found.append(every[::step])
+        return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
+
+    def axis_answer(self, member: int, axis: int, kind: str, f_hz: float, at: Ints) -> Array:
+        """Return positions of one axis at chosen samples under one shaper, of one member."""
+        pulses = AxisShaper(kind, f_hz).pulses()
+        return shaped_at(self._answers[member][axis], self._dt_s, pulses, at)
+
+    def rms(self, positions: Sequence[tuple[Array, Array]], at: Ints) -> float:
+        """Return the rms contour error [mm] of the worst of several motions."""
+        worst = 0.0
+        for x, y in positions:
+            error = self._distance.at(np.stack([x, y]), at)
+            worst = max(worst, float(error @ error))
+        return float(np.sqrt(worst / max(len(at), 1)))
+
+    def _answer(self, machine: Machine, member: int | None) -> Array:
+        parts = [np.zeros((2, 0))]
+        stream: MachineStream | None = None
+        for first, last, point in self._bounds:
+            if stream is None:
+                stream = MachineStream(machine, self._dt_s, point, member=member)
+            stream.operate_at(point)
+            part = self._path[:, first:last]
+            parts.append(stream.push(part, part))
+        return np.concatenate(parts, axis=1)
+
+    def _shape(self, answer: Array, shaping: Shaping, at: Ints, out: Array) -> None:
+        for axis, shaper in enumerate((shaping.x, shaping.y)):
+            out[axis] = shaped_at(answer[axis], self._dt_s, shaper.pulses(), at)
+
+
+def _motion(
+    samples: Sequence[Sample], advice: Advice, machine: Machine, adviser: Adviser, dt_s: float
+) -> _Motion:
+    paths: list[Array] = []
+    features: list[NDArray[np.int32]] = []
+    bounds: list[tuple[int, int, OperatingPoint]] = []
+    seconds: dict[int, float] = {}
+    end, stands_at = 0, np.zeros(2)
+    pad = round(_REST_S / dt_s)
+    for sample in samples:
+        phases = _planned(sample, advice, machine, adviser)
+        if len(phases) == 0:
+            continue
+        way = phases.direction
+        prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
+        numbers = phases.move_index - phases.move_index[0]
+        feature = np.where(prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
+        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        for one in np.unique(feature).tolist():
+            seconds[one] = seconds.get(one, 0.0) + float(np.sum(duration[feature == one]))
+        total_s = float(phases.t_s[-1] + duration[-1] - phases.t_s[0])
+        position, row = sample_phases(phases, (float(phases.t_s[0]), dt_s, round(total_s / dt_s)))
+        if position.shape[1] == 0:
+            continue
+        # Errors do not depend on the place; without a jump nothing vibrates between samples.
+        path = position[:2] - position[:2, :1] + stands_at[:, None]
+        stands_at = path[:, -1]
+        paths.append(np.pad(path, ((0, 0), (pad, pad)), mode="edge"))
+        features.append(np.pad(feature[row], pad, constant_values=-2))
+        first, end = end, end + paths[-1].shape[1]
+        bounds.append((first, end, sample.point))
+    if not paths:
+        return _Motion(np.zeros((2, 0)), np.zeros(0, np.int32), [], seconds)
+    return _Motion(np.concatenate(paths, axis=1), np.concatenate(features), bounds, seconds)
+
+
+def _planned(sample: Sample, advice: Advice, machine: Machine, adviser: Adviser) -> Phases:
+    """Plan a sample with the accelerations that are advised."""
+    piece = sample.piece
+    moves = piece.moves
+    wanted, file = wanted_accel(moves, piece.limits, advice, adviser)
+    changed = np.flatnonzero(~np.isnan(wanted) & (wanted != file))
+    if not len(changed):
+        return piece.phases
+    limits, limits_id = list(piece.limits), moves.limits_id.copy()
+    made: dict[tuple[int, float], int] = {}
+    for k in changed.tolist():
+        key = (int(moves.limits_id[k]), float(wanted[k]))
+        if key not in made:
+            made[key] = len(limits)
+            limits.append(adviser.with_accel(piece.limits[key[0]], key[1]))
+        limits_id[k] = made[key]
+    return plan_moves(replace(moves, limits_id=limits_id), limits, machine)
+
+
+def _chosen(feature: NDArray[np.int32], wanted: int) -> Ints:
+    """Choose samples of a feature, one of each cell: they share no rhythm with the motion."""
+    rows = np.flatnonzero(feature == wanted)
+    step = max(1, len(rows) // _POINTS)
+    offset = np.random.default_rng(1).integers(0, step, len(rows) // step)
+    return np.asarray(rows[np.arange(len(offset)) * step + offset], np.int64)

@@ -1,0 +1,329 @@
+"""How much of a machine's compensation its plant set can bear: the promise of the default.
+
+On the plants that explain the measurement a file shall print no worse than with the shaper that the
+same measurement leads to. Before anything is printed, both commands are tried on the reference
+motion, all members answer, and the mixture is taken that is best for the likely ones without being
+bad for any; what the worst of them pays is kept with the choice.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.cautious import Caution
+from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.friction import against_friction
+from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.friction import DryFriction
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
+from stillpath.models.reference_motion import reference_motion
+from stillpath.pipeline.files import replacing
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Channel
+from stillpath.simulation.measures import PathDistances
+from stillpath.simulation.response import response
+
+__all__ = [
+    "Choice",
+    "caution_for",
+    "choose_caution",
+    "design_mode",
+    "designed",
+    "error_ranges",
+    "measured_set",
+    "member_pairs",
+    "most_share",
+    "pair_weights",
+    "prediction_note",
+]
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
+
+_VERSION = 7
+_SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
+_UNSEEN_SHARE = 0.85
+"""Most where the phase was not measured: what a set does not hold, it cannot warn of."""
+_PRICE = 0.5
+"""Of a member that fares worse than with the shaper, by how much it does: members contradict each
+other, and to please the least likely one would mean to leave the others alone."""
+_COARSE_UM, _LEAST_FIT = 4.0, 0.5
+"""Contour error from which on straight segments may take all of their tolerance, and the least
+share of it: on machines that are known well the segments would be the larger error."""
+_FRICTION_UNSURE = 0.25
+"""Relative: of what logs say of it, on virtual printers 10 % are missed, 25 % seldom."""
+_LAG_UNSURE_S = 1.5e-4
+"""Of one axis against the other: alignment sets both to 0, viscous guides may delay one of them."""
+_STRIDE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The mixture chosen for a machine, and what its set says of it on the reference motion.
+
+    Attributes
+    ----------
+    shares : (float, float)
+        Of filtered basis functions in the command of X and Y.
+    worst, mean : float
+        Largest over the members, and their geometric mean with their weights, of the contour error
+        against the shaper's.
+    worst_to_none : float
+        Largest against no compensation.
+    rms_um : float
+        Contour error, geometric mean over the members with their weights.
+    ranges : dict
+        By channel of a report, least and largest contour error of the members (delays and all)
+        against the nominal plants' with the same command.
+    """
+
+    shares: tuple[float, float]
+    worst: float
+    mean: float
+    worst_to_none: float
+    rms_um: float
+    ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def fit_share(self) -> float:
+        """How much of the tolerance a fit to the command may use."""
+        return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
+
+    def ranged(self, channel: Channel) -> Channel:
+        """Return a channel of a report with the range over the members."""
+        if channel.name not in self.ranges:
+            return channel
+        rms_um = channel.selected_rms_um
+        rms_um = channel.extruding.contour_rms_um if rms_um is None else rms_um
+        low, high = (rms_um * s for s in self.ranges[channel.name])
+        return channel.model_copy(update={"contour_range_um": (low, high)})
+
+
+def measured_set(axis: PlantSetSpec) -> bool:
+    """Whether an axis has members that a measurement gave, each a plant of its own."""
+    return isinstance(axis.members, tuple) and len(axis.members) > 1
+
+
+def design_mode(machine: Machine, options: Options) -> str:
+    """Return the robust mode of `compensation.fbf.PreviewFbf` that the options ask for."""
+    if options.robust != "auto":
+        return options.robust
+    return "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
+
+
+def designed(options: Options, mode: str, design: Callable[[str], T]) -> T:
+    """Return the design of a mode, or by default of the plants in the middle if it refuses itself.
+
+    Plants that ring for longer than any window make a set refuse itself.
+    """
+    try:
+        return design(mode)
+    except DesignError:
+        if options.robust != "auto" or mode == "off":
+            raise
+        return design("off")
+
+
+def caution_for(
+    machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
+) -> tuple[Caution, Choice] | None:
+    """Return what the default takes of the shaper, and why; None where it takes none."""
+    vibration = options.method.removesuffix("+ripple")
+    if vibration != "fbf" or options.robust != "auto" or design_mode(machine, options) == "off":
+        return None
+    return choose_caution(machine, shaper, directory, dt_s, options.basis)
+
+
+def prediction_note(machine: Machine, choice: Choice) -> str:
+    """Say what the figures of a report are, and how far apart the plants behind them lie."""
+    measured = []
+    for axis, plants in sorted(machine.axes.items()):
+        about = plants.provenance
+        day = f" of {about.measured_on}" if about and about.measured_on else ""
+        what = about.kind if about else "plants"
+        measured.append(f"{len(plants.weighted_members())} ({axis.upper()}: {what}{day})")
+    return (
+        f"Figures are predictions of the plants in the middle of {' and '.join(measured)} that "
+        "explain the measurement. On a test motion, delays of the axes aside, the contour error of "
+        "all of them is at most "
+        f"{choice.worst_to_none:.2f} of what it is without compensation, and {choice.mean:.2f} of "
+        f"the shaper's ({choice.worst:.2f} on the worst of them)."
+    )
+
+
+def choose_caution(
+    machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = "ce-opt"
+) -> tuple[Caution, Choice]:
+    """Choose how much of the compensation a machine bears; found once per machine revision.
+
+    Parameters
+    ----------
+    shaper : BestShaper
+        What the nominal plants lead to.
+    directory : Path
+        Where the choice is kept.
+    """
+    path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
+    choice: Choice | None = None
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        found = json.loads(path.read_text(encoding="utf-8"))
+        ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
+        choice = Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
+    if choice is None:
+        choice = _tried(machine, shaper, dt_s, basis)
+        directory.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as temporary:
+            temporary.write_text(json.dumps(asdict(choice)), encoding="utf-8")
+    return (
+        Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz, choice.fit_share),
+        choice,
+    )
+
+
+def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
+    path, extruding = reference_motion(dt_s)
+    no_rests = np.zeros((0, 2), np.int64)
+    exact = designed(
+        Options(),
+        "ensemble",
+        lambda mode: PreviewFbf(machine, dt_s, basis=basis, robust=mode),
+    )
+    exact.reset(path[:, 0])
+    smooth = ShaperCompensator(
+        machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz
+    )
+    commands = [one.compensate(path, extruding, no_rests) for one in (exact, smooth)]
+    at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
+    distances = PathDistances(path, dt_s)
+    answers = [
+        [response(pair, command)[:, at] for command in (*commands, path)]
+        for pair in member_pairs(machine, dt_s)
+    ]
+
+    def rms(points: Array) -> float:
+        error = distances.at(points, at)
+        return float(np.sqrt(np.mean(error**2)))
+
+    weights = pair_weights(machine, len(answers))
+    shaped = np.array([rms(smooth_mm) for _, smooth_mm, _ in answers])
+    none = np.array([rms(none_mm) for _, _, none_mm in answers])
+
+    def tried(shares: tuple[float, float]) -> Choice:
+        a = np.array(shares)[:, None]
+        ours = np.array(
+            [rms(a * exact_mm + (1 - a) * smooth_mm) for exact_mm, smooth_mm, _ in answers]
+        )
+        ratio = ours / np.maximum(shaped, 1e-12)
+        return Choice(
+            shares,
+            float(ratio.max()),
+            float(np.exp(weights @ np.log(ratio))),
+            float(np.max(ours / np.maximum(none, 1e-12))),
+            float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
+        )
+
+    most = [most_share(machine.axes[axis]) for axis in ("x", "y")]
+    both = [tried((min(share, most[0]), min(share, most[1]))) for share in _SHARES]
+    best = min(both, key=_rank)
+    for i in (0, 1):
+        others = [
+            tried((share, best.shares[1]) if i == 0 else (best.shares[0], share))
+            for share in _SHARES
+            if share <= most[i]
+        ]
+        best = min([best, *others], key=_rank)
+    a = np.array(best.shares)[:, None]
+    mixed = a * commands[0] + (1 - a) * commands[1]
+    channels = {
+        "before": path,
+        "after": against_friction(mixed, machine.friction_mm, no_rests, dt_s),
+        "shaper": commands[1],
+    }
+    return replace(best, ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+
+
+def error_ranges(
+    machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
+) -> dict[str, tuple[float, float]]:
+    """Return least and largest error of the members against the nominal plants', by command.
+
+    Friction, where it is known, differs from member to member too, and so does what alignment
+    took from one axis and not from the other.
+    """
+    x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
+    nominal = (x.nominal, y.nominal)
+    pairs = _side_by_side(x.members, y.members)
+    sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
+    # A set of plants without measured phase holds delays of its own.
+    lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
+    out = {}
+    for name, command in commands.items():
+        usual = max(rms(response(nominal, _received(machine, command))), 1e-12)
+        found = []
+        for pair, side in zip(pairs, sides, strict=True):
+            received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)
+            found.append(rms(_delayed(response(pair, received), side * lag_s / dt_s)) / usual)
+        out[name] = (min(1.0, *found), max(1.0, *found))
+    return out
+
+
+def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
+    """Return what dry friction leaves of a command, so many times of what was measured."""
+    return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
+
+
+def _delayed(y: Array, samples: float) -> Array:
+    """Return a motion (2, n) with X late by so many samples; below 0 Y is late instead."""
+    row = 0 if samples > 0.0 else 1
+    late = y.copy()
+    at = np.arange(y.shape[1], dtype=float)
+    late[row] = np.interp(at - abs(samples), at, y[row])
+    return late
+
+
+def _rank(choice: Choice) -> float:
+    """Order choices: what they reach on the likely members, and what the worst one pays for it."""
+    return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
+
+
+def most_share(axis: PlantSetSpec) -> float:
+    """Return the largest share of a compensation that an axis bears beside a shaper's."""
+    return _UNSEEN_SHARE if _unseen(axis) else 1.0
+
+
+def _unseen(axis: PlantSetSpec) -> bool:
+    """Whether the phase of an axis was not measured."""
+    return axis.provenance is None or axis.provenance.magnitude_only
+
+
+def pair_weights(machine: Machine, count: int) -> Array:
+    """Return how likely each pair of members is."""
+    x, y = (
+        np.array([m.weight for m in machine.axes[axis].weighted_members()]) for axis in ("x", "y")
+    )
+    both = np.array([x[j % len(x)] * y[j % len(y)] for j in range(count)])
+    return np.asarray(np.sqrt(both) / np.sqrt(both).sum())
+
+
+def member_pairs(machine: Machine, dt_s: float) -> list[Pair]:
+    """Return members of X and Y side by side, slow motion on time."""
+    # A delay that differs between the axes spoils all commands alike: it tells none from another.
+    axes = [machine.axes[axis].without_delay() for axis in ("x", "y")]
+    return _side_by_side(*(plant_set(axis, dt_s).members for axis in axes))
+
+
+def _side_by_side(x: Sequence[DiscretePlant], y: Sequence[DiscretePlant]) -> list[Pair]:
+    """Return pairs of members; the shorter list again from its start."""
+    return [(x[j % len(x)], y[j % len(y)]) for j in range(max(len(x), len(y)))]

@@ -1,0 +1,89 @@
+"""Tables with a row a sample, written as they come: NumPy's npz, or CSV."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Protocol
+
+import numpy as np
+
+from stillpath.pipeline.files import replacing
+
+__all__ = ["Table", "csv_table", "npz_table"]
+
+
+class Table(Protocol):
+    """Takes rows."""
+
+    def write(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Add rows: arrays of one length by name, the same names in the same order every time."""
+
+
+@contextlib.contextmanager
+def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
+    """Yield a table that becomes an npz file of one array a column, whole or not at all.
+
+    Parameters
+    ----------
+    target : Path
+        Columns wait in a folder beside it.
+    types : mapping
+        Names of the columns and their types, as ``<f8``.
+    """
+    with (
+        replacing(target) as temporary,
+        tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-table-") as folder,
+    ):
+        paths = {name: Path(folder, name) for name in types}
+        with contextlib.ExitStack() as stack:
+            files = {name: stack.enter_context(path.open("wb")) for name, path in paths.items()}
+            table = _Npz(files, types)
+            yield table
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+            for name, path in paths.items():
+                # A date of its own would make equal tables unequal files.
+                entry = zipfile.ZipInfo(f"{name}.npy")
+                with archive.open(entry, "w", force_zip64=True) as out, path.open("rb") as column:
+                    header = {"descr": types[name], "fortran_order": False, "shape": (table.rows,)}
+                    np.lib.format.write_array_header_1_0(out, header)
+                    shutil.copyfileobj(column, out, 1 << 20)
+
+
+@contextlib.contextmanager
+def csv_table(target: Path, formats: Mapping[str, str]) -> Iterator[Table]:
+    """Yield a table that becomes a CSV file with a line of names, whole or not at all.
+
+    Parameters
+    ----------
+    target : Path
+    formats : mapping
+        Names of the columns and how a value is written, as ``%.3f``.
+    """
+    with replacing(target) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
+        out.write(",".join(formats) + "\n")
+        yield _Csv(out, ",".join(formats.values()) + "\n")
+
+
+class _Npz:
+    def __init__(self, files: Mapping[str, IO[bytes]], types: Mapping[str, str]) -> None:
+        self._files, self._types = files, types
+        self.rows = 0
+
+    def write(self, columns: Mapping[str, np.ndarray]) -> None:
+        for name, values in columns.items():
+            self._files[name].write(np.ascontiguousarray(values, self._types[name]).tobytes())
+        self.rows += len(next(iter(columns.values())))
+
+
+class _Csv:
+    def __init__(self, file: IO[str], line: str) -> None:
+        self._file, self._line = file, line
+
+    def write(self, columns: Mapping[str, np.ndarray]) -> None:
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        self._file.write("".join(self._line % row for row in rows))

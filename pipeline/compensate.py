@@ -1,0 +1,760 @@
+"""The road: a print file in, a compensated and verified file out, in bounded memory.
+
+A file is read block by block, cut into pieces and passages, and written in order. Every piece that
+was changed is read back from the bytes as written, planned by the firmware's rules and compared
+with what it should do; a piece that fails leaves as it came. All figures come from that motion.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+import numpy as np
+
+from stillpath.compensation.base import DesignError
+from stillpath.gcode.containers.opening import open_text, rewriting
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import intended, join_phases, plan_moves
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.writing import StreamWriter
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import LeftOut, Passage, Piece, Splitter
+from stillpath.gcode.sampler import sample_phases, sample_until
+from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.slicers.retiming import Retiming
+from stillpath.gcode.types import EventKind, Events, Moves, Phases
+from stillpath.models.confirmation import confirmation_text
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.caution import caution_for, prediction_note
+from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.last_check.comparing import LastCheck
+from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
+from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.points import MotionSamples, part_of
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.pacing.budget import SpeedBudget
+from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
+from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.pass_through import feeding, plan_passage, switching_s, takes_s
+from stillpath.pipeline.piece_compensator import (
+    DT_S,
+    CompensatedPiece,
+    PieceCompensator,
+    Unfit,
+    as_executed,
+    deviation,
+)
+from stillpath.pipeline.progress import ProgressCallback, Teller, telling
+from stillpath.pipeline.reading import dialect_for, doubts, passed_over
+from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
+from stillpath.pipeline.selection import Selection, TooLarge, narrower
+from stillpath.pipeline.simulate import STANDING_S, plan_file, simulate_file
+from stillpath.pipeline.totals import Sums
+from stillpath.pipeline.tracing import Trace
+from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
+from stillpath.version import __version__
+
+__all__ = ["compensate_file", "plan_file", "simulate_file"]
+
+T = TypeVar("T", bound=Passage)
+
+_BLOCK_BYTES = 1 << 17
+_CHUNK = 1 << 17
+
+
+def compensate_file(
+    source: Path,
+    target: Path,
+    machine: Machine,
+    options: Options,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+    layers: Path | None = None,
+    trace: Callable[[Trace], None] | None = None,
+) -> Result:
+    """Compensate a print file.
+
+    Parameters
+    ----------
+    source, target : Path
+        Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
+        name says so and the source's does not. It is written beside itself and renamed when it is
+        complete; the source is only read. They may be the same file.
+    machine : Machine
+    options : Options
+    cache_dir : Path, optional
+        Where the tuned shaper of a machine revision is kept.
+    progress : callable, optional
+        Called now and then; may raise `Cancelled`.
+    layers : Path, optional
+        Folder for layers.json and layers.bin (`pipeline.measuring.layer_files`).
+    trace : callable, optional
+        Is given the motion as it is measured.
+
+    Returns
+    -------
+    Result
+        Figures measured on the written file.
+
+    Raises
+    ------
+    GcodeError
+        The file cannot be read as G-code of this machine, moves nothing, or was processed before;
+        its container is damaged, or cannot be what the target is called.
+    DesignError, ModelError
+        The method cannot be designed for this machine.
+    """
+    if options.method == "advise":
+        if trace is not None:
+            raise GcodeError(
+                "an advised file has moves of its own times: ask for the trajectories of the "
+                "written file, not compensated"
+            )
+        from stillpath.pipeline.advising.advise import advise_file
+
+        return advise_file(
+            source,
+            target,
+            machine,
+            options,
+            cache_dir=cache_dir,
+            progress=progress,
+            layers=layers,
+        )
+    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    with (
+        contextlib.ExitStack() as files,
+        replacing(target) as temporary,
+        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+    ):
+        with (
+            rewriting(container, temporary, name=target, told=packing) as text,
+            tempfile.TemporaryFile(dir=target.parent) as spool,
+        ):
+            facts = container.facts()
+            writer = None
+            if layers is not None:
+                writer = files.enter_context(
+                    written_layers(layers, channel_names(compensated=True))
+                )
+            go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
+            # Within a budget a file may be written more than once: only the last time is traced.
+            traced = None if _Job.has_budget(options) else trace
+            budget: SpeedBudget | None = None
+            while True:
+                job = go(writer, traced, budget)
+                try:
+                    result = job.run(source.name, facts)
+                except TooLarge:
+                    options = _fitting(options, source.name)
+                    go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
+                    spool.seek(0)
+                    spool.truncate()
+                    writer = writer.anew() if writer is not None else None
+                    continue
+                budget = job.milder
+                if budget is None and traced is trace:
+                    break
+                if budget is None:
+                    budget, traced = job.same, trace
+                spool.seek(0)
+                spool.truncate()
+                writer = writer.anew() if writer is not None else None
+            spool.seek(0)
+            result = job.deliver(result, text)
+            if options.times == "new":
+                container.delay(job.delay_s)
+        sizes = {
+            "original_bytes": source.stat().st_size,
+            "written_bytes": temporary.stat().st_size,
+        }
+        return result.model_copy(update=sizes)
+
+
+def _fitting(options: Options, name: str) -> Options:
+    """Return options with which less is compensated than with those that made a file too large."""
+    less = narrower(options)
+    if less is None:
+        raise GcodeError(
+            f"{name} does not fit into max_mb {options.max_mb:g} even if its outer walls alone are "
+            "compensated: allow more, or take a larger tolerance_um"
+        )
+    return less
+
+
+_SAID = (Unfit, GcodeError, DesignError, ModelError)
+"""What says of itself why a piece cannot be compensated."""
+_FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
+"""With those of our own: a piece that meets one stays as it came, and the others are printed."""
+
+
+def _counting_rms_um(channel: Channel) -> float:
+    selected_um = channel.selected_rms_um
+    return channel.extruding.contour_rms_um if selected_um is None else selected_um
+
+
+@dataclass(frozen=True, slots=True)
+class _Attempt:
+    """A piece as it may be written."""
+
+    made: CompensatedPiece
+    executed: Phases
+    gap_mm: np.ndarray
+    text: bytes
+    motion: MotionSamples
+
+
+class _Job:
+    """State of one file on its way.
+
+    What is written waits in the target for its times: `retiming` knows how to copy it.
+    """
+
+    def __init__(
+        self,
+        source: BinaryIO,
+        target: BinaryIO,
+        machine: Machine,
+        options: Options,
+        cache_dir: Path | None,
+        progress: ProgressCallback | None,
+        layers: LayerWriter | None,
+        trace: Callable[[Trace], None] | None,
+        budget: SpeedBudget | None,
+    ) -> None:
+        self._layers = layers
+        self._source, self._target = source, target
+        self._machine, self._options = machine, options
+        self._teller = Teller(progress)
+        self._clock = StageClock()
+        self._changes = options.method != "none"
+        self._kit = kit(machine)
+        self._rounds = max(self._kit.step_mm[:2]) > 0.0
+        if self._changes and self._kit.refusal is not None:
+            raise ModelError(f"{machine.name} cannot execute this file: {self._kit.refusal}")
+        # A method that cannot be designed says so before the yardstick takes its seconds.
+        tuned_first = options.method.startswith("shaper:")
+        if self._changes and not tuned_first:
+            self._say("designing", 0.0)
+            with self._clock.stage("design"):
+                self._work = PieceCompensator(machine, options)
+        self._say("tuning the shaper to compare with", 0.0)
+        with self._clock.stage("yardstick"):
+            self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
+            chosen = caution_for(
+                machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S
+            )
+        self._caution = chosen[0] if chosen else None
+        self._choice = chosen[1] if chosen else None
+        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
+        if tuned_first or self._caution is not None:
+            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
+        dialect = dialect_for(machine, options.dialect)
+        self._length = LengthGuard(source, machine, dialect)
+        self._reader = Interpreter(machine, dialect=dialect)
+        self._checker = Interpreter(machine, dialect=dialect)
+        self._splitter = Splitter(machine, compensate=self._changes)
+        self._selection = Selection(options.where, machine)
+        self._operation = Operation(machine)
+        self._budget = budget
+        self._pairs: BudgetMeasurement | None = None
+        take_layer = layers.add if layers else None
+        size = source.seek(0, io.SEEK_END)
+        if self.has_budget(options):
+            self._pairs = BudgetMeasurement(
+                machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
+            )
+            self._measurement: Measurement = self._pairs
+        else:
+            self._measurement = Measurement(
+                machine,
+                DT_S,
+                self._shaper,
+                compensated=True,
+                take_layer=take_layer,
+                trace=trace,
+                size=size,
+            )
+        if self._changes:
+            self._verifier = Verifier(machine, options.tolerance_um)
+            self._writer = StreamWriter(self._kit, stamp(machine, options))
+        ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
+        self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
+        self._sum = Sums()
+        self._sum.warnings += doubts(source, machine, options.dialect)
+        if options.budget_um is not None and not self._changes:
+            self._sum.warnings.append("The method none changes nothing: the budget was not used.")
+
+    @staticmethod
+    def has_budget(options: Options) -> bool:
+        """Tell whether paces are chosen."""
+        return options.budget_um is not None and options.method != "none"
+
+    @property
+    def milder(self) -> SpeedBudget | None:
+        """What the file must be written with instead, where it exceeds its budget."""
+        if self._budget is None or self._pairs is None:
+            return None
+        return self._budget.milder(self._pairs.sums())
+
+    @property
+    def same(self) -> SpeedBudget | None:
+        """What the file was written with."""
+        return self._budget.again() if self._budget is not None else None
+
+    @property
+    def delay_s(self) -> float:
+        """How much later than the original the written file is where the road has come to."""
+        return self._sum.time_s - self._sum.original_s
+
+    def run(self, name: str, facts: SlicerFacts) -> Result:
+        size = max(self._source.seek(0, io.SEEK_END), 1)
+        if self._pairs is not None and self._budget is None:
+            self._budget = self._chosen_paces(size)
+        self._source.seek(0)
+        for item in self._selected():
+            self._point = self._operation.at(item.moves)
+            self._measurement.operate_at(self._point)
+            if isinstance(item, Piece):
+                self._piece(item)
+            else:
+                self._passage(item)
+            self._operation.passed(item.moves)
+            self._say("compensating", self._source.tell() / size)
+        if self._sum.moves == 0:
+            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
+        if self._changes:
+            text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
+            self._wait(switching_s(self._checker.push(text)))
+            self._emit(text)
+        self._measurement.finish()
+        if self._layers is not None:
+            self._layers.finish(self._reader.feature_names)
+        if self.milder is None:
+            self._say("done", 1.0)
+        return self._result(name, size, facts)
+
+    def deliver(self, result: Result, text: BinaryIO) -> Result:
+        """Write the file with its new times; it is compared with the original meanwhile."""
+        if not self._changes:
+            self.retiming.copy(self._target, text, self.delay_s)
+            return result
+        shortest_mm = 2.0 * self._kit.shortest_move_mm
+        check = LastCheck(text, self._source, self._machine, self._kit.step_mm, shortest_mm)
+        self.retiming.copy(self._target, check, self.delay_s)
+        figures = check.finish()
+        stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
+        return result.model_copy(update={"last_check": figures, "stages": [*result.stages, stage]})
+
+    def _chosen_paces(self, size: int) -> SpeedBudget:
+        """Find how quick the print may be."""
+        self._source.seek(0)
+        with self._clock.stage("budget"):
+            found = take_samples(
+                self._source,
+                self._machine,
+                dialect_for(self._machine, self._options.dialect),
+                lambda read: self._say("choosing speeds", read / size),
+            )
+            return SpeedBudget.chosen(
+                found, self._machine, self._options, self._shaper, self._caution
+            )
+
+    def _selected(self) -> Iterator[Piece | Passage]:
+        for item in self._items():
+            before_s, names = self._sum.original_s, self._reader.feature_names
+            yield from self._timed(self._selection.divide(item, names))
+            if isinstance(item, Piece) and self._options.where != "all":
+                # The file as it came does not stand still where it was divided.
+                self._sum.original_s = before_s + item.phases.duration_s
+
+    def _items(self) -> Iterator[Piece | Passage]:
+        while True:
+            with self._clock.stage("read"):
+                data = self._source.read(_BLOCK_BYTES)
+                blocks = self._reader.push(data) if data else self._reader.flush()
+            for block in blocks:
+                if np.any(block.events.kind == EventKind.STAMP):
+                    row = int(np.argmax(block.events.kind == EventKind.STAMP))
+                    raise GcodeError(
+                        "this file was already processed by stillpath; compensate the original",
+                        line=int(block.events.line[row]),
+                    )
+                yield from self._timed(self._splitter.push(block))
+            if not data:
+                yield from self._timed(self._splitter.flush())
+                return
+
+    def _timed(self, items: Iterator[T]) -> Iterator[T]:
+        while True:
+            with self._clock.stage("plan"):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
+
+    def _piece(self, piece: Piece) -> None:
+        delay_s = self.delay_s
+        self._sum.pieces += 1
+        self._sum.moves += len(piece.moves)
+        original_s = piece.phases.duration_s
+        self._check_end(piece, original_s)
+        self._sum.original_s += original_s
+        if self._sum.jumped:
+            # Homed, say: the machine did not come here along the path.
+            self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
+            self._sum.jumped = False
+        switched_s = self._switched_off_s()
+        for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
+            try:
+                attempt = self._attempt(piece, paced)
+                break
+            except Unfit as error:
+                reason = str(error)
+            except GcodeError as error:  # its line is one of what was written
+                reason = f"the firmware would refuse what was made of it: {error.message}"
+        else:
+            self._sum.time_s -= switched_s
+            self._put_back(piece, original_s, reason)
+            return
+        self._work.compensator.commit()
+        self._verifier.passed(attempt.motion.executed_mm)
+        self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
+        with self._clock.stage("measure"):
+            # The last sample of an item is the first one of the next.
+            self._measure_piece(piece, part_of(attempt.motion, 0, len(attempt.motion) - 1))
+        late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
+        self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
+
+    def _switched_off_s(self) -> float:
+        """Stand still where a piece that comes now begins with a line that makes the machine stand.
+
+        Before it is compensated: vibration dies down meanwhile.
+        """
+        lines = self._writer.switching_off
+        seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
+        if seconds > 0.0:
+            self._wait(seconds)
+        return seconds
+
+    def _attempt(self, piece: Piece, paced: Piece) -> _Attempt:
+        """Compensate and write a piece at a pace and read it back; or leave everything as it was.
+
+        Parameters
+        ----------
+        piece, paced : Piece
+            As it came, and as its moves are planned now.
+        """
+        writer, checker = copy.copy(self._writer), None
+        try:
+            with self._clock.stage("compensate"):
+                made = self._work.compensate(paced, self._point)
+            with self._clock.stage("write"):
+                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
+            with self._clock.stage("read back"):
+                checker = self._checker.snapshot()
+                executed = self._read_back(text)
+                gap_mm = deviation(made, executed)
+                self._verifier.check_motion(piece, made, gap_mm, executed)
+            with self._clock.stage("measure"):
+                motion = self._motion(piece, paced, made, executed)
+                if self._budget is None:
+                    self._verifier.check_gain(motion, self._point)
+        except _FAULTS as error:
+            self._writer = writer
+            if checker is not None:
+                self._checker = checker
+            if isinstance(error, _SAID):
+                raise
+            raise Unfit(
+                f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
+                f"{error}); please report it with the file"
+            ) from error
+        return _Attempt(made, executed, gap_mm, text, motion)
+
+    def _motion(
+        self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
+    ) -> MotionSamples:
+        """Planned and executed motion of a piece on one grid of real time."""
+        asked = self._asked(paced, paced.phases)
+        planned, position, row, extruding = as_executed(made, asked, executed)
+        came = planned
+        if self._rounds:
+            moved = replace(paced.phases, t_s=made.encoded.row_start_s)
+            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
+        return self._samples(piece, row, planned, position, extruding, came)
+
+    def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
+        if self._budget is None or self._pairs is None:
+            self._measurement.add(written)
+            return
+        phases = piece.phases
+        grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
+        path, row = sample_phases(self._asked(piece, phases), grid)
+        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+        sliced = self._samples(piece, row, path, came, feeding(phases)[row], came)
+        self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
+        self._budget.correct(self._pairs.sums())
+
+    def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
+        """Let a piece leave as it came."""
+        phases = piece.phases
+        row_s = phases.accel_s + phases.cruise_s + phases.decel_s
+        extruding_s = float(np.sum(row_s[feeding(phases)]))
+        self._sum.put_back.append(
+            PutBack(
+                line_first=int(piece.moves.line[0]),
+                line_last=int(piece.moves.line[-1]),
+                seconds=seconds,
+                extruding_seconds=extruding_s,
+                reason=reason,
+            )
+        )
+        self._sum.original_s -= seconds
+        self._sum.moves -= len(piece.moves)
+        if self._budget is not None:
+            self._budget.passed(-seconds)
+        self._passage(piece)
+
+    def _passage(self, passage: Passage) -> None:
+        text = passage.text
+        if self._changes:
+            text = self._writer.passage(passage, self._checker.extruder_mm)
+            with self._clock.stage("read back"):
+                blocks = self._checker.push(text)
+            # Lines of ours make it stand too, or its own longer than they did.
+            self._wait(switching_s(blocks) - switching_s([passage]))
+        self._emit(text, passage, self.delay_s)
+        self._sum.moves += len(passage.moves)
+        self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
+        with self._clock.stage("plan"):
+            parts = list(plan_passage(passage, self._machine))
+        seconds = sum(takes_s(part) for part in parts)
+        self._check_end(passage, seconds)
+        if self._budget is not None:
+            self._budget.passed(seconds)
+        with self._clock.stage("measure"):
+            for part in parts:
+                if part is None:
+                    self._measurement.jump()
+                    self._observe(None)
+                elif isinstance(part, Phases):
+                    self._measure_passage(passage, part)
+                else:
+                    self._stand(part)
+
+    def _check_end(self, item: Passage, seconds: float) -> None:
+        lines: Moves | Events = item.moves if len(item.moves) else item.events
+        if len(lines):
+            self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
+
+    def _measure_passage(self, passage: Passage, phases: Phases) -> None:
+        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        motion_s = phases.duration_s
+        self._sum.original_s += motion_s
+        self._sum.time_s += motion_s
+        feeds = feeding(phases)
+        extruding_s = float(np.sum(duration[feeds]))
+        self._sum.extruding_s += extruding_s
+        if isinstance(passage, LeftOut):
+            self._sum.left_out_s += motion_s
+            self._sum.left_out_extruding_s += extruding_s
+        else:
+            self._sum.passed_motion_s += motion_s
+        if np.any(feeds) and not isinstance(passage, LeftOut):
+            self._sum.passed_s += extruding_s
+            first = phases.move_index[int(np.argmax(feeds))]
+            self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
+        until = np.where(feeds, phases.t_s + duration, -np.inf)
+        asked = self._asked(passage, phases)
+        samples = max(round(motion_s / DT_S), 1)
+        for start in range(0, samples, _CHUNK):
+            n = min(_CHUNK, samples - start)
+            grid = (start * DT_S, DT_S, n)
+            path, row, extruding = sample_until(asked, grid, until, axes=3)
+            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+            at = phases.move_index[row]
+            self._measurement.add(self._samples(passage, at, path, came, extruding, came))
+            self._observe(path[:2])
+
+    def _samples(
+        self,
+        item: Piece | Passage,
+        row: np.ndarray,
+        planned: np.ndarray,
+        executed: np.ndarray,
+        extruding: np.ndarray,
+        sliced: np.ndarray,
+    ) -> MotionSamples:
+        """Return the samples of an item whose moves have been counted.
+
+        `sliced` is how the file as it came is executed, where the firmware rounds.
+        """
+        return MotionSamples(
+            path_mm=planned[:2],
+            executed_mm=executed[:2],
+            z_mm=planned[2],
+            extruding=extruding,
+            row=row,
+            moves=item.moves,
+            first_move=self._sum.moves - len(item.moves),
+            sliced_mm=sliced if self._rounds else None,
+        )
+
+    def _asked(self, item: Piece | Passage, phases: Phases) -> Phases:
+        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._kit.step_mm)
+
+    def _stand(self, dwell_s: float) -> None:
+        """Let the machine stand where it is."""
+        self._sum.original_s += dwell_s
+        self._wait(dwell_s)
+
+    def _wait(self, dwell_s: float) -> None:
+        """Let the machine stand in the written file."""
+        self._sum.time_s += dwell_s
+        if dwell_s <= 0.0:
+            return
+        stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
+        if stood is not None:
+            self._observe(stood)
+
+    def _observe(self, command: np.ndarray | None) -> None:
+        if not self._changes:
+            return
+        self._verifier.passed(command)
+        if command is None:
+            self._sum.jumped = True
+            return
+        if self._sum.jumped and command.shape[1]:
+            self._work.compensator.reset(command[:, 0])
+            self._sum.jumped = False
+        self._work.compensator.observe(command)
+
+    def _read_back(self, text: bytes) -> Phases:
+        """Plan the written lines of a piece by the firmware's rules."""
+        blocks = self._checker.push(text)
+        parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
+        if len(parts) == 1:
+            return plan_moves(parts[0][0], parts[0][1], self._machine)
+        planner = self._kit.planner()
+        phases = [planner.push_moves(moves, limits) for moves, limits in parts]
+        phases.append(planner.flush())
+        return join_phases(phases)
+
+    def _emit(
+        self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
+    ) -> None:
+        self._sum.written += len(text)
+        most_mb = self._options.max_mb
+        if most_mb is not None and self._sum.written > 1e6 * most_mb:
+            raise TooLarge
+        self._target.write(text)
+        self.retiming.push(text, item, delay_s)
+
+    def _say(self, stage: str, fraction: float) -> None:
+        self._teller.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
+
+    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
+        """Yield a warning where the firmware's shaper, without compensation, would do better."""
+        ours, shaper = rms_um["after"], rms_um["shaper"]
+        compared = self._budget is None and not self._options.method.startswith("shaper:")
+        if not compared or ours < max(shaper, NEGLIGIBLE_UM):
+            return
+        yield (
+            f"The firmware's own shaper would serve this file better: {self._shaper.label} alone "
+            f"would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
+            "Print it as sliced with that shaper, or let --method advise write the commands"
+        )
+
+    def _channels(self) -> list[Channel]:
+        """Return the figures of the whole print, with what counts where a part is compensated."""
+        channels = self._measurement.channels()
+        if self._options.where != "all":
+            features = self._measurement.features(self._reader.feature_names)
+            rms_um = self._selection.rms_um(features)
+            channels = [
+                c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
+            ]
+        if self._choice is not None:
+            channels = [self._choice.ranged(channel) for channel in channels]
+        return channels
+
+    def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
+        total, measured = self._sum, self._measurement
+        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
+        if self._changes and self._writer.shaper_unknown:
+            warnings.append(
+                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
+                "is switched off and stays off; set it again after the print."
+            )
+        if self._changes and self._writer.shaper_note is not None:
+            warnings.append(self._writer.shaper_note)
+        channels = self._channels()
+        notes = [*self._standing, *self._operation.notes()]
+        if self._changes:
+            warnings += total.left_alone()
+            warnings += self._outdone({c.name: _counting_rms_um(c) for c in channels})
+            notes += total.left_out(self._options.where)
+        shaper, budget = self._shaper, None
+        if self._budget is not None and self._pairs is not None:
+            names, sums = self._reader.feature_names, self._pairs.sums()
+            budget = self._budget.figures(sums, names, total.original_s, total.time_s)
+            warnings += self._budget.warnings(sums, names)
+            notes = [*notes, self._pairs.note]
+        return Result(
+            version=__version__,
+            machine=self._machine.name,
+            machine_title=self._machine.title,
+            machine_revision=self._machine.revision,
+            settings=self._options.model_dump(exclude_none=True),
+            source_name=name,
+            channels=channels,
+            best_shaper=shaper.label,
+            original_time_s=total.original_s,
+            time_s=total.time_s,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
+            original_bytes=size,
+            written_bytes=total.written,
+            segments=total.segments,
+            segments_per_s=total.segments / total.compensated_s if total.compensated_s else 0.0,
+            peak_segments_per_s=total.peak_rate,
+            peak_velocity_mm_s=total.peak_velocity,
+            peak_accel_mm_s2=total.peak_accel,
+            emission_rms_um=1e3 * np.sqrt(total.gap2 / max(total.gap_count, 1)),
+            emission_max_um=1e3 * total.gap_max,
+            filament_error_mm=total.filament_error,
+            compensated_s=total.compensated_s,
+            extruding_s=total.extruding_s,
+            pieces=total.pieces,
+            put_back=total.put_back,
+            put_back_extruding_share=total.put_back_share,
+            left_out_s=total.left_out_s,
+            left_out_extruding_s=total.left_out_extruding_s,
+            left_alone_s=total.left_alone_s if self._changes else 0.0,
+            left_alone_extruding_s=total.left_alone_extruding_s if self._changes else 0.0,
+            warnings=warnings,
+            notes=notes,
+            confirmation=confirmation_text(self._machine) if self._changes else "",
+            layers=measured.layers(),
+            features=measured.features(self._reader.feature_names),
+            track=measured.track(),
+            spectra=measured.spectra(),
+            layer_views=measured.layer_views(),
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            budget=budget,
+        )

@@ -1,0 +1,68 @@
+"""Prints that would never end are refused before hours are spent on what comes before that."""
+
+from __future__ import annotations
+
+from typing import BinaryIO
+
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.planning import check_print_ends
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.types import Events, Moves
+from stillpath.models.machine import Machine
+
+__all__ = ["LengthGuard"]
+
+LOOK_AHEAD_S = 48 * 3600.0
+"""From here on the rest of the file is planned first: planning costs by the line, all else by the
+second of the print, and twenty minutes of it fit into a line."""
+_BLOCK_BYTES = 1 << 17
+
+
+class LengthGuard:
+    """Watch how long a print becomes.
+
+    Parameters
+    ----------
+    text : binary file
+        The print; its place is kept.
+    machine : Machine
+    dialect : Dialect
+        How the file is read.
+    """
+
+    def __init__(self, text: BinaryIO, machine: Machine, dialect: Dialect) -> None:
+        self._text, self._machine, self._dialect = text, machine, dialect
+        self._looked = False
+
+    def check(self, time_s: float, line: int) -> None:
+        """Say that up to and with `line` the print takes so long, before anything is made of it.
+
+        Raises
+        ------
+        GcodeError
+            This, or the whole file, takes more than 1000 hours.
+        """
+        check_print_ends(time_s, line)
+        if time_s > LOOK_AHEAD_S and not self._looked:
+            self._looked = True
+            place = self._text.tell()
+            self._look_ahead()
+            self._text.seek(place)
+
+    def _look_ahead(self) -> None:
+        reader = Interpreter(self._machine, dialect=self._dialect)
+        planner = kit(self._machine).planner()
+        line = 1
+        self._text.seek(0)
+        while True:
+            data = self._text.read(_BLOCK_BYTES)
+            for block in reader.push(data) if data else reader.flush():
+                planner.push(block)
+                rows: Moves | Events = block.moves if len(block.moves) else block.events
+                line = int(rows.line[-1]) if len(rows) else line
+                check_print_ends(planner.time_s, line)
+            if not data:
+                break
+        planner.flush()
+        check_print_ends(planner.time_s, line)

@@ -1,0 +1,365 @@
+"""Kernels of the last check's own reader: lines like ``G1 X10.5 Y-3 E.02 F1800``, and no others.
+
+A state is an array of `SIZE` floats; nan is what nobody knows. Text ends with a newline.
+"""
+
+from __future__ import annotations
+
+from math import fabs, isnan, nan, sqrt
+from typing import Any
+
+import numpy as np
+
+from stillpath.models.jit import kernel
+
+__all__ = ["carry_out_moves", "compare", "compare_moves", "move", "ours", "way_xy_mm"]
+
+X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
+"""Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
+mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 behind a move of X and Y
+so short that the firmware may carry it out with the next one."""
+SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
+"""What `compare` finds: nothing, or the first of a state's numbers that differs."""
+WORDS, WITHIN = 15, 32
+"""For the mask of `compare`: words that make a move, and whether it is one within a stream."""
+
+_POWERS = 10.0 ** np.arange(16)
+_LONGEST = 90
+"""Marlin's buffer takes 95 characters."""
+_FEED_MM_MIN, _FEED_SHARE = 1e-4, 2e-6
+
+
+@kernel(force_inline=True, allocates=False)
+def _words(text: Any, at: int, words: Any) -> tuple[int, int]:
+    """Read a plain G0 or G1; return where the next line begins, or -1, and which words there are.
+
+    Bit 0 to 4 of the latter: X Y Z E F. Words are parted by one blank and have a plain number.
+    """
+    mask = 0
+    if text[at] != 71 or (text[at + 1] != 48 and text[at + 1] != 49):
+        return -1, mask
+    p = at + 2
+    while True:
+        c = text[p]
+        if c == 10:
+            break
+        if c == 13 and text[p + 1] == 10:
+            p += 1
+            break
+        if c != 32:
+            return -1, mask
+        p += 1
+        c = text[p]
+        if c == 59:  # ; a comment
+            while text[p] != 10:
+                p += 1
+            break
+        word = 3 if c == 69 else 4 if c == 70 else c - 88
+        if word < 0 or word > 4 or (c >= 88 and word > 2) or mask >> word & 1:
+            return -1, mask
+        p += 1
+        negative = text[p] == 45
+        if negative:
+            p += 1
+        digits, mantissa, fraction = 0, 0, 0
+        while 48 <= text[p] <= 57 and digits < 16:
+            mantissa = 10 * mantissa + (text[p] - 48)
+            digits += 1
+            p += 1
+        if text[p] == 46:
+            p += 1
+            while 48 <= text[p] <= 57 and digits < 16:
+                mantissa = 10 * mantissa + (text[p] - 48)
+                digits += 1
+                fraction += 1
+                p += 1
+        # Up to 15 digits the quotient of two exact doubles is the nearest double.
+        if digits == 0 or digits > 15:
+            return -1, mask
+        value = mantissa / _POWERS[fraction]
+        words[word] = -value if negative else value
+        mask |= 1 << word
+    if p - at > _LONGEST or (mask & 16 and words[4] <= 0.0):
+        return -1, mask
+    return p + 1, mask
+
+
+@kernel(force_inline=True, allocates=False)
+def _comments(text: Any, at: int, stop: int, marks: bool) -> tuple[int, int]:
+    """Pass over empty lines and comments; return where the next line begins, and how many.
+
+    With `marks` a comment that may be a mark of ours is none.
+    """
+    lines = 0
+    while at < stop:
+        if text[at] == 59:
+            if marks and text[at + 1] == 32 and text[at + 2] == 115:  # "; s"
+                break
+        elif text[at] != 10:
+            break
+        while text[at] != 10:
+            at += 1
+        at += 1
+        lines += 1
+    return at, lines
+
+
+@kernel(force_inline=True, allocates=False)
+def way_xy_mm(state: Any, words: Any, mask: int) -> float:
+    """Return how far a move goes in X and Y [mm]; nan where that is not known."""
+    squares = 0.0
+    for axis in range(2):
+        if mask >> axis & 1:
+            way = words[axis] * state[UNIT]
+            if state[RELATIVE] != 1.0:
+                way = way - state[axis] if state[RELATIVE] == 0.0 else nan
+            elif isnan(state[axis]):
+                way = nan
+            squares += way * way
+    return sqrt(squares)
+
+
+@kernel(force_inline=True, allocates=False)
+def move(state: Any, words: Any, mask: int) -> None:
+    """Carry out a move."""
+    for axis in range(3):
+        if mask >> axis & 1:
+            value = words[axis] * state[UNIT]
+            state[axis] = value if state[RELATIVE] == 0.0 else value + state[axis]
+            if isnan(state[RELATIVE]):
+                state[axis] = nan
+    if mask & 8:
+        value = words[3] * state[UNIT]
+        if state[RELATIVE_E] == 1.0:
+            state[FED] += value
+            state[E] += value
+        elif state[RELATIVE_E] == 0.0:
+            state[FED] += value - state[E]
+            state[E] = value
+        else:
+            state[FED] = state[E] = nan
+    if mask & 16:
+        state[F] = words[4] * state[UNIT]
+
+
+@kernel(allocates=False)
+def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) -> int:
+    """Compare two states; what one of them does not know is passed over.
+
+    Parameters
+    ----------
+    one, other : float array
+        Of the original and of the written file. Filament counts anew where one does not know it.
+    mask : int
+        Words of the move behind which they stand; 0: no move, and F does not count. With `WITHIN`
+        a stream, where what E reads is set right before lines that depend on it only.
+    place_mm : float array, shape (3,)
+    filament_mm : float
+        By how much they may differ.
+    """
+    for axis in range(3):
+        if fabs(one[axis] - other[axis]) > place_mm[axis]:
+            return PLACE + axis
+    if isnan(one[FED]) or isnan(other[FED]):
+        one[FED] = other[FED] = 0.0
+    elif fabs(one[FED] - other[FED]) > filament_mm:
+        return FILAMENT
+    if fabs(one[RELATIVE] - other[RELATIVE]) > 0.0:
+        return MODES
+    if fabs(one[RELATIVE_E] - other[RELATIVE_E]) > 0.0:
+        return MODES + 1
+    if not mask & WITHIN and one[RELATIVE_E] == 0.0 and fabs(one[E] - other[E]) > filament_mm:
+        return E
+    if mask & WORDS and fabs(one[F] - other[F]) > _FEED_MM_MIN + _FEED_SHARE * fabs(one[F]):
+        return FEED
+    return SAME
+
+
+@kernel(allocates=False)
+def ours(
+    text: Any,
+    at: int,
+    stop: int,
+    state: Any,
+    words: Any,
+    wanted: Any,
+    rests: bool,
+    before: Any,
+    behind: Any,
+    place_mm: Any,
+    filament_mm: float,
+) -> tuple[int, int, bool, int]:
+    """Carry out plain moves of a stream, up to the line that is waited for or an odd one.
+
+    Parameters
+    ----------
+    text : uint8 array
+    at, stop : int
+        Where to begin, and behind the last newline.
+    state, words : float array
+    wanted : uint8 array
+        A line of the original, without its end; may be empty. It is carried out if it is plain.
+    rests : bool
+        The states before it and behind it are compared with those of the original.
+    before, behind : float array
+        States of the original.
+    place_mm, filament_mm
+        As of `compare`.
+
+    Returns
+    -------
+    (int, int, bool, int)
+        Where the next line begins, how many were carried out, whether the last was the one that is
+        waited for, and what differs there.
+    """
+    lines = 0
+    length = len(wanted)
+    while at < stop:
+        at, passed = _comments(text, at, stop, True)
+        lines += passed
+        if at >= stop:
+            break
+        is_wanted = False
+        if length:
+            k = 0
+            while k < length and text[at + k] == wanted[k]:
+                k += 1
+            is_wanted = k == length and (text[at + k] == 10 or text[at + k] == 13)
+        next_at, mask = _words(text, at, words)
+        if next_at < 0:
+            break
+        if is_wanted and rests:
+            found = compare(before, state, WITHIN, place_mm, filament_mm)
+            if found != SAME:
+                return at, lines, True, found
+        move(state, words, mask)
+        at = next_at
+        lines += 1
+        if is_wanted:
+            found = SAME
+            if rests:
+                found = compare(behind, state, mask | WITHIN, place_mm, filament_mm)
+            return at, lines, True, found
+    return at, lines, False, SAME
+
+
+@kernel(allocates=False)
+def carry_out_moves(
+    text: Any,
+    at: int,
+    stop: int,
+    most: int,
+    shortest_mm: float,
+    state: Any,
+    words: Any,
+    before: Any,
+) -> tuple[int, int, int]:
+    """Carry out plain moves of the original that move X or Y, and one behind them that does not.
+
+    Parameters
+    ----------
+    text, at, stop, state, words
+        As of `ours`.
+    most : int
+        So many lines at most.
+    shortest_mm : float
+        What is no longer than this in X and Y is left to others, unless it stands still there.
+    before : float array
+        Takes the state before the one that does not move X or Y.
+
+    Returns
+    -------
+    (int, int, int)
+        Where the next line begins, how many were carried out, and which words the last has if it
+        does not move X or Y; else -1.
+    """
+    lines = 0
+    while at < stop and lines < most:
+        if text[at] == 59 or text[at] == 10:
+            while text[at] != 10:
+                at += 1
+            at += 1
+            lines += 1
+            continue
+        behind, mask = _words(text, at, words)
+        if behind < 0:
+            break
+        way_mm = way_xy_mm(state, words, mask)
+        if not (way_mm > shortest_mm or (way_mm == 0.0 and state[WAITS] == 0.0)):
+            break
+        if way_mm == 0.0:
+            for k in range(SIZE):
+                before[k] = state[k]
+        else:
+            state[WAITS] = 0.0
+        move(state, words, mask)
+        at = behind
+        lines += 1
+        if way_mm == 0.0:
+            return at, lines, mask
+    return at, lines, -1
+
+
+@kernel(allocates=False)
+def compare_moves(
+    before: Any,
+    at: int,
+    stop: int,
+    after: Any,
+    written_at: int,
+    written_stop: int,
+    one: Any,
+    other: Any,
+    words: Any,
+    place_mm: Any,
+    filament_mm: float,
+) -> tuple[int, int, int, int, int, int, int]:
+    """Carry out plain moves that both texts share, and compare the states behind each.
+
+    Parameters
+    ----------
+    before, at, stop : uint8 array, int, int
+        Text of the original.
+    after, written_at, written_stop : uint8 array, int, int
+        Text of the written file.
+    one, other : float array
+        Their states.
+    words, place_mm, filament_mm
+        As of `compare`.
+
+    Returns
+    -------
+    (int, int, int, int, int, int, int)
+        Where both texts go on, how many lines of each were passed, how many moves were carried
+        out, how many of these without X and Y known, and what differs behind the last.
+    """
+    lines, written_lines, moves, unknown = 0, 0, 0, 0
+    while True:
+        at, passed = _comments(before, at, stop, False)
+        written_at, written_passed = _comments(after, written_at, written_stop, True)
+        lines += passed
+        written_lines += written_passed
+        if at >= stop or written_at >= written_stop:
+            break
+        behind, mask = _words(before, at, words)
+        length = behind - at
+        if behind < 0 or written_at + length > written_stop:
+            break
+        k = 0
+        while k < length and before[at + k] == after[written_at + k]:
+            k += 1
+        if k < length:
+            break
+        move(one, words, mask)
+        move(other, words, mask)
+        at = behind
+        written_at += length
+        lines += 1
+        written_lines += 1
+        moves += 1
+        if isnan(one[X] + one[Y] + other[X] + other[Y]):
+            unknown += 1
+        found = compare(one, other, mask, place_mm, filament_mm)
+        if found != SAME:
+            return at, written_at, lines, written_lines, moves, unknown, found
+    return at, written_at, lines, written_lines, moves, unknown, SAME

@@ -1,0 +1,486 @@
+"""Follow original and written file side by side, and compare them at every line they share.
+
+Outside of streams the written file holds every line of the original. Within one, straight lines of
+ours stand for its moves of X and Y; all other lines are there in order, or held back as comments.
+The original holds no marks of ours: such files are refused.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.machine import Machine
+from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
+from stillpath.pipeline.last_check.reader import NAN, Kind, Reader, code_of, tells_times
+from stillpath.pipeline.last_check.rules import rules_of
+from stillpath.pipeline.result import LastCheckFigures
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
+__all__ = ["LastCheck", "LastCheckError"]
+
+_PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
+_MOST_IDLE = 1 << 10
+_SHOWN = 5
+_SHOWN_CHARACTERS = 60
+_ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
+_OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
+_NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
+_UNITS = ("mm", "mm", "mm", "mm", "mm", "mm/min", "", "", "")
+_ANYWHERE = re.compile(
+    rb"G4 P0 ;|M400\b|G1$|(?:SET_VELOCITY_LIMIT|SET_INPUT_SHAPER|M20[1345]|M566|M572|M593|M74|M493"
+    rb"|M900|M97[45])(?![\d.])",
+    re.IGNORECASE,
+)
+"""Lines that we write outside of streams too: standing still, limits, the firmware's shaper."""
+_SHAPER = re.compile(rb"SET_INPUT_SHAPER|M593(?!\d)|M493(?!\d)", re.IGNORECASE)
+"""The file's own line for the shaper, which we repeat, may hold more than that."""
+_IN_STREAM = re.compile(
+    _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
+    re.IGNORECASE,
+)
+
+
+class LastCheckError(Exception):
+    """The written file is not what it should be; it must not be delivered.
+
+    Attributes
+    ----------
+    line, written_line : int
+        Lines of the original and of the written file, from 1.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, line: int, written_line: int) -> None:
+        self.line, self.written_line = line, written_line
+        super().__init__(
+            f"the last check refuses the written file at its line {written_line} (line {line} of "
+            f"the original): {message}. This is an error of Stillpath, nothing was written: "
+            "please report it with the file, and print the original"
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuilt, (self.args[0], self.line, self.written_line)
+
+
+def _rebuilt(text: str, line: int, written_line: int) -> LastCheckError:
+    error = LastCheckError("", line, written_line)
+    error.args = (text,)
+    return error
+
+
+class LastCheck:
+    """A file to write to, which reads along and compares with the original.
+
+    Parameters
+    ----------
+    target : file
+        Where to hand on what is written.
+    original : binary file
+        Text of the original; is read from its beginning.
+    machine : Machine
+    step_mm : tuple of float
+        Grid of the firmware's x, y, z; 0: none. Where streams end the written file may be one off.
+    shortest_mm : float
+        The firmware joins shorter moves with the next one; 0: it does not.
+
+    Attributes
+    ----------
+    cpu_s : float
+        CPU time that reading and comparing took.
+    """
+
+    def __init__(
+        self,
+        target: SupportsWrite[bytes],
+        original: BinaryIO,
+        machine: Machine,
+        step_mm: tuple[float, ...] = (0.0, 0.0, 0.0),
+        shortest_mm: float = 0.0,
+    ) -> None:
+        self._target = target
+        rules = rules_of(machine.firmware)
+        self._before, self._after = Reader(rules, shortest_mm), Reader(rules)
+        self._original, self._written = Original(original, self._before), Text()
+        self._rest: list[bytes] = []
+        self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
+        self._words = np.zeros(5)
+        self._idle: set[bytes] = set()
+        """Lines of ours that leave place and modes as they are."""
+        self._streaming = False
+        self._begun: deque[Place] = deque(maxlen=16)
+        """Where the original was behind its last lines within the stream."""
+        self._wanted: Wanted | None = None
+        self._earlier: deque[bytes] = deque(maxlen=64)
+        """Lines that were taken for the first of several with their text; perhaps they were not."""
+        self._kept = self._compared = 0
+        self._gap_line = 0
+        self._gaps: list[str] = []
+        self._more_gaps = 0
+        self.cpu_s = 0.0
+
+    def write(self, data: bytes) -> int:
+        """Hand on what is written, and compare it.
+
+        Raises
+        ------
+        LastCheckError
+        """
+        self._target.write(data)
+        began = time.process_time()
+        cut = data.rfind(b"\n") + 1
+        if cut:
+            self._written.take(b"".join((*self._rest, data[:cut])))
+            self._rest = []
+            self._follow()
+        if cut < len(data):
+            self._rest.append(data[cut:])
+        self.cpu_s += time.process_time() - began
+        return len(data)
+
+    def finish(self) -> LastCheckFigures:
+        """Compare the end, and tell what was compared.
+
+        Raises
+        ------
+        LastCheckError
+        """
+        began = time.process_time()
+        if self._rest:
+            self._written.take(b"".join((*self._rest, b"\n")))
+            self._rest = []
+            self._follow()
+        if expected := self._original.peek():
+            raise self._missing(self._original.text.line, expected)
+        if self._gap_line:
+            self._close_gap("the end")
+        gaps = list(self._gaps)
+        if self._more_gaps:
+            gaps.append(f"... and {self._more_gaps} more")
+        self.cpu_s += time.process_time() - began
+        return LastCheckFigures(
+            kept_lines=self._kept, compared_lines=self._compared, not_compared=gaps
+        )
+
+    # The written file
+
+    def _follow(self) -> None:
+        written = self._written
+        while not written.is_read:
+            if self._streaming:
+                self._stream()
+            else:
+                self._lines()
+
+    def _lines(self) -> None:
+        """Follow what stands outside of streams: moves of both, and another line."""
+        written, original = self._written, self._original.text
+        if original.is_read:
+            self._original.read_on()
+        before, after = original.line, written.at
+        original.at, written.at, lines, written_lines, moves, unknown, found = at.compare_moves(
+            original.array,
+            original.at,
+            original.stop,
+            written.array,
+            written.at,
+            written.stop,
+            self._before.state,
+            self._after.state,
+            self._words,
+            self._place_mm,
+            self._filament_mm,
+        )
+        original.line += lines
+        written.line += written_lines
+        if found != at.SAME:
+            end = written.at - 1
+            start = written.data.rfind(b"\n", after, end) + 1
+            code = written.data[max(start, after) : end]
+            place = original.line - 1, written.line - 1
+            raise self._differs(found, self._before.state, "behind", code, *place)
+        self._note(moves, unknown, before)
+        if written.is_read or (lines and original.is_read):
+            return
+        line, behind = written.peek()
+        code = code_of(line)
+        if not code:
+            written.skip(behind)
+            if line.startswith(_ON):
+                self._streaming, self._wanted = True, None
+                self._begun.clear()
+                self._begun.append(self._original.place())
+            return
+        expected = self._original.peek()
+        if _is_same(code, expected):
+            _, mask = self._before.carry_out(expected)
+            self._after.carry_out(code)
+            self._check(self._before.state, mask, code, original.line)
+            self._count(original.line)
+            self._original.skip()
+        elif _ANYWHERE.match(code) or _SHAPER.search(code):
+            self._after.carry_out(code)
+        else:
+            raise self._strange(code, expected)
+        written.skip(behind)
+
+    def _stream(self) -> None:
+        """Follow a stream: moves of ours, and another line."""
+        written = self._written
+        if self._wanted is None:
+            self._wanted = self._original.wanted()
+        wanted = self._wanted
+        written.at, lines, taken, found = at.ours(
+            written.array,
+            written.at,
+            written.stop,
+            self._after.state,
+            self._words,
+            wanted.array,
+            wanted.kind is Kind.RESTS,
+            wanted.before,
+            self._before.state,
+            self._place_mm,
+            self._filament_mm,
+        )
+        written.line += lines
+        if taken and wanted.code in self._original.perhaps:
+            self._take_earlier(wanted.code, carried_out=found == at.SAME)
+            return
+        if taken:
+            if found != at.SAME:
+                is_before = written.data.startswith(wanted.code, written.at)
+                raise self._differs(
+                    found,
+                    wanted.before if is_before else self._before.state,
+                    "before" if is_before else "behind",
+                    wanted.code,
+                    wanted.line,
+                    written.line - (not is_before),
+                )
+            self._take(wanted, compared=wanted.kind is Kind.RESTS)
+            return
+        if written.at >= written.stop:
+            return
+        end = written.data.index(b"\n", written.at)
+        line = written.data[written.at : end]
+        if line in self._idle and line != wanted.code:
+            written.skip(end + 1)
+            return
+        code = code_of(line)
+        if code:
+            if not self._takes(code, held_back=False):
+                if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
+                    if self._came_already():
+                        return
+                    raise self._strange(code, wanted.code)
+                self._after.carry_out(code)
+                if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
+                    self._idle.add(line)
+        elif line.startswith(_HELD):
+            if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
+                if self._came_already():
+                    return
+                raise self._strange(line, wanted.code)
+        elif (off := _OFF.match(line)) is not None:
+            self._leave(int(off[1]) if off[1] else ALL)
+        written.skip(end + 1)
+
+    def _takes(self, code: bytes, *, held_back: bool) -> bool:
+        """Take a line of a stream for one of the original, if it is one."""
+        wanted, perhaps = self._wanted, self._original.perhaps
+        if wanted is not None and _is_same(code, wanted.code) and code not in perhaps:
+            compared = wanted.kind is Kind.RESTS and not held_back
+            if compared:
+                # Before it too: where E is absolute, what was fed too much comes back with it.
+                self._check(wanted.before, at.WITHIN, code, wanted.line, "before")
+            if not held_back:
+                self._after.carry_out(code)
+            if compared:
+                self._check(self._before.state, wanted.mask | at.WITHIN, code, wanted.line)
+            self._take(wanted, compared=compared)
+            return True
+        if code in perhaps:
+            while perhaps.popleft() != code:
+                pass
+            if not held_back:
+                self._after.carry_out(code)
+            if wanted is not None and _is_same(code, wanted.code):
+                self._earlier.append(wanted.code)
+                self._count_anew()
+            self._kept += 1
+            return True
+        return False
+
+    def _take_earlier(self, code: bytes, *, carried_out: bool) -> None:
+        """Take a line for the first with its text that may be there, not for the one waited for.
+
+        Filament counts anew from the next line that is compared.
+        """
+        written, perhaps = self._written, self._original.perhaps
+        while perhaps.popleft() != code:
+            pass
+        if not carried_out and written.data.startswith(code, written.at):
+            self._after.carry_out(code)
+            written.skip(written.data.index(b"\n", written.at) + 1)
+        self._count_anew()
+        self._earlier.append(code)
+        self._kept += 1
+
+    def _came_already(self) -> bool:
+        """Whether the line waited for was taken for an earlier one; go on behind it then."""
+        wanted = self._wanted
+        if wanted is None or wanted.code not in self._earlier:
+            return False
+        self._earlier.remove(wanted.code)
+        self._take(wanted, compared=False)
+        self._kept -= 1
+        self._count_anew()
+        return True
+
+    def _count_anew(self) -> None:
+        """Count filament anew from the next line that is compared."""
+        states = [self._after.state, self._before.state]
+        if self._wanted is not None:
+            states.append(self._wanted.before)
+        for state in states:
+            state[at.FED] = NAN
+
+    def _take(self, wanted: Wanted, *, compared: bool) -> None:
+        """Go on behind a line that was waited for."""
+        if compared:
+            self._count(wanted.line)
+        else:
+            self._kept += 1
+        self._original.perhaps.clear()
+        self._original.forget_ahead()
+        self._wanted = None
+        self._begun.append(self._original.place())
+
+    def _leave(self, number: int) -> None:
+        """Leave a stream behind which the file goes on with a line of the original."""
+        original = self._original
+        wanted = self._wanted or original.wanted()
+        while wanted.line < number and wanted.code in self._earlier:
+            self._wanted = wanted
+            self._came_already()
+            wanted = original.wanted()
+        if wanted.code and wanted.line < number:
+            raise self._missing(wanted.line, wanted.code)
+        self._streaming, self._wanted = False, None
+        if number == ALL:
+            self._check(self._before.state, at.WORDS, b"the last stream", original.text.line)
+            return
+        # Go back to before the line: what is wanted may lie behind it, and lines of ours that set
+        # modes or F may have been taken for such.
+        original.look_ahead(wanted)
+        original.perhaps.clear()
+        while len(self._begun) > 1 and self._begun[-1].line > number:
+            self._begun.pop()
+            self._kept -= 1
+            original.forget_ahead()
+        original.go_to(self._begun[-1])
+        original.go_up_to(number)
+        if original.text.line != number:
+            raise LastCheckError(
+                f"a stream ends before line {number} of the original, of which this was written "
+                "already",
+                original.text.line,
+                self._written.line,
+            )
+        self._check(self._before.state, at.WORDS, b"a stream", number)
+
+    # What is found
+
+    def _check(
+        self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "behind"
+    ) -> None:
+        """Compare a state of the original with where the written file is."""
+        found = at.compare(before, self._after.state, mask, self._place_mm, self._filament_mm)
+        if found != at.SAME:
+            raise self._differs(found, before, where, code, line, self._written.line)
+
+    @property
+    def _filament_mm(self) -> float:
+        """By how much E may differ: filament, in units of the file."""
+        return _FILAMENT_MM / self._before.least_flow
+
+    def _count(self, line: int) -> None:
+        """Count a line that was compared."""
+        before, after = self._before.state, self._after.state
+        unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
+        self._note(1, int(unknown != unknown), line)
+
+    def _note(self, lines: int, unknown: int, line: int) -> None:
+        """Count lines that were compared, the first of them without a place."""
+        self._kept += lines
+        self._compared += lines - unknown
+        if unknown and not self._gap_line:
+            self._gap_line = line
+        if lines > unknown and self._gap_line:
+            self._close_gap(f"line {line + unknown}")
+
+    def _close_gap(self, until: str) -> None:
+        line, self._gap_line = self._gap_line, 0
+        why = _shown(self._before.lost) or "no line has named one yet"
+        if len(self._gaps) < _SHOWN:
+            self._gaps.append(
+                f"from line {line} up to {until}: filament and modes only, since the position is "
+                f"not known there ({why})"
+            )
+        else:
+            self._more_gaps += 1
+
+    def _differs(
+        self,
+        found: int,
+        before: NDArray[np.float64],
+        where: str,
+        code: bytes,
+        line: int,
+        written_line: int,
+    ) -> LastCheckError:
+        one, other = float(before[found]), float(self._after.state[found])
+        limit = {at.F: 1e-4, at.RELATIVE: 0.0, at.RELATIVE_E: 0.0}.get(found, self._filament_mm)
+        if found < 3:
+            limit = float(self._place_mm[found])
+        unit = _UNITS[found] and " " + _UNITS[found]
+        return LastCheckError(
+            f"{where} {_shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
+            f"{one:.7g}{unit}; they may differ by {limit:.3g}{unit}",
+            line,
+            written_line,
+        )
+
+    def _missing(self, line: int, code: bytes) -> LastCheckError:
+        return LastCheckError(
+            f"a line of the original is missing ({_shown(code)!r})", line, self._written.line
+        )
+
+    def _strange(self, code: bytes, expected: bytes) -> LastCheckError:
+        wanted = repr(_shown(expected)) if expected else "the end of the file"
+        return LastCheckError(
+            f"{_shown(code)!r} is not what comes next in the original ({wanted}), and no line that "
+            "Stillpath adds there",
+            self._original.text.line,
+            self._written.line,
+        )
+
+
+def _is_same(code: bytes, expected: bytes) -> bool:
+    """Whether a line is that of the original; the times of M73 are new."""
+    return code == expected or (tells_times(code) and tells_times(expected))
+
+
+def _shown(line: bytes) -> str:
+    text = line.strip().decode("utf-8", "replace")
+    return text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."

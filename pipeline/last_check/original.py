@@ -1,0 +1,253 @@
+"""The original, read along: what comes next, and what must come next in the written file."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.reader import Kind, Reader, code_of
+
+__all__ = ["ALL", "Original", "Place", "Text", "Wanted"]
+
+ALL = 1 << 60
+"""Lines of a file, all of them."""
+_BLOCK_BYTES = 1 << 18
+_MOST_PERHAPS = 1 << 12
+_BOM = b"\xef\xbb\xbf"
+
+
+@dataclass(slots=True)
+class Text:
+    """Whole lines of a file that are at hand.
+
+    Attributes
+    ----------
+    data, array : bytes, uint8 array
+        The same twice.
+    at, stop : int
+        Where the next line begins, and where the last one ends.
+    line : int
+        Number of the line at `at`.
+    bytes_before : int
+        Where `data` begins in the file.
+    """
+
+    data: bytes = b""
+    at: int = 0
+    line: int = 1
+    bytes_before: int = 0
+    array: NDArray[np.uint8] = field(default_factory=lambda: np.frombuffer(b"", np.uint8))
+    stop: int = 0
+
+    @property
+    def is_read(self) -> bool:
+        """Nothing is left."""
+        return self.at >= self.stop
+
+    def take(self, data: bytes) -> None:
+        """Go on with other lines, behind those that were at hand."""
+        self.bytes_before += len(self.data)
+        self.data, self.at, self.stop = data, 0, len(data)
+        self.array = np.frombuffer(data, np.uint8)
+
+    def peek(self) -> tuple[bytes, int]:
+        """Return the next line without its end, and where the one behind it begins."""
+        end = self.data.index(b"\n", self.at)
+        line = self.data[self.at : end]
+        if self.line == 1 and line.startswith(_BOM):
+            line = line[len(_BOM) :]
+        return line, end + 1
+
+    def skip(self, behind: int, lines: int = 1) -> None:
+        """Go on with a line further down."""
+        self.at = behind
+        self.line += lines
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The next line of the original that must be in the written file.
+
+    Attributes
+    ----------
+    line : int
+    code, array : bytes, uint8 array
+        The same twice; empty at the end of the file.
+    kind : Kind
+    mask : int
+        Words of a plain move (`Reader.carry_out`).
+    before : float array
+        State before it.
+    """
+
+    line: int = ALL
+    code: bytes = b""
+    kind: Kind = Kind.STAYS
+    mask: int = 0
+    array: NDArray[np.uint8] = field(default_factory=lambda: np.frombuffer(b"", np.uint8))
+    before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(at.SIZE))
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place in the original, and what its reader knew there."""
+
+    bytes_before: int
+    line: int
+    kept: tuple[Any, ...]
+
+
+class Original:
+    """Follow the original.
+
+    Parameters
+    ----------
+    source : binary file
+        Is read from its beginning, and again where `go_to` goes back.
+    reader : Reader
+
+    Attributes
+    ----------
+    text : Text
+    perhaps : deque of bytes
+        Lines before the one that is wanted of which nobody knows whether they move X or Y.
+    """
+
+    def __init__(self, source: BinaryIO, reader: Reader) -> None:
+        source.seek(0)
+        self._source, self.reader, self.text = source, reader, Text()
+        self.perhaps: deque[bytes] = deque(maxlen=_MOST_PERHAPS)
+        self._words = np.zeros(5)
+        self._still = np.zeros(at.SIZE)
+        """State before the last line that stood still in X and Y."""
+        self._ahead: tuple[Wanted, Place, tuple[bytes, ...]] | None = None
+
+    def read_on(self) -> bool:
+        """Read the next lines; tell whether there are any."""
+        parts = []
+        while block := self._source.read(_BLOCK_BYTES):
+            cut = block.rfind(b"\n") + 1
+            if cut:
+                parts.append(block[:cut])
+                if cut < len(block):
+                    self._source.seek(cut - len(block), 1)
+                break
+            parts.append(block)
+        data = b"".join(parts)
+        if data and not data.endswith(b"\n"):
+            data += b"\n"
+        if data:
+            self.text.take(data)
+        return bool(data)
+
+    def place(self) -> Place:
+        """Return where the original is."""
+        text = self.text
+        return Place(text.bytes_before + text.at, text.line, self.reader.keep())
+
+    def go_to(self, place: Place) -> None:
+        """Go on from a place."""
+        text = self.text
+        self.reader.restore(place.kept)
+        if text.bytes_before <= place.bytes_before < text.bytes_before + len(text.data):
+            text.at = place.bytes_before - text.bytes_before
+        else:
+            self._source.seek(place.bytes_before)
+            text.take(b"")
+            text.bytes_before = place.bytes_before
+        text.line = place.line
+
+    def peek(self) -> bytes:
+        """Return the next line that holds a command; nothing at the end."""
+        text = self.text
+        while not text.is_read or self.read_on():
+            line, behind = text.peek()
+            if code := code_of(line):
+                return code
+            text.skip(behind)
+        return b""
+
+    def skip(self) -> None:
+        """Go on behind the next line."""
+        self.text.skip(self.text.data.index(b"\n", self.text.at) + 1)
+
+    def wanted(self) -> Wanted:
+        """Carry out what a stream may stand for, and the line behind it, which must stay."""
+        if self._ahead is not None:
+            wanted, place, perhaps = self._ahead
+            if wanted.line >= self.text.line:
+                self.go_to(place)
+                self.perhaps.extend(perhaps)
+                return wanted
+        while (found := self._next())[0]:
+            (code, mask), before = found, self._still
+            line, kind = self.text.line - 1, Kind.RESTS if mask & at.WORDS else Kind.STAYS
+            if mask < 0:
+                before = self.reader.state.copy()
+                kind, mask = self.reader.carry_out(code)
+                self.skip()
+                line += 1
+            if kind is Kind.PERHAPS:
+                self.perhaps.append(code)
+            elif kind is not Kind.MOVES:
+                array = np.frombuffer(code, np.uint8)
+                return Wanted(line, code, kind, mask, array, before.copy())
+        return Wanted()
+
+    def look_ahead(self, wanted: Wanted) -> None:
+        """Remember what is wanted next, behind which the original is now.
+
+        Many streams may end before it, and the file should not be searched again for each.
+        """
+        self._ahead = wanted, self.place(), tuple(self.perhaps)
+
+    def forget_ahead(self) -> None:
+        """Search again."""
+        self._ahead = None
+
+    def go_up_to(self, line: int) -> None:
+        """Carry out the lines before another one."""
+        while (found := self._next(line))[0]:
+            if found[1] < 0:
+                self.reader.carry_out(found[0])
+                self.skip()
+
+    def _next(self, before_line: int = ALL) -> tuple[bytes, int]:
+        """Carry out moves of X and Y, and go on to what is behind them.
+
+        Returns
+        -------
+        (bytes, int)
+            The line behind them, to be carried out, and -1; or one that stands still in X and Y and
+            was carried out, with its words. Nothing at the end of the file, and before the line.
+        """
+        text = self.text
+        while text.line < before_line:
+            if text.is_read and not self.read_on():
+                break
+            behind, lines, mask = at.carry_out_moves(
+                text.array,
+                text.at,
+                text.stop,
+                before_line - text.line,
+                self.reader.shortest_mm,
+                self.reader.state,
+                self._words,
+                self._still,
+            )
+            text.skip(behind, lines)
+            if mask >= 0:
+                begin = text.data.rfind(b"\n", 0, behind - 1) + 1
+                return text.data[begin : behind - 1].rstrip(), mask
+            if text.is_read or text.line >= before_line:
+                continue
+            line, behind = text.peek()
+            if code := code_of(line):
+                return code, -1
+            text.skip(behind)
+        return b"", -1

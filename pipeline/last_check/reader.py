@@ -1,0 +1,357 @@
+"""A small G-code reader: where a file's own coordinates are at each line, and how much was fed.
+
+It knows plain moves, arcs, modes, units and origins. What may do more makes it forget, until the
+file names the next absolute position: not knowing is never an error. Places are the file's own
+coordinates, so that it does not matter where its origin lies.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import IntEnum
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.rules import Rules
+
+__all__ = ["NAN", "Kind", "Reader", "code_of", "tells_times"]
+
+NAN = float("nan")
+_STILL_MM = 1e-6
+_BEHIND_NAME = re.compile(rb"[ \t]*(?:[A-Z_*].*)?")
+_NUMBER = rb"-?(?:\d+\.?\d*|\.\d+)"
+_WORD = re.compile(rb"[ \t]*([A-Z])(" + _NUMBER + rb")")
+_WORDS = re.compile(rb"(?:" + _WORD.pattern + rb")*[ \t]*")
+_NAME = re.compile(rb"([GMT])(\d+)((?:\.\d+)?)(?![\d.])")
+_LONG_NAME = re.compile(rb"[A-Z_]{2,}[A-Z0-9_]*")
+_LINE_NUMBER = re.compile(rb"N[ \t]*\d+[ \t]*(?![\d.])")
+_SUM = re.compile(rb"\*(\d+)[ \t]*")
+_FLOW = re.compile(rb"S(" + _NUMBER + rb")")
+_FURTHER = re.compile(rb"[GM]-?\d|\{|\x00")
+_CONDITION = re.compile(rb"(?:IF|ELIF|ELSE|WHILE)(?![A-Z0-9_])")
+_STATE_NAME = re.compile(rb"NAME=([A-Z0-9_]+)(?!\S)")
+_MAY_MOVE = re.compile(
+    rb"G[ \t]*-?0*[01235](?!\d)|[XYZEIJK][ \t]*[-+.\d]|.*[\s\d]G-?0*[01235](?!\d)"
+)
+_TEXT = (b"M117", b"M118", b"M23")
+_AXES = b"XYZEF"
+_NO_WORDS = np.zeros(5)
+
+
+class Kind(IntEnum):
+    """What may become of a line in the written file."""
+
+    COMMENT = 0
+    """No command."""
+    STAYS = 1
+    """It must be there."""
+    RESTS = 2
+    """So must this; it is a plain move without X and Y."""
+    MOVES = 3
+    """It moves X or Y: a stream may stand for it."""
+    PERHAPS = 4
+    """Nobody knows whether it does."""
+
+
+class Reader:
+    """Follow one file.
+
+    Parameters
+    ----------
+    rules : Rules
+    shortest_mm : float
+        A move of X and Y that is shorter may be joined with the next one and stay as it is.
+
+    Attributes
+    ----------
+    state : float array
+        See `pipeline.last_check._reader_kernels`.
+    lost : bytes
+        The last line behind which the position was not known.
+    """
+
+    def __init__(self, rules: Rules, shortest_mm: float = 0.0) -> None:
+        self.rules, self.shortest_mm = rules, max(shortest_mm, _STILL_MM)
+        self.state = np.full(at.SIZE, NAN)
+        self.state[[at.E, at.FED, at.RELATIVE, at.WAITS]] = 0.0
+        self.state[at.UNIT] = 1.0
+        self.state[at.RELATIVE_E] = self._says_relative_e = rules.relative_e
+        self.lost = b""
+        self.least_flow = 1.0
+        """The smallest flow factor so far (M221): what E says may be many times what is fed."""
+        self._saved: dict[bytes, tuple[float, ...]] = {}
+        self._pushed: list[tuple[float, ...]] = []
+        self._in_plane_xy = True
+        self._condition = -1
+        """Indentation of the condition under which lines stand; -1: none."""
+
+    def keep(self) -> tuple[Any, ...]:
+        """Return what `restore` goes back to."""
+        return (
+            self.state.copy(),
+            self._says_relative_e,
+            self.lost,
+            self._saved.copy(),
+            self._pushed.copy(),
+            self._in_plane_xy,
+            self._condition,
+        )
+
+    def restore(self, kept: tuple[Any, ...]) -> None:
+        """Go back to where the reader was."""
+        (
+            state,
+            self._says_relative_e,
+            self.lost,
+            saved,
+            pushed,
+            self._in_plane_xy,
+            self._condition,
+        ) = kept
+        self.state[:] = state
+        self._saved, self._pushed = saved.copy(), pushed.copy()
+
+    def carry_out(self, line: bytes) -> tuple[Kind, int]:
+        """Carry out a line that `code_of` says is one, without its end.
+
+        Returns
+        -------
+        (Kind, int)
+            And which of X Y Z E F are its words (bits 0 to 4), of a plain move.
+        """
+        rules = self.rules
+        code = line.split(b";", 1)[0]
+        if rules.several and not self._holds(code):
+            return self._forget(code, modes=True), 0
+        code = code.strip(b" \t\r")
+        if rules.checks_sums and b"*" in code and code != code.upper():
+            return self._forget(code), 0  # the sum is of what stands there
+        if rules.folds_case:
+            code = code.upper()
+        elif code[:1].islower():
+            return Kind.STAYS, 0  # an unknown command, passed over
+        cut = _cut(code, rules)
+        if cut is None:
+            return Kind.STAYS, 0
+        name, rest = cut
+        if name in (b"G0", b"G1"):
+            return self._move(code, rest)
+        if name == b"M221" and (flow := _FLOW.search(rest)) is not None:
+            self.least_flow = min(self.least_flow, max(0.01 * float(flow[1]), 1e-9))
+        if name in rules.harmless or name in _TEXT:
+            return self._harmless(code, name, rest), 0
+        return self._command(code, name, rest), 0
+
+    def _holds(self, code: bytes) -> bool:
+        """Whether a line is carried out for certain: it does not stand under a condition."""
+        indent = len(code) - len(code.lstrip(b" \t"))
+        if self._condition >= 0 and indent > self._condition:
+            return False
+        self._condition = indent if _CONDITION.match(code.strip().upper()) else -1
+        return self._condition < 0
+
+    def _harmless(self, code: bytes, name: bytes, rest: bytes) -> Kind:
+        if self.rules.several and name not in _TEXT and _FURTHER.search(rest):
+            return self._forget(code, modes=True)
+        if self.rules.stacks and name == b"G10" and rest.strip():
+            return self._forget(code)  # offsets of a tool or a workspace
+        return Kind.STAYS
+
+    def _move(self, code: bytes, rest: bytes) -> tuple[Kind, int]:
+        words = _plain_words(rest, self.rules)
+        if words is None or not words.keys() <= {*_AXES, ord("S"), ord("P")}:
+            return self._forget(code, modes=self.rules.several), 0
+        if words.get(ord("F"), 1.0) <= 0.0 and self.rules.skips_low_feed:
+            del words[ord("F")]
+        values, mask = _NO_WORDS.copy(), 0
+        for k, letter in enumerate(_AXES):
+            if letter in words:
+                values[k] = words[letter]
+                mask |= 1 << k
+        z_mm, fed_mm = self.state[[at.Z, at.FED]]
+        way_mm = float(at.way_xy_mm.py_func(self.state, values, mask))  # type: ignore[attr-defined]
+        at.move.py_func(self.state, values, mask)  # type: ignore[attr-defined]
+        if not mask & at.WORDS:
+            return Kind.STAYS, mask
+        others_mm = max(abs(self.state[at.Z] - z_mm), abs(self.state[at.FED] - fed_mm))
+        waited = self.state[at.WAITS] == 1.0
+        # What waits is carried out with the next move that is long enough, of whatever axis.
+        waits = waited if way_mm == 0.0 else way_mm <= self.shortest_mm
+        self.state[at.WAITS] = float(waits and not others_mm > self.shortest_mm)
+        if way_mm == 0.0 and not waited:
+            return Kind.RESTS, mask
+        return Kind.MOVES if way_mm > self.shortest_mm else Kind.PERHAPS, mask
+
+    def _arc(self, code: bytes, rest: bytes) -> Kind:
+        words = _plain_words(rest, self.rules)
+        if words is None or not self._is_plain_arc(words):
+            return self._forget(code)
+        for k, letter in enumerate(_AXES):
+            if letter in words and not (letter == _AXES[4] and words[letter] <= 0.0):
+                values = _NO_WORDS.copy()
+                values[k] = words[letter]
+                at.move.py_func(self.state, values, 1 << k)  # type: ignore[attr-defined]
+        if self.rules.divides_extruder and ord("E") in words and self.state[at.RELATIVE_E] != 1.0:
+            self.state[[at.E, at.FED]] = NAN
+        return Kind.PERHAPS
+
+    def _is_plain_arc(self, words: dict[int, float]) -> bool:
+        """Whether an arc ends where its words say: Marlin passes over one without a centre."""
+        if not self._in_plane_xy or not words.keys() <= set(b"XYZEFIJR"):
+            return False
+        turned = any(words.get(letter, 0.0) != 0.0 for letter in b"IJ")
+        if ord("R") not in words:
+            return turned
+        values = np.array([words.get(letter, 0.0) for letter in _AXES])
+        mask = sum(1 << k for k, letter in enumerate(b"XY") if letter in words)
+        way_mm = at.way_xy_mm.py_func(self.state, values, mask)  # type: ignore[attr-defined]
+        return not turned and words[ord("R")] != 0.0 and way_mm > _STILL_MM
+
+    def _command(self, code: bytes, name: bytes, rest: bytes) -> Kind:
+        """Carry out a command that changes modes or the place, or forget."""
+        rules, state = self.rules, self.state
+        if rules.several and _FURTHER.search(rest):
+            return self._forget(code, modes=True)
+        if name in rules.arcs:
+            return self._arc(code, rest)
+        if name in (b"G90", b"G91"):
+            state[at.RELATIVE] = float(name == b"G91")
+            if rules.positioning_sets_extruder:
+                self._says_relative_e = float(name == b"G91")
+        elif name in (b"M82", b"M83"):
+            self._says_relative_e = float(name == b"M83")
+        elif name == b"G92":
+            return self._set_position(code, rest)
+        elif name in (b"G17", b"G18", b"G19"):
+            self._in_plane_xy = name == b"G17"
+        elif name == b"G21" or (name == b"G20" and rules.inches):
+            state[at.UNIT] = 1.0 if name == b"G21" else 25.4
+        elif rules.restores and name == b"SAVE_GCODE_STATE":
+            self._saved[_state_name(rest)] = self._modes()
+        elif rules.restores and name == b"RESTORE_GCODE_STATE":
+            saved = self._saved.get(_state_name(rest))
+            self._forget(code, modes=saved is None)
+            if saved is not None:
+                self._set_modes(saved)
+        elif rules.stacks and name == b"M120":
+            self._pushed.append(self._modes())
+        elif rules.stacks and name == b"M121":
+            if self._pushed:
+                reads = state[at.E]
+                self._set_modes(self._pushed.pop())
+                state[at.E] = reads
+        elif name in (b"G28", b"G29", b"G30", b"G32"):
+            state[at.X : at.Z + 1] = NAN
+            self.lost = code
+        else:
+            return self._forget(code)
+        self._settle()
+        return Kind.STAYS
+
+    def _set_position(self, code: bytes, rest: bytes) -> Kind:
+        words = _plain_words(rest, self.rules)
+        if words is None or not words.keys() <= set(b"XYZE"):
+            return self._forget(code)
+        if not words and self.rules.bare_set_position:
+            words = dict.fromkeys(b"XYZE", 0.0)
+        for k, letter in enumerate(b"XYZE"):
+            if letter in words:
+                self.state[k] = words[letter] * self.state[at.UNIT]
+        return Kind.STAYS
+
+    def _forget(self, code: bytes, *, modes: bool = False) -> Kind:
+        """Know nothing but the modes until the file says it again."""
+        self.state[[at.X, at.Y, at.Z, at.E, at.FED, at.F]] = NAN
+        if modes:
+            self.state[at.RELATIVE] = self._says_relative_e = NAN
+            self._settle()
+        self.lost = code
+        code = code.strip(b" \t\r").upper()
+        found = _cut(code, self.rules)
+        is_odd = found is not None and not found[0]
+        return Kind.PERHAPS if is_odd or _MAY_MOVE.match(code) else Kind.STAYS
+
+    def _modes(self) -> tuple[float, ...]:
+        state = self.state
+        kept = (at.RELATIVE, at.UNIT, at.F, at.E)
+        return (self._says_relative_e, *(float(state[k]) for k in kept))
+
+    def _set_modes(self, modes: tuple[float, ...]) -> None:
+        self._says_relative_e = modes[0]
+        self.state[[at.RELATIVE, at.UNIT, at.F, at.E]] = modes[1:]
+        self._settle()
+
+    def _settle(self) -> None:
+        """Work out whether E is relative."""
+        relative = self._says_relative_e
+        if self.rules.relative_rules_extruder and not np.isnan(self.state[at.RELATIVE]):
+            relative = max(relative, float(self.state[at.RELATIVE]))
+        self.state[at.RELATIVE_E] = relative
+
+
+def code_of(line: bytes) -> bytes:
+    """Return a line without blanks around it, or nothing if it holds no command."""
+    code = line.strip()
+    if code[:1] in (b"", b";", b"*"):
+        return b""  # a sum alone is of no line
+    if code[:1] in (b"N", b"n"):
+        found = _LINE_NUMBER.match(code.upper())
+        if found is not None and code[found.end() : found.end() + 1] in (b"", b";"):
+            return b""
+    return code
+
+
+def tells_times(code: bytes) -> bool:
+    """Whether it is M73, whose numbers are new in the written file."""
+    return code[:3] == b"M73"
+
+
+@lru_cache(maxsize=1024)  # slicers repeat themselves
+def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
+    """Cut a command from its words; None: the firmware drops the line. Odd ones have no name."""
+    begin = code
+    numbered = _LINE_NUMBER.match(code)
+    if numbered is not None:
+        code = code[numbered.end() :]
+    if b"*" in code and not code.startswith(_TEXT):
+        code, _, given = code.partition(b"*")
+        if not given.strip().isdigit():
+            return b"", begin
+        if rules.checks_sums:
+            if numbered is None or len(given.strip()) > 3:
+                return b"", begin
+            value = 0
+            for byte in begin.partition(b"*")[0]:
+                value ^= byte
+            if value != int(given):
+                return None
+    if len(code) > rules.longest or b"\\" in code or b"\r" in code or b"\x00" in code:
+        return b"", begin
+    found = _NAME.match(code)
+    if found is not None and rules.leading_zeros | bool(_BEHIND_NAME.fullmatch(code, found.end())):
+        number = found[2]
+        if rules.leading_zeros:
+            number = number.lstrip(b"0") or b"0"
+        return found[1] + number + found[3], code[found.end() :]
+    found = _LONG_NAME.match(code)
+    return (found[0], code[found.end() :]) if found is not None else (b"", begin)
+
+
+def _plain_words(rest: bytes, rules: Rules) -> dict[int, float] | None:
+    """Return letters and their numbers if nothing is odd: no blanks within, no letter twice."""
+    if _WORDS.fullmatch(rest) is None:
+        return None
+    if rules.exponents and re.search(rb"[\d.]E", rest):
+        return None
+    found = _WORD.findall(rest)
+    words = {letter[0]: float(number) for letter, number in found}
+    return words if len(words) == len(found) else None
+
+
+def _state_name(rest: bytes) -> bytes:
+    """Return the name of a saved state; nothing for one that is spelled oddly."""
+    found = _STATE_NAME.search(rest)
+    return found[1] if found is not None else b"" if b"NAME" in rest else b"DEFAULT"

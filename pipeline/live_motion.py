@@ -1,0 +1,81 @@
+"""Planned motion that arrives in blocks, with the command that the extra of Klipper makes of it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.base import DesignError
+from stillpath.compensation.live_filter import LiveFilter
+from stillpath.models.schedule import OperatingPoint
+from stillpath.models.shaping import OFF, Shaping
+from stillpath.pipeline.measuring.points import MotionSamples, part_of
+
+__all__ = ["LiveMotion"]
+
+Array = NDArray[np.float64]
+
+
+class LiveMotion:
+    """The stream of a file through a filter that looks ahead; rests are motion like any other.
+
+    Parameters
+    ----------
+    live : LiveFilter
+    """
+
+    def __init__(self, live: LiveFilter) -> None:
+        self._live = live
+        self._begin()
+
+    def push(
+        self, samples: MotionSamples, shaping: Shaping, point: OperatingPoint
+    ) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
+        """Take planned motion; yield what is ready, `executed_mm` being the command.
+
+        Raises
+        ------
+        DesignError
+            If the file sets the firmware's shaper: the extra steps aside for it.
+        """
+        if shaping != OFF:
+            raise DesignError(
+                f"the file sets the firmware's shaper ({shaping.label}), and the compensation "
+                "inside Klipper stands aside for it: take that line out of the file"
+            )
+        if len(samples):
+            self._held.append((samples, point))
+            yield from self._extended(samples.executed_mm)
+
+    def flush(self) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
+        """Yield what is held, as if the machine stood still from now on."""
+        if self._known is not None:
+            last = self._known[:, -1:]
+            yield from self._extended(np.repeat(last, self._live.margin, axis=1))
+        self._begin()
+
+    def _begin(self) -> None:
+        self._known: Array | None = None
+        self._held: deque[tuple[MotionSamples, OperatingPoint]] = deque()
+
+    def _extended(self, path_mm: Array) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
+        margin = self._live.margin
+        before = np.repeat(path_mm[:, :1], margin, axis=1) if self._known is None else self._known
+        known = np.concatenate([before, path_mm], axis=1)
+        self._known = known[:, max(known.shape[1] - 2 * margin, 0) :]
+        if known.shape[1] <= 2 * margin:
+            self._known = known
+            return
+        command = self._live.command(known)
+        while command.shape[1] and self._held:
+            samples, point = self._held.popleft()
+            count = min(command.shape[1], len(samples))
+            if count < len(samples):
+                self._held.appendleft((part_of(samples, count, len(samples)), point))
+                samples = part_of(samples, 0, count)
+            yield replace(samples, executed_mm=command[:, :count]), point
+            command = command[:, count:]

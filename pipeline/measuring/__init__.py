@@ -1,0 +1,1 @@
+"""What is measured of planned motion: errors, spectra, layers, reference shapers."""

@@ -1,0 +1,210 @@
+"""The loop that turns measured samples into points of a layer; `layers` gives it names."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.jit import kernel
+
+__all__ = [
+    "BEND",
+    "COUNT",
+    "HEIGHT",
+    "LAYER",
+    "LINE",
+    "MOVE",
+    "PEN_X",
+    "PEN_Y",
+    "PREVIOUS_X",
+    "PREVIOUS_Y",
+    "SAMPLES",
+    "SPARE",
+    "UNKNOWN",
+    "follow",
+]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+PEN_X, PEN_Y, PREVIOUS_X, PREVIOUS_Y, SPARE, BEND, HEIGHT = range(7)
+"""Where `follow` keeps positions: the last point, the last sample, points that the text read so
+far leaves room for, how far the path has turned since the last point, the height extruded at."""
+COUNT, MOVE, SAMPLES, LAYER, LINE = range(5)
+"""Where it keeps numbers: points of the tile, the move under way, samples since the last point,
+the tile's layer (behind a return: the one that comes), the line whose bytes were counted last."""
+
+UNKNOWN = 65535
+_MOST = 65534
+_UNITS_PER_MM = 1e4
+_SHORTEST_MM, _LONGEST_MM = 0.2, 5.0
+"""Points along an edge are no nearer to each other, and no further apart."""
+_CHANGE_MM, _CHANGE_SHARE = 2e-3, 0.5
+"""An error that stays within this, or within this share of its largest value, is one stretch."""
+_SAGITTA_MM, _TURN = 0.02, 0.35
+"""Chords of an arc make one stretch as long as it stays this straight."""
+_SAME_HEIGHT_MM = 0.04
+
+
+@kernel(allocates=False)
+def follow(
+    xy: Array,
+    z: Array,
+    extruding: NDArray[np.bool_],
+    row: Ints,
+    error: Array,
+    begin: int,
+    first: int,
+    until: int,
+    start: Array,
+    end: Array,
+    line: Ints,
+    byte_start: Ints,
+    byte_end: Ints,
+    layer: NDArray[np.int32],
+    feature: NDArray[np.int32],
+    point_bytes: float,
+    place: Array,
+    number: Ints,
+    high: Array,
+    low: Array,
+    recent: Array,
+    tally: Array,
+    out_xyz: NDArray[np.float32],
+    out_line: NDArray[np.uint32],
+    out_error: NDArray[np.uint16],
+    out_feature: NDArray[np.int32],
+    out_on: NDArray[np.uint8],
+) -> int:
+    """Add the points of samples to a tile, until it is full or another one begins.
+
+    Parameters
+    ----------
+    xy, z, extruding, row, error
+        Samples, shapes (2, n), (n,), (n,), (n,), (channels, n); `row` counts in the moves.
+    begin : int
+        First sample to look at.
+    first, until : int
+        Number in the file of the first of the moves; moves before `until` end behind the samples.
+    start, end, line, byte_start, byte_end, layer, feature
+        Columns of the moves.
+    point_bytes : float
+        What a point costs.
+    place, number : ndarray
+        State, see above.
+    high, low, recent : ndarray, shape (channels,)
+        Largest and smallest error since the last point, and the last one.
+    tally : ndarray, shape (2 channels + 1,)
+        Sums of squares, largest values and number of the samples that extrude.
+    out_*
+        Points of the tile.
+
+    Returns
+    -------
+    int
+        The sample to go on with; -1 when all is done.
+    """
+    channels, samples, room = error.shape[0], error.shape[1], out_line.shape[0]
+    for i in range(begin, samples + 1):
+        last = i == samples
+        target = until if last else first + row[i]
+        while number[MOVE] < target:
+            k = number[MOVE] - first
+            dx, dy = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1]
+            if line[k] != number[LINE]:
+                number[LINE] = line[k]
+                place[SPARE] += (byte_end[k] - byte_start[k]) / point_bytes
+            if dx != 0.0 or dy != 0.0:
+                if layer[k] != number[LAYER] or number[COUNT] + 2 > room:
+                    number[LAYER] = layer[k]
+                    return i
+                bend = False
+                if k + 1 < len(line) and line[k + 1] == line[k]:
+                    ex, ey = end[k + 1, 0] - start[k + 1, 0], end[k + 1, 1] - start[k + 1, 1]
+                    place[BEND] += abs(math.atan2(dx * ey - dy * ex, dx * ex + dy * ey))
+                    cx, cy = end[k, 0] - place[PEN_X], end[k, 1] - place[PEN_Y]
+                    chord = math.sqrt(cx * cx + cy * cy)
+                    bend = chord * place[BEND] < 8.0 * _SAGITTA_MM and place[BEND] < _TURN
+                if not bend:
+                    if number[SAMPLES] == 0:
+                        for c in range(channels):
+                            high[c] = recent[c] if last else max(recent[c], error[c, i])
+                    _add(
+                        end[k, 0], end[k, 1], end[k, 2], k, end[k, 3] > start[k, 3], line,
+                        feature, place, number, high, out_xyz, out_line, out_error, out_feature,
+                        out_on,
+                    )  # fmt: skip
+            number[MOVE] += 1
+        if last:
+            break
+        k = row[i]
+        if layer[k] != number[LAYER] or number[COUNT] + 2 > room:
+            number[LAYER] = layer[k]
+            return i
+        if extruding[i]:
+            if layer[k] < 0 and abs(z[i] - place[HEIGHT]) > _SAME_HEIGHT_MM:
+                return i
+            place[HEIGHT] = z[i]
+            for c in range(channels):
+                tally[c] += error[c, i] * error[c, i]
+                tally[channels + c] = max(tally[channels + c], error[c, i])
+            tally[2 * channels] += 1.0
+        feeds = end[k, 3] > start[k, 3] and (end[k, 0] != start[k, 0] or end[k, 1] != start[k, 1])
+        if feeds and number[SAMPLES] > 0 and place[SPARE] >= 1.0:
+            dx, dy = place[PREVIOUS_X] - place[PEN_X], place[PREVIOUS_Y] - place[PEN_Y]
+            way = dx * dx + dy * dy
+            if way > _SHORTEST_MM * _SHORTEST_MM:
+                another = way > _LONGEST_MM * _LONGEST_MM
+                for c in range(channels):
+                    top = max(high[c], error[c, i])
+                    least = min(low[c], error[c, i])
+                    if top - least > max(_CHANGE_MM, _CHANGE_SHARE * top):
+                        another = True
+                if another:
+                    _add(
+                        place[PREVIOUS_X], place[PREVIOUS_Y], z[i], k, True, line,
+                        feature, place, number, high, out_xyz, out_line, out_error, out_feature,
+                        out_on,
+                    )  # fmt: skip
+        for c in range(channels):
+            value = error[c, i]
+            high[c] = max(high[c], value) if number[SAMPLES] else value
+            low[c] = min(low[c], value) if number[SAMPLES] else value
+            recent[c] = value
+        number[SAMPLES] += 1
+        place[PREVIOUS_X], place[PREVIOUS_Y] = xy[0, i], xy[1, i]
+    return -1
+
+
+@kernel(inline=True, allocates=False)
+def _add(
+    x: float,
+    y: float,
+    z: float,
+    k: int,
+    on: bool,
+    line: Ints,
+    feature: NDArray[np.int32],
+    place: Array,
+    number: Ints,
+    high: Array,
+    out_xyz: NDArray[np.float32],
+    out_line: NDArray[np.uint32],
+    out_error: NDArray[np.uint16],
+    out_feature: NDArray[np.int32],
+    out_on: NDArray[np.uint8],
+) -> None:
+    """End a stretch at x y."""
+    at = number[COUNT]
+    out_xyz[0, at], out_xyz[1, at], out_xyz[2, at] = x, y, z
+    out_line[at] = line[k]
+    for c in range(len(high)):
+        out_error[c, at] = min(int(high[c] * _UNITS_PER_MM + 0.5), _MOST)
+    out_feature[at] = feature[k]
+    out_on[at] = 1 if on else 0
+    number[COUNT] = at + 1
+    number[SAMPLES] = 0
+    place[SPARE] -= 1.0
+    place[PEN_X], place[PEN_Y], place[BEND] = x, y, 0.0

@@ -1,0 +1,78 @@
+"""What a command, or its moves, ask for at most, in one pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.jit import kernel
+
+__all__ = ["peaks", "speed_step"]
+
+Array = NDArray[np.float64]
+
+
+@kernel(allocates=False)
+def peaks(command: Array) -> tuple[float, float]:
+    """Return the longest step of X and Y together, and the largest second difference of either.
+
+    Parameters
+    ----------
+    command : ndarray, shape (2 or more, n)
+        X and Y first.
+    """
+    step2 = bend = 0.0
+    before_x = before_y = 0.0
+    for k in range(1, command.shape[1]):
+        dx, dy = command[0, k] - command[0, k - 1], command[1, k] - command[1, k - 1]
+        step2 = max(step2, dx * dx + dy * dy)
+        if k > 1:
+            bend = max(bend, abs(dx - before_x), abs(dy - before_y))
+        before_x, before_y = dx, dy
+    return np.sqrt(step2), bend
+
+
+@kernel(allocates=False)
+def speed_step(
+    accel_s: Array,
+    cruise_s: Array,
+    decel_s: Array,
+    start_mm_s: Array,
+    cruise_mm_s: Array,
+    accel_mm_s2: Array,
+    direction: Array,
+    step_mm: float,
+    mean: bool,
+    corexy: bool,
+) -> float:
+    """Return the largest step of a motor's speed from move to move, less what rounding may bring.
+
+    Parameters
+    ----------
+    accel_s ... direction
+        Columns of `Phases`.
+    step_mm : float
+        A move's way may be off by so much, and its speed by that over its duration.
+    mean : bool
+        The mean speed counts, and not that of the cruise.
+    corexy : bool
+        The motors turn with x + y and x - y.
+    """
+    worst = 0.0
+    before_a = before_b = rounded_before = 0.0
+    for k in range(len(cruise_s)):
+        duration = accel_s[k] + cruise_s[k] + decel_s[k]
+        speed = cruise_mm_s[k]
+        if mean:
+            lifted = accel_s[k] * (speed - start_mm_s[k])
+            fallen = accel_mm_s2[k] * decel_s[k] * decel_s[k]
+            speed -= 0.5 * (lifted + fallen) / max(duration, 1e-9)
+        a, b = direction[k, 0] * speed, direction[k, 1] * speed
+        rounded = step_mm / max(duration, 1e-4)
+        if corexy:
+            a, b, rounded = a + b, a - b, 2.0 * rounded
+        if k > 0:
+            step = max(abs(a - before_a), abs(b - before_b))
+            worst = max(worst, step - rounded_before - rounded)
+        before_a, before_b, rounded_before = a, b, rounded
+    return worst

@@ -1,0 +1,101 @@
+"""Some layers of a print to draw on a page: taken from all of them, thinned as the print grows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from stillpath.pipeline.measuring.layers import ERROR_UM, UNKNOWN, LayerTile
+from stillpath.pipeline.result import LayerView
+
+__all__ = ["LayerViews"]
+
+_LAYERS_SHOWN = 24
+_POINTS_PER_LAYER = 2500
+
+
+class LayerViews:
+    """Keep a limited number of layers with a limited number of points.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Channels.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = list(names)
+        self._every = 1
+        self._layers: dict[int, LayerTile] = {}
+
+    def add(self, tile: LayerTile) -> None:
+        """Take a layer, or more of one."""
+        if tile.layer < 0 or tile.layer % self._every:
+            return
+        part = _thinned(replace(tile, error=np.where(tile.error == UNKNOWN, 0, tile.error)))
+        known = self._layers.get(tile.layer)
+        self._layers[tile.layer] = part if known is None else _thinned(_joined(known, part))
+        while len(self._layers) > 2 * _LAYERS_SHOWN:
+            self._every *= 2
+            self._layers = {k: v for k, v in self._layers.items() if k % self._every == 0}
+
+    def views(self) -> list[LayerView]:
+        """Return the layers to draw, rising."""
+        numbers = sorted(self._layers)
+        if len(numbers) > _LAYERS_SHOWN:
+            pick = np.linspace(0, len(numbers) - 1, _LAYERS_SHOWN).round().astype(int)
+            numbers = [numbers[i] for i in pick]
+        return [self._view(self._layers[k]) for k in numbers]
+
+    def _view(self, tile: LayerTile) -> LayerView:
+        return LayerView(
+            layer=tile.layer,
+            z_mm=tile.z_mm,
+            x_mm=np.round(tile.x_mm.astype(float), 3).tolist(),
+            y_mm=np.round(tile.y_mm.astype(float), 3).tolist(),
+            extruding=(tile.on > 0).tolist(),
+            line=tile.line.tolist(),
+            contour_um={
+                name: np.round(ERROR_UM * row, 1).tolist()
+                for name, row in zip(self._names, tile.error, strict=True)
+            },
+        )
+
+
+def _joined(first: LayerTile, second: LayerTile) -> LayerTile:
+    """Return two parts of a layer as one."""
+    return replace(
+        first,
+        x_mm=np.append(first.x_mm, second.x_mm),
+        y_mm=np.append(first.y_mm, second.y_mm),
+        line=np.append(first.line, second.line),
+        error=np.append(first.error, second.error, axis=1),
+        feature=np.append(first.feature, second.feature),
+        on=np.append(first.on, second.on),
+    )
+
+
+def _thinned(tile: LayerTile) -> LayerTile:
+    """Return a tile with a stretch where there were several, and the largest of their errors.
+
+    A stretch is never longer than what extrudes without a break, or travels.
+    """
+    count = len(tile)
+    if count <= _POINTS_PER_LAYER:
+        return tile
+    step = -(-count // _POINTS_PER_LAYER)
+    run = np.concatenate([[0], np.flatnonzero(np.diff(tile.on)) + 1, [count]])
+    place = np.arange(count) - np.repeat(run[:-1], np.diff(run))
+    first = np.flatnonzero(place % step == 0)
+    last = np.append(first[1:], count) - 1
+    return replace(
+        tile,
+        x_mm=tile.x_mm[last],
+        y_mm=tile.y_mm[last],
+        line=tile.line[last],
+        error=np.maximum.reduceat(tile.error, first, axis=1),
+        feature=tile.feature[last],
+        on=tile.on[last],
+    )

@@ -1,0 +1,270 @@
+"""The path of every layer with its errors, made while a print is measured.
+
+One point for each move of X or Y, and further ones along an edge where the error changes. A
+point's errors are the largest of the stretch that ends there, so that no peak between two corners
+is lost. Points wait in a tile, which goes to whoever takes tiles when its layer ends: memory does
+not grow with the print.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.types import Moves
+from stillpath.pipeline.measuring import _layer_kernels as kernels
+
+__all__ = ["ERROR_UM", "TILE_POINTS", "UNKNOWN", "LayerRecorder", "LayerTile", "point_bytes"]
+
+Array = NDArray[np.float64]
+_Samples = tuple[Array, Array, NDArray[np.bool_], NDArray[np.int64], Array]
+
+TILE_POINTS = 1 << 17
+"""A layer with more points is several tiles."""
+_GRANTED = 20_000
+"""Points along edges beyond what the file's own size has room for: small files have long edges."""
+ERROR_UM = 0.1
+"""Unit of a point's errors."""
+UNKNOWN = kernels.UNKNOWN
+"""Error of a point that ends no measured stretch."""
+
+
+def point_bytes(channels: int) -> int:
+    """Return the size of a point: x y line, an error for each channel, feature, on."""
+    return 14 + 2 * channels
+
+
+@dataclass(frozen=True, slots=True)
+class LayerTile:
+    """A layer, or a part of one with very many points.
+
+    Attributes
+    ----------
+    layer : int
+        -1 before the first mark of a layer.
+    z_mm : float
+        Median height of what is extruded, or of all points.
+    x_mm, y_mm : ndarray of float32, shape (n,)
+        Corners of the path. The first point is where it begins.
+    line : ndarray of uint32, shape (n,)
+        Line of the file.
+    error : ndarray of uint16, shape (channels, n)
+        Largest contour error of the stretch that ends here, in `ERROR_UM`.
+    feature : ndarray of int32, shape (n,)
+        -1 where unknown.
+    on : ndarray of uint8, shape (n,)
+        1 where the stretch extrudes.
+    rms_um, max_um : ndarray, shape (channels,)
+        Over the time in which something is extruded.
+    seconds : float
+        That time.
+    """
+
+    layer: int
+    z_mm: float
+    x_mm: NDArray[np.float32]
+    y_mm: NDArray[np.float32]
+    line: NDArray[np.uint32]
+    error: NDArray[np.uint16]
+    feature: NDArray[np.int32]
+    on: NDArray[np.uint8]
+    rms_um: Array
+    max_um: Array
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+class LayerRecorder:
+    """Turn measured samples into tiles.
+
+    Parameters
+    ----------
+    channels : int
+    sample_s : float
+        Time from sample to sample.
+    takers : sequence of callables
+        Each is given every tile.
+    """
+
+    def __init__(
+        self, channels: int, sample_s: float, takers: Sequence[Callable[[LayerTile], None]]
+    ) -> None:
+        self._sample_s, self._takers = sample_s, takers
+        self._point_bytes = float(point_bytes(channels))
+        self._nothing: _Samples = (
+            np.zeros((2, 0)),
+            np.zeros(0),
+            np.zeros(0, dtype=bool),
+            np.zeros(0, dtype=np.int64),
+            np.zeros((channels, 0)),
+        )
+        self._moves: Moves | None = None
+        self._layer = -1
+        self._first = 0
+        self._place = np.zeros(kernels.HEIGHT + 1)
+        self._place[kernels.HEIGHT] = np.nan
+        self._number = np.zeros(kernels.LINE + 1, dtype=np.int64)
+        self._number[kernels.LINE] = -1
+        self._place[kernels.SPARE] = _GRANTED
+        self._high, self._low, self._recent = (np.zeros(channels) for _ in range(3))
+        self._tally = np.zeros(2 * channels + 1)
+        self._xyz = np.empty((3, TILE_POINTS), dtype=np.float32)
+        self._line = np.empty(TILE_POINTS, dtype=np.uint32)
+        self._error = np.empty((channels, TILE_POINTS), dtype=np.uint16)
+        self._feature = np.empty(TILE_POINTS, dtype=np.int32)
+        self._on = np.empty(TILE_POINTS, dtype=np.uint8)
+
+    def add(
+        self,
+        xy_mm: Array,
+        z_mm: Array,
+        extruding: NDArray[np.bool_],
+        row: NDArray[np.int64],
+        moves: Moves,
+        first_move: int,
+        error_mm: Array,
+        *,
+        jumped: bool = False,
+    ) -> None:
+        """Add samples.
+
+        Parameters
+        ----------
+        xy_mm : ndarray, shape (2, n)
+            Planned positions.
+        z_mm, extruding, row : ndarray, shape (n,)
+            `row` counts in `moves`.
+        moves : Moves
+        first_move : int
+            Number of the first of them in the file.
+        error_mm : ndarray, shape (channels, n)
+        jumped : bool
+            The position was lost before these samples.
+        """
+        if len(row) == 0:
+            return
+        samples = (xy_mm, z_mm, extruding, row, error_mm)
+        here, begins = first_move + int(row[0]), self._moves is None
+        if not begins and self._moves is not moves:
+            # Moves that were too short for a sample end the moves before.
+            self._follow(self._nothing, here)
+        self._moves, self._first = moves, first_move
+        if begins or jumped:
+            self._number[kernels.MOVE] = here
+            self._lift(samples)
+        # Numbers go on where one item of the file ends and the next one begins.
+        self._number[kernels.MOVE] = max(int(self._number[kernels.MOVE]), first_move)
+        self._follow(samples, 0)
+
+    def finish(self) -> None:
+        """Say that the motion has ended."""
+        if self._moves is not None:
+            self._follow(self._nothing, self._first + len(self._moves))
+            self._close()
+
+    def _follow(self, samples: _Samples, until: int) -> None:
+        """Add the points of samples and of the moves before `until`."""
+        moves = self._moves
+        assert moves is not None
+        xy_mm, z_mm, extruding, row, error_mm = samples
+        at = 0
+        while at >= 0:
+            at = kernels.follow(
+                np.ascontiguousarray(xy_mm),
+                z_mm,
+                extruding,
+                row,
+                np.ascontiguousarray(error_mm),
+                at,
+                self._first,
+                min(until, self._first + len(moves)),
+                moves.start_mm,
+                moves.end_mm,
+                moves.line,
+                moves.byte_start,
+                moves.byte_end,
+                moves.layer,
+                moves.feature,
+                self._point_bytes,
+                self._place,
+                self._number,
+                self._high,
+                self._low,
+                self._recent,
+                self._tally,
+                self._xyz,
+                self._line,
+                self._error,
+                self._feature,
+                self._on,
+            )
+            if at >= 0:
+                self._close()
+                self._begin()
+
+    def _lift(self, samples: _Samples) -> None:
+        """Go to where samples begin, as nobody knows how."""
+        assert self._moves is not None
+        xy_mm, z_mm, _, row, _ = samples
+        self._place[[kernels.PEN_X, kernels.PEN_Y]] = xy_mm[:, 0]
+        self._place[kernels.BEND] = 0.0
+        self._number[kernels.SAMPLES] = 0
+        if self._number[kernels.COUNT] + 2 > TILE_POINTS:
+            self._close()
+        if self._number[kernels.COUNT] == 0:
+            self._number[kernels.LAYER] = self._moves.layer[row[0]]
+            self._layer = int(self._number[kernels.LAYER])
+        self._start(float(z_mm[0]), int(self._moves.line[row[0]]))
+
+    def _begin(self) -> None:
+        """Begin the tile that the kernel asks for, where the path has come to."""
+        self._layer = int(self._number[kernels.LAYER])
+        self._start(np.nan, int(self._number[kernels.LINE]))
+
+    def _start(self, z_mm: float, line: int) -> None:
+        """Add a point where a path begins."""
+        at = int(self._number[kernels.COUNT])
+        self._xyz[:, at] = (*self._place[[kernels.PEN_X, kernels.PEN_Y]], z_mm)
+        self._line[at] = max(line, 0)
+        self._error[:, at] = UNKNOWN
+        self._feature[at], self._on[at] = -1, 0
+        self._number[kernels.COUNT] = at + 1
+
+    def _close(self) -> None:
+        """Give the tile away, unless it is one point, and clear it."""
+        count = int(self._number[kernels.COUNT])
+        if count > 1:
+            on = self._on[:count] > 0
+            z = self._xyz[2, :count][on] if on.any() else self._xyz[2, 1:count]
+            channels = len(self._high)
+            squares, largest = self._tally[:channels], self._tally[channels:-1]
+            seen = float(self._tally[-1])
+            tile = LayerTile(
+                layer=self._layer,
+                z_mm=round(_median(z), 4),
+                x_mm=self._xyz[0, :count].copy(),
+                y_mm=self._xyz[1, :count].copy(),
+                line=self._line[:count].copy(),
+                error=self._error[:, :count].copy(),
+                feature=self._feature[:count].copy(),
+                on=self._on[:count].copy(),
+                rms_um=1e3 * np.sqrt(squares / max(seen, 1.0)),
+                max_um=1e3 * largest,
+                seconds=seen * self._sample_s,
+            )
+            for take in self._takers:
+                take(tile)
+        self._number[kernels.COUNT] = 0
+        self._place[kernels.HEIGHT] = np.nan
+        self._tally[:] = 0.0
+
+
+def _median(z_mm: NDArray[np.float32]) -> float:
+    """Return the median of heights, most often all the same."""
+    low = z_mm.min()
+    return float(low) if low == z_mm.max() else float(np.median(z_mm))

@@ -1,0 +1,106 @@
+"""The largest contour errors behind the ends of lines.
+
+A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
+it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
+They are few, so every sample is measured.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.simulation.measures import ChosenMeter
+
+__all__ = ["RINGING_S", "LineEnds"]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RINGING_S = 0.1
+"""So long ringing counts behind the end of a line."""
+_STILL_MM = 1e-9
+
+
+class LineEnds:
+    """Find the largest errors behind the ends of lines, in all, by layer and by feature.
+
+    Parameters
+    ----------
+    dt_s : float
+    channels : int
+
+    Attributes
+    ----------
+    max_mm : ndarray, shape (channels,)
+    layers, features : dict of int to ndarray, shape (channels,)
+    """
+
+    def __init__(self, dt_s: float, channels: int) -> None:
+        self._errors = ChosenMeter(dt_s, channels=channels)
+        self._reach = round(RINGING_S / dt_s)
+        self._index = np.zeros(0, np.int64)
+        self._groups = np.zeros((2, 0), np.int64)
+        """Number, layer and feature of the samples that are to be measured."""
+        self._fed = self._answered = self._added = 0
+        self.max_mm = np.zeros(channels)
+        self.layers: dict[int, Array] = {}
+        self.features: dict[int, Array] = {}
+        self.jump()
+
+    def jump(self) -> None:
+        """Say that the position is lost."""
+        self._printed = self._moved = -self._reach - 1
+        self._of = (-1, -1)
+        self._at: Array | None = None
+
+    def add(self, samples: MotionSamples) -> None:
+        """Take note of motion whose answers come later."""
+        n = len(samples)
+        path = samples.path_mm
+        before = path[:, :1] if self._at is None else self._at
+        moves = np.any(np.abs(np.diff(path, axis=1, prepend=before)) > _STILL_MM, axis=0)
+        here = np.arange(n)
+        printed = np.maximum.accumulate(np.where(samples.extruding, here, self._printed))
+        moved = np.maximum.accumulate(np.where(moves, here, self._moved))
+        # The last sample of a line may lie a part of a sample before its end.
+        chosen = np.flatnonzero(
+            ~samples.extruding & (here - printed <= self._reach) & (moved <= printed + 1)
+        )
+        if len(chosen):
+            self._index = np.append(self._index, self._added + chosen)
+            of = np.stack([samples.moves.layer, samples.moves.feature])
+            of = of[:, samples.row[np.maximum(printed[chosen], 0)]]
+            of = np.where(printed[chosen] >= 0, of, np.array(self._of)[:, None])
+            self._groups = np.append(self._groups, of.astype(np.int64), axis=1)
+        if printed[-1] >= 0:
+            row = samples.row[printed[-1]]
+            self._of = int(samples.moves.layer[row]), int(samples.moves.feature[row])
+        self._printed, self._moved = int(printed[-1]) - n, int(moved[-1]) - n
+        self._at = path[:, -1:].copy()
+        self._added += n
+
+    def answered(self, path_mm: Array, answer_mm: Array) -> None:
+        """Add the next answers, shapes (2, n) and (channels, 2, n), to what was noted."""
+        upto = self._answered + path_mm.shape[1]
+        end = int(np.searchsorted(self._index, upto))
+        at = self._index[self._fed : end] - self._answered
+        self._answered, self._fed = upto, end
+        self._note(self._errors.push(path_mm, answer_mm, at))
+
+    def finish(self) -> None:
+        """Say that the motion has ended."""
+        self._note(self._errors.flush())
+
+    def _note(self, errors_mm: Array) -> None:
+        count = errors_mm.shape[1]
+        if count == 0:
+            return
+        groups, self._groups = self._groups[:, :count], self._groups[:, count:]
+        self._index, self._fed = self._index[count:], self._fed - count
+        self.max_mm = np.maximum(self.max_mm, errors_mm.max(axis=1))
+        for of, found in zip(groups, (self.layers, self.features), strict=True):
+            for one in np.unique(of).tolist():
+                most = errors_mm[:, of == one].max(axis=1)
+                found[one] = np.maximum(found[one], most) if one in found else most

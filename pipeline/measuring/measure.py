@@ -1,0 +1,330 @@
+"""Figures of a whole print, added up piece by piece: before, after, and the best shaper.
+
+Every channel is the nominal plant's answer to the motion that the firmware executes, measured
+against the same planned path; plants that follow a schedule are those of the moment. Memory stays
+bounded: errors go into tallies, into bins of time that double when they run out, and into tiles of
+layers that are given away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.band import BandContent
+from stillpath.pipeline.measuring.layer_views import LayerViews
+from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
+from stillpath.pipeline.measuring.line_ends import RINGING_S, LineEnds
+from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.measuring.responses import Answered, Answers
+from stillpath.pipeline.measuring.spectra import ErrorSpectra
+from stillpath.pipeline.result import (
+    AxisSpectrum,
+    Channel,
+    ErrorFigures,
+    GroupFigures,
+    LayerView,
+    Track,
+)
+from stillpath.pipeline.tracing import Trace, Tracer
+from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
+
+__all__ = ["STRIDE", "Measurement", "channel_names"]
+
+Array = NDArray[np.float64]
+
+STRIDE = 6
+"""Contour errors are measured at every sixth sample: they change over tens of samples."""
+_SMALL_BYTES = 200_000
+"""Of smaller files every sample is measured: there are too few for chance to even out."""
+_TRACK_BINS = 400
+
+
+class Measurement:
+    """Measure the motion of a print.
+
+    Parameters
+    ----------
+    machine : Machine
+    dt_s : float
+    shaper : BestShaper
+        The yardstick.
+    compensated : bool
+        Whether there is a channel `after` beside `before` and `shaper`. If not, `before` is the
+        executed motion: the firmware's own shaper may be in it.
+    names : sequence of str, optional
+        Channels to measure, where it is not all of these.
+    beside : callable, optional
+        Gives the errors of the other channels at measured points, (2, n): `before` and `shaper`,
+        measured earlier (`pipeline.earlier`), for what is shown along the path.
+    noted : callable, optional
+        Is given measured points with their errors.
+    take_layer : callable, optional
+        Is given every layer as soon as it is measured; channels as `channel_names` has them.
+    trace : callable, optional
+        Is given the motion. Errors are then measured at every sample.
+    size : int, optional
+        Of the file that is measured, in bytes.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        dt_s: float,
+        shaper: BestShaper,
+        *,
+        compensated: bool,
+        names: tuple[str, ...] | None = None,
+        take_layer: Callable[[LayerTile], None] | None = None,
+        trace: Callable[[Trace], None] | None = None,
+        beside: Callable[[MeasuredPoints], Array] | None = None,
+        noted: Callable[[MeasuredPoints, Array], None] | None = None,
+        size: int | None = None,
+    ) -> None:
+        self._beside, self._noted = beside, noted
+        all_of_it = trace is not None or (size is not None and size < _SMALL_BYTES)
+        self._stride = 1 if all_of_it else STRIDE
+        self._tracer = None if trace is None else Tracer(trace)
+        self._dt_s = dt_s
+        self._band = BandContent(machine, dt_s)
+        self._names = names or channel_names(compensated=compensated)
+        shown = channel_names(compensated=True) if beside else self._names
+        self._shown = shown
+        self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
+        self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
+        self._ends = LineEnds(dt_s, len(self._names))
+        self._answers = Answers(machine, dt_s, shaper, self._names, compensated=compensated)
+        self._shaper_label = f"best shaper ({shaper.label})"
+        self._track = _Bins(len(shown))
+        self._spectra = ErrorSpectra(machine, dt_s, self._names)
+        self._views = LayerViews(shown)
+        takers = [self._views.add] + ([take_layer] if take_layer else [])
+        self._tiles = LayerRecorder(len(shown), self._stride * dt_s, takers)
+        self._count = 0
+        self._waiting: list[MeasuredPoints] = []
+        self._jumped = True
+        self._last: MotionSamples | None = None
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is from now on."""
+        self._answers.operate_at(point)
+
+    def add(self, samples: MotionSamples) -> None:
+        """Add motion."""
+        if len(samples):
+            self._last = samples
+            which = slice(-self._count % self._stride, None, self._stride)
+            points = MeasuredPoints.of(samples, which, jumped=self._jumped)
+            if len(points):
+                self._waiting.append(points)
+                self._jumped = False
+            self._count += len(samples)
+            self._band.add(samples.path_mm, samples.extruding)
+            self._ends.add(samples)
+            self._measure(self._answers.push(samples))
+
+    def stand(self, samples: int) -> Array | None:
+        """Stand still; return the position for every sample, (2, n), if it is known."""
+        if self._last is None or samples == 0:
+            return None
+        last = self._last
+        rows = np.full(samples, len(last) - 1)
+        position = last.path_mm[:, rows]
+        self.add(
+            MotionSamples(
+                path_mm=position,
+                executed_mm=position,
+                z_mm=last.z_mm[rows],
+                extruding=np.zeros(samples, dtype=bool),
+                row=last.row[rows],
+                moves=last.moves,
+                first_move=last.first_move,
+                sliced_mm=None if last.sliced_mm is None else last.sliced_mm[:, rows],
+            )
+        )
+        return position
+
+    def jump(self) -> None:
+        """Say that the position is lost: the machine stands still when motion goes on."""
+        self._measure(self._answers.flush())
+        self._band.jump()
+        self._ends.jump()
+        self._spectra.jump()
+        self._jumped = True
+        self._last = None
+
+    def finish(self) -> None:
+        """Say that the motion has ended: the machine stands, and rings where it ended."""
+        self.stand(round(RINGING_S / self._dt_s))
+        self._measure(self._answers.flush())
+        self._note(self._meter.flush())
+        self._ends.finish()
+        self._tiles.finish()
+
+    def _measure(self, found: Answered | None) -> None:
+        if found is None:
+            return
+        path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding
+        self._spectra.add(path_mm, answer_mm, extruding)
+        self._ends.answered(path_mm, answer_mm)
+        if self._tracer is not None:
+            self._tracer.wait(found.executed_mm, answer_mm)
+        self._note(self._meter.push(path_mm, answer_mm, extruding))
+
+    def _note(self, errors: ContourErrors) -> None:
+        done = 0
+        while done < len(errors):
+            points = self._waiting[0]
+            count = min(len(points), len(errors) - done)
+            found = np.ascontiguousarray(errors.error_mm[:, done : done + count])
+            done += count
+            if count < len(points):
+                self._waiting[0] = points.part(slice(count, None))
+                points = points.part(slice(count))
+            else:
+                del self._waiting[0]
+            moves, row = points.moves, points.row
+            if self._tracer is not None:
+                self._tracer.tell(points, found)
+            self._layers.add(found, moves.layer[row], points.extruding)
+            self._features.add(found, moves.feature[row], points.extruding)
+            if self._noted is not None:
+                self._noted(points, found)
+            shown = found
+            if self._beside is not None:
+                before, shaper = self._beside(points)
+                shown = np.stack([before, found[0], shaper])
+                index = errors.index[done - count : done]
+                self._track.add(index, shown, self._dt_s)
+            self._tiles.add(
+                points.path_mm,
+                points.z_mm,
+                points.extruding,
+                row,
+                moves,
+                points.first_move,
+                shown,
+                jumped=points.jumped,
+            )
+        if self._beside is None:
+            self._track.add(errors.index, errors.error_mm, self._dt_s)
+
+    def channels(self) -> list[Channel]:
+        """Return the figures of every channel."""
+        labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
+        meter, ends_mm = self._meter, self._ends.max_mm
+        return [
+            Channel(
+                name=name,
+                label=labels[name],
+                extruding=_figures(
+                    meter.contour_extruding[c], meter.tracking_extruding[c], ends_mm[c]
+                ),
+                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c], ends_mm[c]),
+                residual_rms_um=1e3 * meter.residual[c].rms,
+            )
+            for c, name in enumerate(self._names)
+        ]
+
+    def warnings(self) -> list[str]:
+        """Return what the figures do not stand for, in words."""
+        return self._band.warnings()
+
+    def layers(self) -> list[GroupFigures]:
+        """Return the figures by layer."""
+        return self._groups(self._layers, self._ends.layers, None)
+
+    def features(self, names: Sequence[str]) -> list[GroupFigures]:
+        """Return the figures by feature."""
+        return self._groups(self._features, self._ends.features, names)
+
+    def _groups(
+        self, groups: GroupTally, ends_mm: dict[int, Array], names: Sequence[str] | None
+    ) -> list[GroupFigures]:
+        tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
+        out = []
+        for key, tally in tallies[self._names[0]].items():
+            label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
+            if names is None and key < 0:
+                label = "before the first layer"
+            behind_mm = ends_mm.get(key, np.zeros(len(tallies)))
+            out.append(
+                GroupFigures(
+                    name=label,
+                    seconds=round(self._stride * tally.count * self._dt_s, 3),
+                    contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
+                    contour_max_um={
+                        n: 1e3 * max(t[key].max, float(most))
+                        for (n, t), most in zip(tallies.items(), behind_mm, strict=True)
+                        if key in t
+                    },
+                )
+            )
+        return out
+
+    def track(self) -> Track:
+        """Return the error along the print."""
+        rows = self._track.rms_um()
+        return Track(
+            bin_s=self._track.width_s, contour_rms_um=dict(zip(self._shown, rows, strict=True))
+        )
+
+    def layer_views(self) -> list[LayerView]:
+        """Return the layers to draw."""
+        return self._views.views()
+
+    def spectra(self) -> list[AxisSpectrum]:
+        """Return the spectra of the error along X and Y."""
+        return self._spectra.spectra()
+
+
+def channel_names(*, compensated: bool) -> tuple[str, ...]:
+    """Return the names of what is measured, in the order of all tables of channels."""
+    return ("before", "after", "shaper") if compensated else ("before", "shaper")
+
+
+class _Bins:
+    """Mean squares over bins of time; two bins become one when there are too many."""
+
+    def __init__(self, channels: int) -> None:
+        self.width_s = 1.0
+        self._sum = np.zeros((channels, _TRACK_BINS))
+        self._count = np.zeros(_TRACK_BINS)
+        self._used = 0
+
+    def add(self, index: NDArray[np.int64], error_mm: Array, dt_s: float) -> None:
+        if len(index) == 0:
+            return
+        last = float(index[-1]) * dt_s
+        while last >= self.width_s * _TRACK_BINS:
+            half = _TRACK_BINS // 2
+            pairs = self._sum.reshape(-1, half, 2).sum(axis=2)
+            self._sum = np.pad(pairs, ((0, 0), (0, half)))
+            self._count = np.pad(self._count.reshape(half, 2).sum(axis=1), (0, half))
+            self.width_s *= 2.0
+        place = index * (dt_s / self.width_s)
+        first, end = int(place[0]), int(place[-1]) + 1
+        # None of these bins is empty: they are much wider than errors are apart.
+        begins = np.searchsorted(place, np.arange(first, end + 1))
+        self._sum[:, first:end] += np.add.reduceat(error_mm**2, begins[:-1], axis=1)
+        self._count[first:end] += np.diff(begins)
+        self._used = end
+
+    def rms_um(self) -> list[list[float]]:
+        """Return the bins of every channel."""
+        mean = self._sum / np.maximum(self._count, 1.0)
+        return [[round(float(v), 3) for v in 1e3 * np.sqrt(row[: self._used])] for row in mean]
+
+
+def _figures(contour: Tally, tracking: Tally, ends_mm: float) -> ErrorFigures:
+    return ErrorFigures(
+        contour_rms_um=1e3 * contour.rms,
+        contour_max_um=1e3 * max(contour.max, ends_mm),
+        tracking_rms_um=1e3 * tracking.rms,
+        tracking_max_um=1e3 * tracking.max,
+    )

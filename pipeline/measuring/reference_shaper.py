@@ -1,0 +1,308 @@
+"""The best that the firmware's own shapers can do for a machine: the figure to beat.
+
+Definition: types zv, mzv, ei, 2hump_ei, 3hump_ei with damping 0.1; one frequency an axis on a
+2 % grid from 20 to 200 Hz; the type and pair that minimise the rms contour error over extruding
+motion on the nominal plant.
+
+A shaper and a plant are both linear and share the sampling grid, so they commute: the plant
+answers the plan once, and a shaped answer is a few shifted copies of that, needed only at the
+points that are measured. A coarse grid on few points finds the valleys, a descent on the full
+grid with more points finds their floor, and all points decide between the best.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.models.machine import Machine
+from stillpath.models.plants import DiscretePlant, discretise
+from stillpath.models.reference_motion import reference_motion
+from stillpath.simulation.measures import Tally, contour_error, distance_to_path, tracking_error
+from stillpath.simulation.response import response
+
+__all__ = [
+    "FREQUENCIES_HZ",
+    "BestShaper",
+    "cached_shaper",
+    "evaluate_shaper",
+    "shaped_at",
+    "tune_each",
+    "tune_shaper",
+]
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_ZETA = 0.1
+_VERSION = 1
+"""Part of the cache's name; rises when the definition changes."""
+_SHIPPED, _SHIPPED_US = Path(__file__).with_name("yardsticks.json"), 1000
+_COARSE = 4
+_COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
+_STARTS, _FINALISTS, _FINALISTS_EACH = 4, 6, 2
+_REST_S = 0.12
+"""Longer than the longest shaper, 3hump_ei at 20 Hz: 0.1 s."""
+
+FREQUENCIES_HZ: Array = np.array([20.0 * 1.02**k for k in range(117)])
+"""The 2 % grid, 117 frequencies."""
+
+
+@dataclass(frozen=True, slots=True)
+class BestShaper:
+    """A firmware shaper for both axes and what it reaches.
+
+    `contour_rms_um` and `tracking_rms_um` hold over extruding motion on the nominal plant.
+    """
+
+    type: str
+    fx_hz: float
+    fy_hz: float
+    zeta: float
+    contour_rms_um: float
+    tracking_rms_um: float
+
+    @property
+    def label(self) -> str:
+        """Type and frequencies for a person."""
+        return f"{self.type} {self.fx_hz:.1f} / {self.fy_hz:.1f} Hz"
+
+
+def tune_shaper(
+    machine: Machine, y_d_mm: Array, dt_s: float, extruding: NDArray[np.bool_]
+) -> BestShaper:
+    """Find the best shaper for a motion.
+
+    Parameters
+    ----------
+    y_d_mm : ndarray, shape (2, n)
+        Planned motion, at rest at its start.
+    extruding : ndarray of bool, shape (n,)
+        All motion counts if nothing extrudes.
+    """
+    trial = _Trial(machine, y_d_mm, dt_s, extruding)
+    finalists: list[tuple[float, str, int, int]] = []
+    for kind in SHAPERS:
+        finalists += [(value, kind, i, j) for value, i, j in _floors(trial, kind)]
+        trial.forget()
+    _, i, j, kind = min(
+        (*_descend(trial, kind, (i, j), trial.points(_FINAL_POINTS)), kind)
+        for _, kind, i, j in sorted(finalists)[:_FINALISTS]
+    )
+    return evaluate_shaper(
+        machine, y_d_mm, dt_s, extruding, kind, float(FREQUENCIES_HZ[i]), float(FREQUENCIES_HZ[j])
+    )
+
+
+def tune_each(
+    machine: Machine,
+    y_d_mm: Array,
+    dt_s: float,
+    extruding: NDArray[np.bool_],
+    kinds: Iterable[str] = SHAPERS,
+) -> dict[str, BestShaper]:
+    """Find the best frequencies of every type of shaper by itself; see `tune_shaper`."""
+    trial = _Trial(machine, y_d_mm, dt_s, extruding)
+    best = {}
+    for kind in kinds:
+        _, i, j = min(
+            _descend(trial, kind, (i, j), trial.points(_FINAL_POINTS))
+            for _, i, j in sorted(_floors(trial, kind))[:_FINALISTS_EACH]
+        )
+        trial.forget()
+        fx_hz, fy_hz = float(FREQUENCIES_HZ[i]), float(FREQUENCIES_HZ[j])
+        best[kind] = evaluate_shaper(machine, y_d_mm, dt_s, extruding, kind, fx_hz, fy_hz)
+    return best
+
+
+def evaluate_shaper(
+    machine: Machine,
+    y_d_mm: Array,
+    dt_s: float,
+    extruding: NDArray[np.bool_],
+    kind: str,
+    fx_hz: float,
+    fy_hz: float,
+) -> BestShaper:
+    """Measure one shaper with all points, the way every other motion is measured."""
+    use = extruding if extruding.any() else np.ones(len(extruding), bool)
+    y_d_mm, use = _with_rests(y_d_mm, use, dt_s)
+    pulses = [shaper_pulses(kind, f_hz, _ZETA) for f_hz in (fx_hz, fy_hz)]
+    u = np.stack([shape(row, dt_s, p) for row, p in zip(y_d_mm, pulses, strict=True)])
+    y = response(_plants(machine, dt_s), u)
+    contour, tracking = Tally(), Tally()
+    contour.add(contour_error(y_d_mm, y, dt_s, stride=2), use[::2])
+    tracking.add(tracking_error(y_d_mm, y), use)
+    return BestShaper(kind, fx_hz, fy_hz, _ZETA, 1e3 * contour.rms, 1e3 * tracking.rms)
+
+
+def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> BestShaper:
+    """Return the best shaper on the reference motion, tuned once per machine revision.
+
+    The result is a small JSON file in `directory`, written whole or not at all. A file that
+    cannot be read is made again. For the built-in machines it comes with the program.
+    """
+    if round(dt_s * 1e6) == _SHIPPED_US and machine.revision in _shipped():
+        return _shipped()[machine.revision]
+    path = directory / f"shaper-{machine.revision}-{round(dt_s * 1e6)}us-v{_VERSION}.json"
+    with contextlib.suppress(OSError, ValueError, TypeError):
+        found = BestShaper(**json.loads(path.read_text(encoding="utf-8")))
+        if found.type in SHAPERS and min(found.fx_hz, found.fy_hz) > 0:
+            return found
+    y_d, extruding = reference_motion(dt_s)
+    best = tune_shaper(machine, y_d, dt_s, extruding)
+    directory.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=directory, prefix=path.stem, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(asdict(best), file)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return best
+
+
+@cache
+def _shipped() -> dict[str, BestShaper]:
+    """Return what `benchmarks/yardsticks.py` has found for the built-in machines, by revision."""
+    found = json.loads(_SHIPPED.read_text(encoding="utf-8"))
+    if found["version"] != _VERSION:
+        return {}
+    return {row["revision"]: BestShaper(**row["shaper"]) for row in found["machines"].values()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Points:
+    """Samples at which a trial is measured."""
+
+    index: Ints
+
+
+class _Trial:
+    """One motion on one machine, ready to be measured under any shaper at any points."""
+
+    def __init__(
+        self, machine: Machine, y_d_mm: Array, dt_s: float, extruding: NDArray[np.bool_]
+    ) -> None:
+        use = extruding if extruding.any() else np.ones(len(extruding), bool)
+        self._y_d, use = _with_rests(y_d_mm, use, dt_s)
+        self._dt_s = dt_s
+        self._answer = response(_plants(machine, dt_s), self._y_d)
+        chosen = np.flatnonzero(use)
+        self._chosen = chosen.astype(np.int64)
+        self._points: dict[int, _Points] = {}
+        self._shaped: dict[tuple[int, str, int, int], Array] = {}
+        self._known: dict[tuple[int, str, int, int], float] = {}
+
+    def points(self, count: int) -> int:
+        """Prepare about `count` points spread over the extruding samples; return their key."""
+        if count not in self._points:
+            step = max(1, len(self._chosen) // count)
+            # A stride that shares no rhythm with the motion: one random sample per cell.
+            offset = np.random.default_rng(1).integers(0, step, len(self._chosen) // step)
+            cells = np.arange(len(offset)) * step + offset
+            self._points[count] = _Points(self._chosen[cells])
+        return count
+
+    def rms(self, kind: str, i: int, j: int, points: int) -> float:
+        """Rms contour error [mm] with frequency number i on X and j on Y."""
+        key = (points, kind, i, j)
+        if key not in self._known:
+            at = self._points[points].index
+            y = np.stack([self._axis(0, kind, i, points), self._axis(1, kind, j, points)])
+            error = distance_to_path(self._y_d, y, at, self._dt_s)
+            self._known[key] = float(np.sqrt(error @ error / len(error)))
+        return self._known[key]
+
+    def forget(self) -> None:
+        """Drop the shaped answers (they are large and belong to one type of shaper)."""
+        self._shaped.clear()
+
+    def _axis(self, axis: int, kind: str, number: int, points: int) -> Array:
+        key = (points, kind, axis, number)
+        if key not in self._shaped:
+            pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
+            index = self._points[points].index
+            self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, index)
+        return self._shaped[key]
+
+
+def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
+    """Return `shape(answer)[index]`, without the rest: what a plant answers to a shaped command.
+
+    Parameters
+    ----------
+    answer : ndarray, shape (n,)
+        Of the plant to the plan.
+    index : ndarray of int64, shape (m,)
+    """
+    weights, delays = pulses
+    shift = float(weights @ delays)
+    last = len(answer) - 1
+    out = np.zeros(len(index))
+    for weight, delay in zip(weights, delays, strict=True):
+        late = (delay - shift) / dt_s
+        whole = math.floor(late)
+        part = late - whole
+        out += weight * (1 - part) * answer[np.clip(index - whole, 0, last)]
+        out += weight * part * answer[np.clip(index - whole - 1, 0, last)]
+    return out
+
+
+def _floors(trial: _Trial, kind: str) -> set[tuple[float, int, int]]:
+    """Return the floors of the deepest valleys of one type: rms on many points, frequencies."""
+    coarse, fine = trial.points(_COARSE_POINTS), trial.points(_FINE_POINTS)
+    grid = range(0, len(FREQUENCIES_HZ), _COARSE)
+    rough = sorted((trial.rms(kind, i, j, coarse), i, j) for i in grid for j in grid)
+    starts: list[tuple[int, int]] = []
+    for _, i, j in rough:
+        if all(max(abs(i - a), abs(j - b)) > 2 * _COARSE for a, b in starts):
+            starts.append((i, j))
+        if len(starts) == _STARTS:
+            break
+    return {_descend(trial, kind, start, fine) for start in starts}
+
+
+def _descend(
+    trial: _Trial, kind: str, start: tuple[int, int], points: int
+) -> tuple[float, int, int]:
+    """Walk downhill over the full grid, looking three steps around."""
+    i, j = start
+    best = trial.rms(kind, i, j, points)
+    top = len(FREQUENCIES_HZ) - 1
+    while True:
+        around = [
+            (trial.rms(kind, a, b, points), a, b)
+            for reach in (1, 3)
+            for a, b in itertools.product((i - reach, i, i + reach), (j - reach, j, j + reach))
+            if 0 <= a <= top and 0 <= b <= top
+        ]
+        value, a, b = min(around)
+        if value >= best:
+            return best, i, j
+        best, i, j = value, a, b
+
+
+def _with_rests(
+    y_d_mm: Array, use: NDArray[np.bool_], dt_s: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Add standstill before and after: a centred shaper begins early and ends late."""
+    pad = 2 * round(_REST_S / dt_s / 2)
+    return np.pad(y_d_mm, ((0, 0), (pad, pad)), mode="edge"), np.pad(use, pad)
+
+
+def _plants(machine: Machine, dt_s: float) -> list[DiscretePlant]:
+    return [discretise(machine.axes[axis].nominal, dt_s) for axis in ("x", "y")]

@@ -1,0 +1,160 @@
+"""What a machine does with the commands of a print: as sliced, compensated, and the best shaper's.
+
+Motion is pushed as it comes and answered some samples later, as a shaper looks ahead; short motion
+waits for more, since between two pieces there are often a few moves only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import EMPTY, OperatingPoint
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.simulation.scheduled import MachineStream
+
+__all__ = ["Answered", "Answers"]
+
+Array = NDArray[np.float64]
+
+_LEAST_SAMPLES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """Motion with what the machine does with the command of every channel.
+
+    Attributes
+    ----------
+    path_mm, executed_mm : ndarray, shape (2, n)
+    extruding : ndarray of bool, shape (n,)
+    answer_mm : ndarray, shape (channels, 2, n)
+        Part of a larger array.
+    """
+
+    path_mm: Array
+    executed_mm: Array
+    extruding: NDArray[np.bool_]
+    answer_mm: Array
+
+
+class Answers:
+    """Answers of the nominal plants to the commands of some channels.
+
+    Parameters
+    ----------
+    machine : Machine
+    dt_s : float
+    shaper : BestShaper
+        Its delay is taken out.
+    names : sequence of str
+        Channels: `before` is the file as it came (the executed motion, if nothing is compensated),
+        `after` the executed motion, `shaper` the file as it came, shaped.
+    compensated : bool
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        dt_s: float,
+        shaper: BestShaper,
+        names: tuple[str, ...],
+        *,
+        compensated: bool,
+    ) -> None:
+        self._machine, self._dt_s, self._names = machine, dt_s, names
+        self._compensated = compensated
+        self._point = EMPTY
+        self._pulses = [
+            shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
+        ]
+        self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
+        # Plants that change do so where the motion has come to.
+        self._least = 1 if machine.schedules else _LEAST_SAMPLES
+        # A linear machine's answer to the shaped path is its answer to the path, shaped.
+        linear = not machine.schedules and not machine.ripple
+        self._shapes_answer = linear and compensated and {"before", "shaper"} <= set(names)
+        self._streams: dict[str, MachineStream] = {}
+        self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
+        """Planned: the path, and below it the file as it came, where that is not the same."""
+        self._extruding = np.zeros(0, bool)
+        self._answer = np.zeros((2, 0))
+        """To the path, from `reach` samples before what is held to where it is known."""
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is from now on."""
+        self._point = point
+        for stream in self._streams.values():
+            stream.operate_at(point)
+
+    def push(self, samples: MotionSamples) -> Answered | None:
+        """Return answers to what was pushed so far, all but the last few samples."""
+        fresh = samples.path_mm
+        if samples.sliced_mm is not None:
+            fresh = np.concatenate([fresh, samples.sliced_mm])
+        if self._planned.shape[1] == 0:
+            # The machine stood where it begins.
+            self._planned = np.repeat(fresh[:, :1], self._reach, axis=1)
+            self._answer = self._planned[-2:]
+            self._stand()
+        self._planned = np.concatenate([self._planned, fresh], axis=1)
+        self._executed = np.concatenate([self._executed, samples.executed_mm], axis=1)
+        self._extruding = np.concatenate([self._extruding, samples.extruding])
+        ready = len(self._extruding) - self._reach
+        return self._release(ready) if ready >= self._least else None
+
+    def flush(self) -> Answered | None:
+        """Return what is held, as if the machine stood still from now on."""
+        if self._planned.shape[1] == 0:
+            return None
+        end = np.repeat(self._planned[:, -1:], self._reach, axis=1)
+        self._planned = np.concatenate([self._planned, end], axis=1)
+        out = self._release(len(self._extruding))
+        self._planned = self._planned[:, :0]
+        return out
+
+    def _stand(self) -> None:
+        for stream in self._streams.values():
+            stream.stand()
+        if not self._streams:
+            self._streams = {
+                name: MachineStream(self._machine, self._dt_s, self._point)
+                for name in self._names
+                if name != "shaper" or not self._shapes_answer
+            }
+
+    def _release(self, ready: int) -> Answered:
+        # What is planned begins `reach` samples before what is held, and ends as many behind it.
+        span = slice(self._reach, self._reach + ready)
+        sliced = self._planned[-2:]
+        path, executed = self._planned[:2, span], self._executed[:, :ready]
+        answers = np.empty((len(self._names), *sliced.shape))
+        for name, answer in zip(self._names, answers, strict=True):
+            if name == "before" and self._shapes_answer:
+                known = self._answer.shape[1]
+                answer[:, :known] = self._answer
+                self._streams[name].push(sliced[:, known:], sliced[:, known:], answer[:, known:])
+                self._answer = answer
+            elif name == "shaper" and self._shapes_answer:
+                self._shape(self._answer, answer)
+            elif name == "shaper":
+                command = np.empty(sliced.shape)
+                self._shape(sliced, command)
+                self._streams[name].push(command[:, span], path, answer[:, span])
+            else:
+                came = name == "before" and self._compensated
+                command = sliced[:, span] if came else executed
+                self._streams[name].push(command, path, answer[:, span])
+        out = Answered(path, executed, self._extruding[:ready], answers[:, :, span])
+        self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:].copy()
+        self._executed, self._extruding = self._executed[:, ready:], self._extruding[ready:]
+        return out
+
+    def _shape(self, motion: Array, out: Array) -> None:
+        for row, pulses, shaped in zip(motion, self._pulses, out, strict=True):
+            shape(row, self._dt_s, pulses, out=shaped)

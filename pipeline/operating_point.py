@@ -1,0 +1,126 @@
+"""Where a machine is as a file goes on: the print's mass on its bed, and the height."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stillpath.gcode.types import Moves
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid, machine_at, mass_schedules
+from stillpath.models.schedule import EMPTY, OperatingPoint, resonances_hz
+from stillpath.simulation.scheduled import BLEND_STEP, STEP
+
+__all__ = ["Operation"]
+
+_ALL_KNOWN = 7
+_LONGEST_RETRACTION_MM = 20.0
+"""Filament that is pulled back further has left the hotend: a change of filament or tool, behind
+which the firmware may load on its own, and nothing is owed to what was pulled back."""
+
+
+class Operation:
+    """Follow the moves of a file, item by item.
+
+    Parameters
+    ----------
+    machine : Machine
+
+    Attributes
+    ----------
+    printed_kg : float
+        Filament that lies on the bed. Feeding counts where X or Y moves, beyond what was pulled
+        back before; what runs out while the nozzle stands ends in a bin or is wiped off.
+
+    Notes
+    -----
+    Diameter and density are those of the machine document (`firmware`, `schedules`).
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        masses = mass_schedules(machine)
+        density_g_cm3 = masses[0].filament_density_g_cm3 if masses else 0.0
+        area_mm2 = 0.25 * math.pi * machine.firmware.hotend.filament_diameter_mm**2
+        self._kg_per_mm = 1e-6 * area_mm2 * density_g_cm3
+        self.printed_kg = 0.0
+        self._furthest_mm: float | None = None
+        self._point = EMPTY
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._level: OperatingPoint | None = None
+        self._used: dict[str, tuple[float, float]] = {}
+
+    def at(self, moves: Moves) -> OperatingPoint:
+        """Return where the machine is while these moves run, which come next.
+
+        The mass is that at half of their filament, the position where they first print.
+        """
+        if not self._machine.schedules:
+            return self._point
+        known = np.flatnonzero((moves.known & _ALL_KNOWN) == _ALL_KNOWN)
+        position = (self._point.x_mm, self._point.y_mm, self._point.z_mm)
+        if len(known):
+            travel = moves.end_mm[known] - moves.start_mm[known]
+            prints = (travel[:, 3] > 0.0) & np.any(travel[:, :2] != 0.0, axis=1)
+            x, y, z = moves.start_mm[known[np.argmax(prints)], :3].tolist()
+            position = (x, y, z)
+        laid_mm, _ = self._laid(moves)
+        half_kg = 0.5 * self._kg_per_mm * laid_mm
+        self._point = OperatingPoint(self.printed_kg + half_kg, *position)
+        self._note_range()
+        return self._point
+
+    def passed(self, moves: Moves) -> None:
+        """Count the filament of moves that are done."""
+        laid_mm, self._furthest_mm = self._laid(moves)
+        self.printed_kg += self._kg_per_mm * laid_mm
+
+    def notes(self) -> list[str]:
+        """Return what the plants followed, in words."""
+        notes = []
+        for axis, schedule in self._machine.schedules.items():
+            follows = []
+            if schedule.mass is not None:
+                follows.append(
+                    f"the mass on the bed ({self.printed_kg:.3f} kg at the end, filament of "
+                    f"{schedule.mass.filament_density_g_cm3:g} g/cm3)"
+                )
+            if schedule.grid is not None:
+                measured = [a for a in ("x", "y", "z") if schedule.grid.coordinates_mm(a)]
+                follows.append(f"the position in {', '.join(measured)}")
+            text = f"The plant of axis {axis} follows {' and '.join(follows)}"
+            if axis in self._used:
+                low, high = self._used[axis]
+                text += f": its lowest resonance was between {low:.1f} and {high:.1f} Hz"
+            notes.append(f"{text}.")
+        return notes
+
+    def _laid(self, moves: Moves) -> tuple[float, float | None]:
+        """Filament that the moves lay down, and the extruder's furthest position behind them."""
+        if self._kg_per_mm == 0.0 or len(moves) == 0:
+            return 0.0, self._furthest_mm
+        e_mm = moves.end_mm[:, 3]
+        moving = np.any(moves.end_mm[:, :2] != moves.start_mm[:, :2], axis=1)
+        furthest_mm = moves.start_mm[0, 3] if self._furthest_mm is None else self._furthest_mm
+        laid_mm, first = 0.0, 0
+        while first < len(moves):
+            furthest = np.maximum.accumulate(np.append(furthest_mm, e_mm[first:]))
+            unloaded = furthest[1:] - e_mm[first:] > _LONGEST_RETRACTION_MM
+            count = int(np.argmax(unloaded)) + 1 if unloaded.any() else len(unloaded)
+            last = first + count
+            laid_mm += float(np.sum(np.diff(furthest)[:count][moving[first:last]]))
+            furthest_mm = float(e_mm[last - 1] if unloaded.any() else furthest[count])
+            first = last
+        return laid_mm, furthest_mm
+
+    def _note_range(self) -> None:
+        level = self._grid.level(self._point)
+        if level == self._level:
+            return
+        self._level = level
+        for node in self._grid.at_level(level):
+            for axis, plants in machine_at(self._machine, node).axes.items():
+                f_hz = float(resonances_hz(plants.nominal)[0])
+                low, high = self._used.get(axis, (f_hz, f_hz))
+                self._used[axis] = (min(low, f_hz), max(high, f_hz))

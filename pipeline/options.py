@@ -1,0 +1,120 @@
+"""What the user chooses for one job."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+
+from stillpath.compensation.registry import COMPENSATORS
+from stillpath.models.machine import Machine
+from stillpath.version import __version__
+
+__all__ = [
+    "DEFAULT_TOLERANCE_UM",
+    "BasisName",
+    "BudgetUm",
+    "DialectName",
+    "MaxMb",
+    "MethodName",
+    "Options",
+    "RobustMode",
+    "Where",
+    "stamp",
+]
+
+DEFAULT_TOLERANCE_UM = 2.0
+
+_PLAIN = (*COMPENSATORS, "none")
+_METHOD = rf"^(advise|({'|'.join(_PLAIN)})(\+ripple)?)$"
+
+
+def _known(method: str) -> str:
+    if re.fullmatch(_METHOD, method) is None:
+        raise ValueError(
+            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple behind it, "
+            "and advise"
+        )
+    return method
+
+
+MethodName = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"pattern": _METHOD})]
+BasisName = Literal["ce-opt", "robust", "bspline", "dct"]
+RobustMode = Literal["auto", "off", "ensemble", "minimax"]
+DialectName = Literal["klipper", "marlin", "prusa", "bambu", "reprapfirmware"]
+Where = Literal["all", "visible", "walls"]
+MaxMb = Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)]
+BudgetUm = Annotated[float, Field(ge=0.5, le=1000, allow_inf_nan=False)]
+
+
+class Options(BaseModel):
+    """Settings of one compensation job; the same settings give the same bytes.
+
+    `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
+    with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
+    `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`).
+    `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
+    the set of plants that explain the measurement, with as much of a shaper's smoothing as no
+    member fares worse for (`auto`; a machine without a measured set: its one plant), the nominal
+    plant (`off`), or the set as given (`ensemble`, `minimax`). `along` is the weight of the error
+    along the path against that across it (None: 1). `plate` chooses one of several in a
+    3MF package; it is no setting of the compensation. `times` says whether the slicer's times in
+    the file follow the new motion. `dialect` is how the file is read (None: as the machine's
+    firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
+    worst plant of the machine's set) that every feature may have: the print becomes as fast as
+    that allows (None: it keeps its speeds).
+    `where` says which features are compensated (`pipeline.selection`); the others leave as
+    sliced, and the file is smaller. `max_mb` is the most that the G-code may have, in millions of
+    bytes: fewer features are compensated, as few as the walls, until it fits.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: MethodName = "fbf"
+    basis: BasisName = "ce-opt"
+    robust: RobustMode = "auto"
+    along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
+    plate: Annotated[int, Field(ge=1)] | None = None
+    tolerance_um: Annotated[float, Field(ge=0.5, le=50, allow_inf_nan=False)] = DEFAULT_TOLERANCE_UM
+    times: Literal["new", "kept"] = "new"
+    dialect: DialectName | None = None
+    budget_um: BudgetUm | None = None
+    where: Where = "all"
+    max_mb: MaxMb | None = None
+
+    @model_validator(mode="after")
+    def _one_selection(self) -> Options:
+        if self.budget_um is not None and (self.where != "all" or self.max_mb is not None):
+            raise ValueError(
+                "budget_um makes the whole print faster: it cannot be combined with where and "
+                "max_mb, which leave parts of it as sliced"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Digests of options are kept for long: what came later counts only where it is used.
+        values: dict[str, Any] = handler(self)
+        for name, unused in (("budget_um", None), ("where", "all"), ("max_mb", None)):
+            if values.get(name) == unused:
+                values.pop(name, None)
+        return values
+
+
+def stamp(machine: Machine, options: Options) -> str:
+    """Return what a written file says of how it was made; the same stamp, the same bytes."""
+    settings = hashlib.sha256(options.model_dump_json(exclude={"plate"}).encode()).hexdigest()[:8]
+    return (
+        f"{__version__} machine={machine.name} model={machine.revision} "
+        f"method={options.method} settings={settings}"
+    )

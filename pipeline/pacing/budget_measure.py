@@ -1,0 +1,134 @@
+"""Figures of a print that became quicker, beside those of the print as it was sliced.
+
+What is written runs in a time of its own. The errors of the file as it came, and of it with the
+best shaper, are those at the file's own speeds, and are measured there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.pacing import AS_SLICED
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.measuring.layers import LayerTile
+from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.measuring.set_errors import ErrorSum, SetErrors
+from stillpath.pipeline.result import Channel, GroupFigures
+from stillpath.pipeline.tracing import Trace
+
+__all__ = ["BudgetMeasurement"]
+
+_STRIDE = 24
+"""Of the errors of the set, whose plants are many."""
+
+
+class BudgetMeasurement(Measurement):
+    """Measure both motions; parameters as `Measurement` has them.
+
+    Channels, layers and features are those of the written file, with `before` and `shaper` at the
+    speeds of the file as it came. What is drawn along the print (track, spectra, tiles of layers)
+    shows all channels at the new speeds.
+    """
+
+    note = (
+        "Curves along the print, spectra and layers show the motion without compensation, and that "
+        "with the best shaper, at the new speeds; all other figures of these at the file's own."
+    )
+
+    def __init__(
+        self,
+        machine: Machine,
+        dt_s: float,
+        shaper: BestShaper,
+        *,
+        take_layer: Callable[[LayerTile], None] | None = None,
+        trace: Callable[[Trace], None] | None = None,
+        size: int | None = None,
+    ) -> None:
+        super().__init__(
+            machine, dt_s, shaper, compensated=True, take_layer=take_layer, trace=trace, size=size
+        )
+        self._sliced = Measurement(machine, dt_s, shaper, compensated=False, size=size)
+        self._set = SetErrors(machine, dt_s, stride=_STRIDE)
+
+    def operate_at(self, point: OperatingPoint) -> None:
+        """Say where the machine is from now on."""
+        super().operate_at(point)
+        self._sliced.operate_at(point)
+        self._set.operate_at(point)
+
+    def add(self, samples: MotionSamples) -> None:
+        """Add motion that leaves as it came."""
+        self.add_pair(samples, samples, np.full(len(samples.moves), AS_SLICED, np.int32))
+
+    def add_pair(
+        self, written: MotionSamples, sliced: MotionSamples, classes: NDArray[np.int32]
+    ) -> None:
+        """Add the motion of a piece as it is written, and as it was sliced.
+
+        Parameters
+        ----------
+        written, sliced : MotionSamples
+        classes : ndarray of int32
+            What the errors of each of `written.moves` count for.
+        """
+        super().add(written)
+        self._sliced.add(sliced)
+        if len(written):
+            of_sample = classes[written.row]
+            self._set.add(written.path_mm, written.executed_mm, written.extruding, of_sample)
+
+    def jump(self) -> None:
+        """Say that the position is lost: the machine stands still when motion goes on."""
+        super().jump()
+        self._sliced.jump()
+        self._set.jump()
+
+    def finish(self) -> None:
+        """Say that the motion has ended."""
+        super().finish()
+        self._sliced.finish()
+        self._set.finish()
+
+    def sums(self) -> dict[int, ErrorSum]:
+        """Return the errors of the written file by class of moves, so far."""
+        return self._set.sums()
+
+    def channels(self) -> list[Channel]:
+        """Return the figures of every channel."""
+        sliced = {channel.name: channel for channel in self._sliced.channels()}
+        return [sliced.get(channel.name, channel) for channel in super().channels()]
+
+    def layers(self) -> list[GroupFigures]:
+        """Return the figures by layer."""
+        return _joined(super().layers(), self._sliced.layers())
+
+    def features(self, names: Sequence[str]) -> list[GroupFigures]:
+        """Return the figures by feature."""
+        return _joined(super().features(names), self._sliced.features(names))
+
+
+def _joined(written: list[GroupFigures], sliced: list[GroupFigures]) -> list[GroupFigures]:
+    """Put the figures of the file as it came over those at the new speeds."""
+    before = {group.name: group for group in sliced}
+    joined = []
+    for group in written:
+        other = before.get(group.name)
+        if other is None:
+            joined.append(group)
+            continue
+        joined.append(
+            group.model_copy(
+                update={
+                    "contour_rms_um": group.contour_rms_um | other.contour_rms_um,
+                    "contour_max_um": group.contour_max_um | other.contour_max_um,
+                }
+            )
+        )
+    return joined

@@ -1,0 +1,181 @@
+"""The quickest paces that keep a budget of contour error, found on samples.
+
+All classes are raised together, each as far as its own error leaves room; where that was too much,
+those above the budget come down until all keep it; and from there all are raised again. Classes
+shake each other, so only what was tried counts: of all trials within the budget, the quickest wins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from stillpath.gcode.pacing import TRAVEL
+from stillpath.pipeline.pacing.pace_trials import Factors, Tried
+
+__all__ = ["PaceChoice", "allowed_um", "search"]
+
+_TRIALS = 10
+_AIM, _WITHIN, _ROOM = 0.95, 0.98, 0.92
+"""Parts of a bound: what is aimed at, what is within it, and below what a class is raised."""
+_NO_WORSE = 1.1
+"""What exceeds the budget at its own pace may become so many times worse."""
+_LANDING = 2.0
+"""So many budgets may what is extruded right behind a travel have; its feature has one for all."""
+_LEAP = 8.0
+"""A class is raised at most so many times at once."""
+_STEEPEST, _FLATTEST = 2.5, 0.2
+"""Limits of the power of acceleration with which an error is taken to rise."""
+_SHAKEN = 0.7
+"""The same of what a class causes in those behind it."""
+_SAME = 1.02
+_WORTH = 0.002
+"""Time that a raise must save for another one to be tried."""
+
+Trial = Callable[[Factors], Tried]
+
+
+def allowed_um(one: int, budget_um: float) -> float:
+    """Return the error that a class may have within a budget."""
+    return _LANDING * budget_um if one == TRAVEL else budget_um
+
+
+@dataclass(frozen=True, slots=True)
+class PaceChoice:
+    """Paces of a file.
+
+    Attributes
+    ----------
+    factors : dict
+        Ratios of accelerations by class; 1: as the file has it.
+    bounds_um : dict
+        Error that each class may have: the budget, or what it has at its own pace if that is more.
+    reached : bool
+        Some trial kept all bounds.
+    """
+
+    factors: Factors
+    bounds_um: dict[int, float] = field(default_factory=dict)
+    reached: bool = True
+
+
+def search(trial: Trial, least: float, most: Factors, budget_um: float) -> PaceChoice:
+    """Find the quickest paces within a budget.
+
+    Parameters
+    ----------
+    trial : callable
+    least : float
+        Smallest factor, at most 1.
+    most : dict
+        Largest factor of every class.
+    budget_um : float
+    """
+    factors = dict.fromkeys(most, 1.0)
+    tried = trial(factors)
+    bounds = {one: allowed_um(one, budget_um) for one in most}
+    if least == 1.0:
+        for one in bounds:
+            if one in tried.errors:
+                bounds[one] = max(bounds[one], _NO_WORSE * tried.errors[one].rms_um)
+    climb = _Climb(least, most)
+    best: Factors | None = None
+    seconds = math.inf
+    for _ in range(_TRIALS):
+        over = {
+            one: math.inf if one in tried.unfit else tried.errors[one].rms_um / bounds[one]
+            for one in bounds
+            if one in tried.errors or one in tried.unfit
+        }
+        climb.learn(factors, over)
+        if all(ratio <= _WITHIN for ratio in over.values()):
+            gained = seconds - tried.seconds
+            if gained > 0.0:
+                best, seconds = factors, tried.seconds
+            if gained <= _WORTH * tried.seconds:
+                break
+            wanted = climb.higher(factors, over)
+        else:
+            wanted = climb.lower(factors, over, best or dict.fromkeys(most, least))
+        if all(wanted[one] == factors[one] for one in most):
+            break
+        factors = wanted
+        tried = trial(factors)
+    return PaceChoice(best or factors, bounds, reached=best is not None)
+
+
+class _Climb:
+    """How far to go up or down, from how errors have followed the paces so far."""
+
+    def __init__(self, least: float, most: Factors) -> None:
+        self._least, self._most = least, most
+        self._power = dict.fromkeys(most, 1.0)
+        self._unfit = dict.fromkeys(most, math.inf)
+        self._blamed = dict.fromkeys(most, math.inf)
+        self._last: tuple[Factors, dict[int, float]] | None = None
+
+    def learn(self, factors: Factors, over: dict[int, float]) -> None:
+        """Take what a trial showed: errors over their bounds by class."""
+        for one, ratio in over.items():
+            if math.isinf(ratio):
+                self._unfit[one] = min(self._unfit[one], factors[one])
+        if self._last is not None:
+            before, was = self._last
+            for one, ratio in over.items():
+                step = math.log(factors[one] / before[one])
+                known = 0.0 < was.get(one, 0.0) < math.inf and 0.0 < ratio < math.inf
+                if known and abs(step) > math.log(_SAME):
+                    power = math.log(ratio / was[one]) / step
+                    self._power[one] = min(max(power, _FLATTEST), _STEEPEST)
+        self._last = factors, over
+
+    def higher(self, factors: Factors, over: dict[int, float]) -> Factors:
+        """Return higher factors for what has room."""
+        wanted = dict(factors)
+        for one, factor in factors.items():
+            ratio = max(over.get(one, 0.0), 1e-6)
+            if ratio >= _ROOM:
+                continue
+            power = max(self._power[one], _SHAKEN)
+            raised = factor * min((_AIM / ratio) ** (1.0 / power), _LEAP)
+            too_high = max(min(self._unfit[one], self._blamed[one]), factor)
+            if math.isfinite(too_high):
+                raised = min(raised, math.sqrt(factor * too_high))
+            raised = min(raised, self._most[one])
+            wanted[one] = raised if raised > _SAME * factor else factor
+        return wanted
+
+    def lower(self, factors: Factors, over: dict[int, float], good: Factors) -> Factors:
+        """Return lower factors for what exceeds its bound; `good` are such that keep all."""
+        wanted = dict(factors)
+        helpless = 0.0
+        for one, ratio in over.items():
+            if ratio <= _WITHIN:
+                continue
+            factor = factors[one]
+            if factor <= self._least * _SAME:
+                helpless = max(helpless, ratio)
+            elif math.isinf(ratio):
+                wanted[one] = _between(min(good[one], factor), factor)
+            else:
+                wanted[one] = self._less(factor, ratio, self._power[one])
+        if helpless:
+            # What cannot be slower suffers from what comes before it: travel, and then the others.
+            blamed = [TRAVEL] if factors.get(TRAVEL, 0.0) > good.get(TRAVEL, 0.0) else [*factors]
+            for one in blamed:
+                if factors[one] > good[one]:
+                    self._blamed[one] = min(self._blamed[one], factors[one])
+                    less = self._less(factors[one], helpless, _SHAKEN)
+                    wanted[one] = max(min(wanted[one], less), good[one])
+        return wanted
+
+    def _less(self, factor: float, ratio: float, power: float) -> float:
+        """Return a lower factor that may bring a ratio to what is aimed at."""
+        less = float((_AIM / ratio) ** (1.0 / power))
+        return max(factor * min(less, 1.0 / _SAME), self._least)
+
+
+def _between(low: float, high: float) -> float:
+    middle = math.sqrt(low * high)
+    return middle if middle > _SAME * low else low

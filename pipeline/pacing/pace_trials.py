@@ -1,0 +1,180 @@
+"""Samples of a file at other paces: how large their errors become, and how long they take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.cautious import Caution
+from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import intended
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pacing import AS_SLICED, Pace, quickened
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.sampler import sample_phases
+from stillpath.models.machine import Machine
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum, SetErrors
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.pacing.samples import Sample
+from stillpath.pipeline.piece_compensator import DT_S, PieceCompensator, Unfit, as_executed
+
+__all__ = ["Factors", "PaceTrials", "Tried", "compensated", "paces", "shaped"]
+
+_STRIDE = 8
+_SHAPER_REACH_S = 0.16
+
+Factors = dict[int, float]
+"""Class of moves to the ratio of its accelerations to the file's."""
+Motion = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.int32]]
+"""Path and command (2, n), and what is extruded and the class of every sample."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """What the samples showed.
+
+    Attributes
+    ----------
+    errors : dict
+        By class.
+    unfit : set of int
+        Classes in samples for which there is no command.
+    seconds : float
+        How long all samples take, as planned.
+    """
+
+    errors: dict[int, ClassError]
+    unfit: set[int]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """One sample at some paces; `sums` is None where there is no command."""
+
+    sums: dict[int, ErrorSum] | None
+    seconds: float
+
+
+class PaceTrials:
+    """Try paces on samples; what was tried before is not worked out again.
+
+    Samples for which there is no command at their own pace are left out: they leave as they came.
+
+    Parameters
+    ----------
+    samples : list of Sample
+    machine : Machine
+    motion : callable
+        What the firmware makes of a sample at its new pace; raises `Unfit` where there is no
+        command.
+    """
+
+    def __init__(
+        self, samples: list[Sample], machine: Machine, motion: Callable[[Sample, Piece], Motion]
+    ) -> None:
+        self._machine, self._motion = machine, motion
+        self._errors = SetErrors(machine, DT_S, stride=_STRIDE)
+        self._known: dict[tuple[object, ...], _Measured] = {}
+        self._samples = [
+            (sample, sorted(set(sample.classes.tolist()) - {AS_SLICED})) for sample in samples
+        ]
+        fit = [self._measured(k, {}).sums is not None for k in range(len(samples))]
+        self._used = [k for k, works in enumerate(fit) if works]
+
+    def __call__(self, factors: Factors) -> Tried:
+        """Return what comes of these factors; a class that is not named keeps its pace."""
+        total: dict[int, ErrorSum] = {}
+        unfit: set[int] = set()
+        seconds = 0.0
+        for number in self._used:
+            found = self._measured(number, factors)
+            seconds += found.seconds
+            if found.sums is None:
+                unfit.update(self._samples[number][1])
+                continue
+            for one, more in found.sums.items():
+                total[one] = total[one] + more if one in total else more
+        return Tried({one: added.worst for one, added in total.items()}, unfit, seconds)
+
+    def _measured(self, number: int, factors: Factors) -> _Measured:
+        sample, present = self._samples[number]
+        here = {one: factors.get(one, 1.0) for one in present}
+        key = (number, *here.values())
+        if key not in self._known:
+            self._known[key] = self._measure(sample, here)
+        return self._known[key]
+
+    def _measure(self, sample: Sample, factors: Factors) -> _Measured:
+        seconds = sample.piece.phases.duration_s
+        try:
+            piece = quickened(sample.piece, sample.classes, paces(factors), self._machine)
+            seconds = piece.phases.duration_s
+            path, command, extruding, classes = self._motion(sample, piece)
+        except (Unfit, GcodeError):
+            return _Measured(None, seconds)
+        self._errors.begin()
+        self._errors.operate_at(sample.point)
+        self._errors.add(path, command, extruding, classes)
+        self._errors.finish()
+        return _Measured(self._errors.sums(), seconds)
+
+
+def compensated(
+    machine: Machine, options: Options, shaper: BestShaper, caution: Caution | None = None
+) -> Callable[[Sample, Piece], Motion]:
+    """Return how samples move as they will be written.
+
+    Parameters
+    ----------
+    caution : Caution, optional
+        What the command takes of the shaper.
+
+    Raises
+    ------
+    DesignError, ModelError
+        The method cannot be designed for this machine.
+    """
+    work = PieceCompensator(machine, options, shaper, caution)
+    step_mm = kit(machine).step_mm
+
+    def motion(sample: Sample, piece: Piece) -> Motion:
+        work.compensator.reset(piece.phases.start_mm[0, :2])
+        made = work.compensate(piece, sample.point)
+        # The next one begins with the design that did here, as pieces do.
+        work.compensator.commit()
+        asked = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, step_mm)
+        planned, position, row, extruding = as_executed(made, asked, made.encoded.phases)
+        return planned[:2], position[:2], extruding, sample.classes[row]
+
+    return motion
+
+
+def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
+    """Return how samples move with the best firmware shaper."""
+    frequencies = (shaper.fx_hz, shaper.fy_hz)
+    pulses = [shaper_pulses(shaper.type, f_hz, shaper.zeta) for f_hz in frequencies]
+    pad = round(_SHAPER_REACH_S / DT_S)
+
+    def motion(sample: Sample, piece: Piece) -> Motion:
+        phases = piece.phases
+        count = max(round(phases.duration_s / DT_S), 1)
+        position, row = sample_phases(phases, (0.0, DT_S, count))
+        path = np.pad(position[:2], ((0, 0), (pad, pad)), mode="edge")
+        command = [shape(p, DT_S, one) for p, one in zip(path, pulses, strict=True)]
+        direction = phases.direction[row]
+        prints = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+        classes = np.pad(sample.classes[row], pad, constant_values=AS_SLICED)
+        return path, np.stack(command), np.pad(prints, pad), classes
+
+    return motion
+
+
+def paces(factors: Mapping[int, float]) -> dict[int, Pace]:
+    """Return the paces of factors: travel that accelerates more slowly still keeps its speed."""
+    return {one: Pace(factor, max(factor, 1.0)) for one, factor in factors.items()}

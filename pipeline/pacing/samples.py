@@ -1,0 +1,183 @@
+"""Some seconds of every class of moves, taken from all over a file.
+
+Memory is bounded: of each class so many places are kept, and when they run out every second one
+goes and every second one is taken from then on. The same file gives the same samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pacing import AS_SLICED, FirstLayer, move_classes
+from stillpath.gcode.pieces import Passage, Piece, Splitter, excerpt
+from stillpath.gcode.types import Moves, Phases
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.operating_point import Operation
+
+__all__ = ["FileSamples", "Sample", "take_samples"]
+
+_BLOCK_BYTES = 1 << 17
+_LASTS_S = 4.0
+_TOTAL_S = 120.0
+_FEWEST, _MOST = 3, 12
+_SPREAD = 0.6180339887498949
+"""Golden ratio: where in its piece a sample lies shares no rhythm with the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Some moves of a file and where the machine was then."""
+
+    piece: Piece
+    classes: NDArray[np.int32]
+    point: OperatingPoint
+
+
+@dataclass(frozen=True, slots=True)
+class FileSamples:
+    """Samples of a file.
+
+    Attributes
+    ----------
+    samples : list of Sample
+    first_layer : FirstLayer
+    """
+
+    samples: list[Sample]
+    first_layer: FirstLayer
+
+
+@dataclass(slots=True)
+class _Places:
+    """Samples of one class."""
+
+    stride: int = 1
+    seen: int = 0
+    kept: list[tuple[int, int, int, Sample]] = field(default_factory=list)
+
+    @property
+    def due(self) -> bool:
+        return self.seen % self.stride == 0
+
+    def add(self, where: tuple[int, int, int], sample: Sample) -> None:
+        self.kept.append((*where, sample))
+        if len(self.kept) > 2 * _MOST:
+            self.kept = self.kept[::2]
+            self.stride *= 2
+
+    def some(self, count: int) -> list[tuple[int, int, int, Sample]]:
+        if len(self.kept) <= count:
+            return self.kept
+        return [self.kept[i] for i in np.linspace(0, len(self.kept) - 1, count).round().astype(int)]
+
+
+def take_samples(
+    source: BinaryIO,
+    machine: Machine,
+    dialect: Dialect,
+    told: Callable[[float], None] | None = None,
+) -> FileSamples:
+    """Read a file to its end and take samples of all moves whose pace may change.
+
+    Parameters
+    ----------
+    source : BinaryIO
+        At its beginning.
+    machine : Machine
+    dialect : Dialect
+    told : callable, optional
+        Is given the bytes read so far.
+    """
+    operation = Operation(machine)
+    places: dict[tuple[int, int], _Places] = {}
+    first_layer = FirstLayer(-1)
+    for number, item in enumerate(_items(source, machine, dialect, told)):
+        first_layer = _seen(first_layer, item.moves)
+        point = operation.at(item.moves)
+        operation.passed(item.moves)
+        if isinstance(item, Piece):
+            _take(item, number, point, places, machine, first_layer)
+    # Until the second layer comes, nobody knows whether and how the file tells its layers.
+    wanted = [one for (below, _), one in sorted(places.items()) if below == first_layer.below]
+    each = int(np.clip(_TOTAL_S / _LASTS_S / max(len(wanted), 1), _FEWEST, _MOST))
+    chosen = {entry[:3]: entry[3] for one in wanted for entry in one.some(each)}
+    return FileSamples([_above(chosen[key], first_layer) for key in sorted(chosen)], first_layer)
+
+
+def _items(
+    source: BinaryIO, machine: Machine, dialect: Dialect, told: Callable[[float], None] | None
+) -> Iterator[Piece | Passage]:
+    reader, splitter = Interpreter(machine, dialect=dialect), Splitter(machine)
+    while data := source.read(_BLOCK_BYTES):
+        for block in reader.push(data):
+            yield from splitter.push(block)
+        if told is not None:
+            told(float(source.tell()))
+    for block in reader.flush():
+        yield from splitter.push(block)
+    yield from splitter.flush()
+
+
+def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
+    """Return what is known of the first layer when these moves have come."""
+    below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
+    way = moves.end_mm - moves.start_mm
+    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0) & (moves.layer >= 0)
+    if np.isfinite(known.z_mm) or not np.any(prints):
+        return FirstLayer(below, known.z_mm)
+    return FirstLayer(below, float(moves.end_mm[np.argmax(prints), 2]))
+
+
+def _take(
+    piece: Piece,
+    number: int,
+    point: OperatingPoint,
+    places: dict[tuple[int, int], _Places],
+    machine: Machine,
+    first_layer: FirstLayer,
+) -> None:
+    """Take the samples of a piece that are due."""
+    classes = move_classes(piece.moves, first_layer)
+    for one in np.unique(classes[classes != AS_SLICED]).tolist():
+        place = places.setdefault((first_layer.below, one), _Places())
+        if place.due:
+            rows = np.flatnonzero(classes == one)
+            row = int(rows[int(len(rows) * (place.seen * _SPREAD % 1.0))])
+            first, last = _around(piece.phases, row)
+            part = excerpt(piece, first, last, machine)
+            if len(part.phases) == len(part.moves):
+                place.add((number, first, last), Sample(part, classes[first:last], point))
+        place.seen += 1
+
+
+def _around(phases: Phases, row: int) -> tuple[int, int]:
+    """Return rows [first, last) around one, from rest to rest if there are rests nearby."""
+    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+    begin_s = phases.t_s
+    end_s = begin_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    starts = np.flatnonzero(xy & np.append(True, ~xy[:-1]))
+    ends = np.flatnonzero(xy & np.append(~xy[1:], True))
+    first = int(starts[np.searchsorted(starts, row, "right") - 1])
+    if begin_s[first] < begin_s[row] - 0.5 * _LASTS_S:
+        first = int(np.searchsorted(begin_s, begin_s[row] - 0.25 * _LASTS_S))
+        first += int(np.argmax(xy[first:]))
+    last = max(int(np.searchsorted(end_s, begin_s[first] + _LASTS_S, "right")) - 1, row)
+    rest = int(np.searchsorted(ends, last, "right")) - 1
+    if rest >= 0 and ends[rest] >= row and end_s[ends[rest]] > begin_s[first] + 0.5 * _LASTS_S:
+        return first, int(ends[rest]) + 1
+    while not xy[last]:
+        last -= 1
+    return first, last + 1
+
+
+def _above(sample: Sample, first_layer: FirstLayer) -> Sample:
+    classes = move_classes(sample.piece.moves, first_layer)
+    return Sample(sample.piece, classes, sample.point)

@@ -1,0 +1,75 @@
+"""Passages, which leave as they came: their moves as the firmware plans them, from stop to stop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.planning import plan_moves, stops
+from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
+from stillpath.models.machine import Machine
+
+__all__ = ["feeding", "last_length_mm", "plan_passage", "switching_s", "takes_s"]
+
+
+def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float | None]:
+    """Plan the moves of a passage between its stops.
+
+    Yields
+    ------
+    Phases
+        Motion from rest to rest, from time 0 on; `move_index` counts within the passage.
+    float
+        Seconds of standing.
+    None
+        The position becomes unknown here.
+    """
+    if isinstance(passage, Piece):
+        yield passage.phases
+        return
+    events = passage.events
+    done = 0
+    for k in [*np.flatnonzero(stops(events)).tolist(), None]:
+        end = len(passage.moves) if k is None else int(events.move_index[k])
+        if end > done:
+            rows = rows_of(passage.moves, slice(done, end))
+            phases = plan_moves(rows, passage.limits, machine)
+            if len(phases):
+                numbers = phases.move_index - phases.move_index[0] + done
+                yield replace(phases, move_index=numbers)
+            done = end
+        if k is not None and events.dwell_s[k] > 0.0:
+            yield float(events.dwell_s[k])
+        if k is not None and events.kind[k] == EventKind.UNKNOWN:
+            yield None
+
+
+def takes_s(part: Phases | float | None) -> float:
+    """Return how long a part of a passage takes."""
+    return part.duration_s if isinstance(part, Phases) else part or 0.0
+
+
+def switching_s(parts: Iterable[Passage | ProgramBlock]) -> float:
+    """Return how long the machine stands still because its shaper is switched."""
+    return sum(float(np.sum(p.events.dwell_s[p.events.kind == EventKind.SHAPER])) for p in parts)
+
+
+def last_length_mm(phases: Phases) -> float:
+    """Return the length of the last move."""
+    v0, v1, v2 = phases.start_mm_s[-1], phases.cruise_mm_s[-1], phases.end_mm_s[-1]
+    return float(
+        0.5 * (v0 + v1) * phases.accel_s[-1]
+        + v1 * phases.cruise_s[-1]
+        + 0.5 * (v1 + v2) * phases.decel_s[-1]
+    )
+
+
+def feeding(phases: Phases) -> NDArray[np.bool_]:
+    """Mark rows that move X or Y and feed forward."""
+    direction = phases.direction
+    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    return np.asarray(moves_xy & (direction[:, 3] > 0.0))

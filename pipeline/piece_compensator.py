@@ -1,0 +1,463 @@
+"""One piece of a print: from its planned path to a command, segments and timed moves."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.compensation.base import Compensator, DesignError
+from stillpath.compensation.cautious import Caution
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.scheduled import BLEND_STEP, STEP
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.gcode.firmware.encoding import Encoded
+from stillpath.gcode.firmware.planning import intended
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.sampler import distances, sample_phases, sample_until
+from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
+from stillpath.gcode.timeline import Timeline, build_timeline, group_rows
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.operating import OperatingGrid, machine_at
+from stillpath.models.plants import plant_set
+from stillpath.models.schedule import EMPTY, OperatingPoint
+from stillpath.pipeline.caution import design_mode, designed
+from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.options import Options
+
+__all__ = [
+    "DT_S",
+    "CompensatedPiece",
+    "PieceCompensator",
+    "Unfit",
+    "as_executed",
+    "deviation",
+    "follow_tolerance_mm",
+    "strayed",
+]
+
+DT_S = 1e-3
+"""Sampling time of paths and commands: finer changes contour errors by hundredths of a um."""
+
+_REST_TOLERANCE_S = 5e-3
+_ROUNDS = 2
+MIN_STEP_MM_S = 5.0
+_ACCEL_SHARES = (1.0, 0.8, 0.6)
+"""Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
+_SOFT_S = (2e-3, 4e-3, 8e-3)
+"""Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
+
+
+_FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
+"""Filament is smoothed over so many times its mm per mm, before and behind, and no further."""
+_EXTRUDING_EXCESS_MM = 15e-3
+_TRAVEL_EXCESS_MM = 200e-3
+"""How far the executed motion may be from the command beyond the tolerance, at worst."""
+
+
+class Unfit(ValueError):
+    """A piece that had better leave as it came; the message is the reason."""
+
+
+class _Sudden(Unfit):
+    """A motor's speed would step by too much, or the firmware cannot follow within its limits."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatedPiece:
+    """A piece with its command.
+
+    Attributes
+    ----------
+    timeline : Timeline
+    command_mm : ndarray, shape (4, n)
+        x y as commanded, z e as planned, on the timeline's grid.
+    extruding : ndarray of bool, shape (n,)
+    segments : Segments
+    encoded : Encoded
+    step_mm, bend_mm : float
+        Longest step of the command in X Y, and largest second difference of either.
+    """
+
+    timeline: Timeline
+    command_mm: NDArray[np.float64]
+    extruding: NDArray[np.bool_]
+    segments: Segments
+    encoded: Encoded
+    step_mm: float
+    bend_mm: float
+
+
+class PieceCompensator:
+    """Compensate pieces one after another with one method.
+
+    Parameters
+    ----------
+    machine : Machine
+    options : Options
+    shaper : BestShaper, optional
+        The tuned frequencies, for `shaper:NAME` of the same type.
+    caution : Caution, optional
+        How much of a shaper's smoothing `fbf` takes.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        options: Options,
+        shaper: BestShaper | None = None,
+        caution: Caution | None = None,
+    ) -> None:
+        settings: dict[str, object] = {}
+        vibration = options.method.removesuffix("+ripple")
+        if vibration == "fbf":
+            settings.update(basis=options.basis, along=options.along)
+            if caution is not None:
+                settings.update(caution=caution)
+        elif shaper is not None and vibration == f"shaper:{shaper.type}":
+            settings.update(fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz)
+        self._machine = machine
+        fit_share = 1.0 if caution is None else caution.fit_share
+        self._tolerance_mm = 1e-3 * options.tolerance_um * fit_share
+
+        def design(mode: str | None) -> Compensator:
+            chosen = settings if mode is None else {**settings, "robust": mode}
+            return compensator(options.method, machine, DT_S, **chosen)
+
+        fbf = vibration == "fbf"
+        self.compensator: Compensator = (
+            designed(options, design_mode(machine, options), design) if fbf else design(None)
+        )
+        firmware = kit(machine)
+        self.encoder = firmware.encoder()
+        self._step_mm = firmware.step_mm
+        self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
+        self._filter = _error_filter(machine)
+        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._level: OperatingPoint | None = None
+
+    def compensate(self, piece: Piece, point: OperatingPoint = EMPTY) -> CompensatedPiece:
+        """Return the piece with its command.
+
+        Parameters
+        ----------
+        piece : Piece
+        point : OperatingPoint
+            Where the machine is meanwhile; without schedules it does not matter.
+
+        Raises
+        ------
+        Unfit
+            When no command within the machine's limits is found, or the firmware would refuse it.
+        """
+        try:
+            if self._machine.schedules:
+                self._operate_at(point)
+            return self._eased(piece)
+        except (DesignError, GcodeError) as error:
+            raise Unfit(str(error)) from error
+
+    def _eased(self, piece: Piece) -> CompensatedPiece:
+        """Compensate, with less acceleration or rounder corners where the motors need it."""
+        first: _Sudden | DesignError | None = None
+        for share in _ACCEL_SHARES:
+            if not self.compensator.ease(share):
+                assert first is not None
+                raise first
+            try:
+                return self._compensate(piece)
+            except _Sudden as error:
+                first = first or error
+            except DesignError as error:
+                # With less it does not follow the path.
+                first = first or error
+                break
+        self.compensator.ease(1.0)
+        for soft_s in _SOFT_S:
+            with contextlib.suppress(_Sudden, DesignError):
+                return self._compensate(piece, soft_s)
+        assert first is not None
+        raise first
+
+    def _operate_at(self, point: OperatingPoint) -> None:
+        self.compensator.operate_at(point)
+        level = self._grid.level(point)
+        if level != self._level:
+            self._level = level
+            nodes = self._grid.at_level(level)
+            self._filter = _error_filter(machine_at(self._machine, nodes[len(nodes) // 2]))
+
+    def _compensate(self, piece: Piece, soft_s: float = 0.0) -> CompensatedPiece:
+        """Compensate the path, or its mean over `soft_s` before and after."""
+        phases = intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, self._step_mm)
+        groups = group_rows(phases)
+        resting = np.array([group.rest for group in groups])
+        rest_s = self.encoder.rest_durations(piece, groups)
+        feeds = phases.direction[:, 3] > 0.0
+        # How long a rest takes depends a little on the speeds around it: repeat until it agrees.
+        for _ in range(_ROUNDS):
+            timeline = build_timeline(
+                phases,
+                groups,
+                rest_s,
+                DT_S,
+                lead_s=self.compensator.lead_s + soft_s,
+                tail_s=self.compensator.tail_s + soft_s,
+            )
+            extruding = timeline.moving & feeds[timeline.row]
+            path = timeline.position_mm
+            wanted = _mean(path[:2], round(soft_s / DT_S))
+            xy_mm = self.compensator.compensate(wanted, extruding, timeline.rests)
+            command = np.concatenate([xy_mm, path[2:]])
+            _retract_along(command, timeline, phases)
+            _feed_evenly(command, extruding)
+            self._check_travel(command[:2], timeline.row, piece)
+            step_mm, bend_mm = peaks(command)
+            segments, encoded = self._fit(piece, timeline, command, bend_mm)
+            change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
+            if change < _REST_TOLERANCE_S:
+                break
+            rest_s = np.where(resting, encoded.rest_s, rest_s)
+        # Vertices are rounded, and moved on where they would coincide.
+        at = np.rint(encoded.start_s / DT_S).astype(np.int64)
+        row = timeline.row[np.minimum(at, len(timeline.row) - 1)]
+        self._check_travel(encoded.position[:, :2].T / 1e6, row, piece)
+        made = CompensatedPiece(timeline, command, extruding, segments, encoded, step_mm, bend_mm)
+        if (
+            reason := strayed(deviation(made, encoded.phases), extruding, self._follow_mm)
+        ) is not None:
+            raise _Sudden(f"planned by the firmware's rules, {reason}")
+        return made
+
+    def _fit(
+        self, piece: Piece, timeline: Timeline, command: NDArray[np.float64], bend_mm: float
+    ) -> tuple[Segments, Encoded]:
+        """Segments and moves; finer where a motor's speed would step too far."""
+        limit = self._machine.command.speed_step_mm_s
+        tolerance = self._tolerance_mm
+        # No step of speed larger than what the command itself asks for within a sample.
+        step_mm_s = max(bend_mm / timeline.dt_s, MIN_STEP_MM_S)
+        for _ in range(3):
+            segments = fit_segments(
+                timeline,
+                command,
+                tolerance,
+                self._filter,
+                step_mm_s=step_mm_s,
+                grid_mm=self.encoder.grid_mm,
+            )
+            self._keep_inside(segments)
+            encoded = self.encoder.encode(piece, timeline, segments)
+            if len(encoded.row) == 0:
+                line = int(piece.moves.line[0])
+                raise Unfit(f"line {line}: all moves round to nothing on the grid of a file")
+            step = self._speed_step(encoded.phases)
+            if step <= limit:
+                return segments, encoded
+            tolerance *= 0.5
+        raise _Sudden(
+            f"a motor's speed would step by {step:.0f} mm/s between two segments; the machine "
+            f"allows {limit:.0f} mm/s (command.speed_step_mm_s)"
+        )
+
+    def _keep_inside(self, segments: Segments) -> None:
+        """Bring vertices back that the fit's tolerance or the grid would put off the bed."""
+        grid_mm = self.encoder.grid_mm
+        for i, axis in enumerate(("x", "y")):
+            travel = self._machine.travel[axis]  # type: ignore[index]
+            # The last lines of the grid on the bed, but for the rounding of decimals.
+            low = np.ceil(travel.min_mm / grid_mm - 1e-6) * grid_mm
+            high = np.floor(travel.max_mm / grid_mm + 1e-6) * grid_mm
+            np.clip(segments.end_mm[i], low, high, out=segments.end_mm[i])
+
+    def _speed_step(self, phases: Phases) -> float:
+        """Largest step of a motor's speed beyond what rounding to whole steps may bring."""
+        return speed_step(
+            phases.accel_s,
+            phases.cruise_s,
+            phases.decel_s,
+            phases.start_mm_s,
+            phases.cruise_mm_s,
+            phases.accel_mm_s2,
+            phases.direction,
+            max(self._step_mm[:2]),
+            # Ramps are parts of a step there, and no motor can tell.
+            max(self._step_mm) > 0.0,
+            self._machine.kinematics == "corexy",
+        )
+
+    def _check_travel(
+        self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
+    ) -> None:
+        """See that places (2, n), each of a row of the piece's phases, lie within the travel."""
+        for i, axis in enumerate(("x", "y")):
+            travel = self._machine.travel[axis]  # type: ignore[index]
+            if travel.min_mm <= place_mm[i].min() and place_mm[i].max() <= travel.max_mm:
+                continue
+            beyond = np.maximum(travel.min_mm - place_mm[i], place_mm[i] - travel.max_mm)
+            worst = int(np.argmax(beyond))
+            if beyond[worst] > 0.0:
+                line = int(piece.moves.line[piece.phases.move_index[row[worst]]])
+                raise Unfit(
+                    f"line {line}: the command would take {axis} to {place_mm[i, worst]:.4f} mm, "
+                    f"outside {travel.min_mm:.7g} to {travel.max_mm:.7g} mm"
+                )
+
+
+def _mean(path_mm: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Mean over `reach` samples before and after each, shape (2, n); it stood and will stand."""
+    if reach == 0:
+        return path_mm
+    padded = np.pad(path_mm, ((0, 0), (reach + 1, reach)), mode="edge")
+    # From the start: sums of large numbers would lose digits.
+    total = np.cumsum(padded - path_mm[:, :1], axis=1)
+    width = 2 * reach + 1
+    return np.asarray(path_mm[:, :1] + (total[:, width:] - total[:, :-width]) / width)
+
+
+def _error_filter(machine: Machine) -> ErrorFilter:
+    return ErrorFilter([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")])
+
+
+def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Phases) -> None:
+    """Spread the filament that wipes pull back evenly over the command's path, in place.
+
+    Klipper limits such moves by E per mm of X Y. The command stands where the plan creeps and the
+    other way round; filament at the plan's times would then need impossible accelerations.
+    """
+    direction = phases.direction
+    wipes = (direction[:, 3] < 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    if not np.any(wipes):
+        return
+    inside = wipes[timeline.row] & timeline.moving
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
+    last = command.shape[1] - 1
+    for first, end in edges.reshape(-1, 2):
+        # From the plan's own ends: the samples around a wipe may lie in a retraction at rest.
+        row, behind = timeline.row[first], timeline.row[end - 1] + 1
+        begins = phases.start_mm[row, 3]
+        ends = phases.start_mm[behind, 3] if behind < len(phases) else command[3, last]
+        span = slice(max(first - 1, 0), min(end, last) + 1)
+        step = np.sqrt(np.sum(np.diff(command[:2, span]) ** 2, axis=0))
+        way = np.concatenate([[0.0], np.cumsum(step)])
+        if way[-1] > 0.0:
+            share = way[first - span.start : end - span.start] / way[-1]
+            command[3, first:end] = begins + (ends - begins) * share
+
+
+def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> None:
+    """Smooth the filament over the command's way wherever it prints without a break, in place.
+
+    The command has other speeds in a corner than the plan has, the filament has the plan's: per mm
+    of way it comes in steps there, which firmwares brake for, the more the thicker the line.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], extruding, [False]])))
+    for first, end in edges.reshape(-1, 2):
+        span = slice(max(first - 1, 0), end)
+        fed_mm = command[3, span] - command[3, span.start]
+        way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))
+        if way_mm[-1] <= 0.0:
+            continue
+        # Up to the ends of the run the mean is over less, so that all of it stays between them.
+        reach_mm = min(_FEED_REACH * fed_mm[-1] / way_mm[-1], _FEED_REACH_MM)
+        reach = np.minimum(np.minimum(way_mm, way_mm[-1] - way_mm), reach_mm)
+        area = np.append(0.0, np.cumsum(0.5 * (fed_mm[1:] + fed_mm[:-1]) * np.diff(way_mm)))
+        low, high = (np.interp(way_mm + side * reach, way_mm, area) for side in (-1.0, 1.0))
+        wide = reach > 1e-3
+        fed_mm[wide] = ((high - low)[wide]) / (2.0 * reach[wide])
+        command[3, span] = command[3, span.start] + fed_mm
+
+
+def follow_tolerance_mm(firmware: FirmwareKit, tolerance_um: float) -> float:
+    """Return how far executed motion may be from its command, but for some exceptions.
+
+    Where vertices lie on steps, and when steps come, are off by up to a step each. What is shorter
+    than the shortest move goes another way, there and back.
+    """
+    coarse_mm = max(2.0 * np.hypot(*firmware.step_mm[:2]), 2.0 * firmware.shortest_move_mm)
+    return 1e-3 * tolerance_um + float(coarse_mm)
+
+
+def strayed(
+    gap_mm: NDArray[np.float64], extruding: NDArray[np.bool_], tolerance_mm: float
+) -> str | None:
+    """Return in words how far motion is from its command if that is too far.
+
+    Parameters
+    ----------
+    gap_mm : ndarray, shape (n,)
+        As `deviation` gives it.
+    extruding : ndarray of bool, shape (n,)
+    tolerance_mm : float
+        As `follow_tolerance_mm` gives it.
+    """
+    worst = float(np.max(gap_mm, initial=0.0))
+    if worst <= tolerance_mm + _EXTRUDING_EXCESS_MM:
+        return None
+    printed = float(np.max(gap_mm[extruding], initial=0.0))
+    if printed <= tolerance_mm + _EXTRUDING_EXCESS_MM and worst <= tolerance_mm + _TRAVEL_EXCESS_MM:
+        return None
+    return (
+        f"the motion is {1e3 * printed:.1f} um from its command while extruding and "
+        f"{1e3 * worst:.1f} um at worst (tolerance {1e3 * tolerance_mm:g} um)"
+    )
+
+
+def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
+    """Distance in X Y of the executed motion from the command, at the command's samples.
+
+    A stretch counts from its own start: rests may take a little longer or shorter than planned.
+    """
+    timeline, encoded = piece.timeline, piece.encoded
+    first = np.round(timeline.start_s / timeline.dt_s - 0.5).astype(np.int64)
+    np.clip(first, 0, piece.command_mm.shape[1], out=first)
+    first[0] = 0
+    origin_s = timeline.start_s[0]
+    return distances(
+        executed,
+        piece.command_mm,
+        timeline.dt_s,
+        first,
+        encoded.group_start_s - timeline.start_s - origin_s,
+        # In a rest, time waits where the stretch behind it begins.
+        np.append(encoded.group_start_s[1:], np.inf) - origin_s,
+    )
+
+
+def as_executed(
+    piece: CompensatedPiece, phases: Phases, executed: Phases
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Planned and executed motion of a piece on one grid of real time.
+
+    Parameters
+    ----------
+    piece : CompensatedPiece
+    phases : Phases
+        What the file asks for (`gcode.firmware.planning.intended`).
+    executed : Phases
+
+    Returns
+    -------
+    planned_mm, executed_mm : ndarray, shapes (3, n) and (2, n)
+    row : ndarray of int64, shape (n,)
+        Row of the piece's `phases`.
+    extruding : ndarray of bool, shape (n,)
+    """
+    dt_s = piece.timeline.dt_s
+    origin = float(piece.timeline.start_s[0])
+    last = executed.accel_s[-1] + executed.cruise_s[-1] + executed.decel_s[-1]
+    n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
+    moved = replace(phases, t_s=piece.encoded.row_start_s)
+    duration = phases.accel_s + phases.cruise_s + phases.decel_s
+    direction = phases.direction
+    feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    until = np.where(feeds, moved.t_s + duration, -np.inf)
+    planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
+    position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
+    return planned, position, row, extruding

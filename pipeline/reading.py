@@ -1,0 +1,94 @@
+"""How a job reads its file: by the dialect of the machine's firmware, or by the one asked for."""
+
+from __future__ import annotations
+
+import io
+from typing import BinaryIO
+
+from stillpath.gcode.detection import detect
+from stillpath.gcode.dialect import Dialect
+from stillpath.gcode.firmware.dialects import dialect_of
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.models.errors import ModelError
+from stillpath.models.firmware import Marlin
+from stillpath.models.machine import Machine
+from stillpath.pipeline.options import DialectName
+
+__all__ = ["DialectName", "dialect_for", "doubts", "passed_over"]
+
+_SHOWN = 5
+_END_BYTES = 1 << 18
+_OFFSHOOTS = ("prusa", "bambu")
+"""Dialects of Marlin that a Marlin machine may be told to read by."""
+_EXPECTED = ("klipper", "marlin")
+
+
+def dialect_for(machine: Machine, name: DialectName | None = None) -> Dialect:
+    """Return how a file for a machine is read.
+
+    Parameters
+    ----------
+    machine : Machine
+    name : str, optional
+        A dialect that the machine's firmware reads; None: its own.
+
+    Raises
+    ------
+    ModelError
+        The firmware reads every file its own way, and that is not this one.
+    """
+    firmware = machine.firmware
+    if isinstance(firmware, Marlin) and name in _OFFSHOOTS:
+        return dialect_of(firmware.model_copy(update={"variant": name}))
+    if isinstance(firmware, Marlin) and name == "marlin" and firmware.variant in _OFFSHOOTS:
+        return dialect_of(firmware.model_copy(update={"variant": "2.1"}))
+    own = dialect_of(firmware)
+    if name not in (None, own.name):
+        raise ModelError(
+            f"{machine.name} runs {own.title} and reads every file as {own.title} does, not as "
+            f"{name}: slice for {own.title}, or give the machine the other firmware (stillpath "
+            "machines set-firmware)"
+        )
+    return own
+
+
+def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) -> list[str]:
+    """Return a warning if a file looks like one for another firmware than it is read by.
+
+    Parameters
+    ----------
+    file : binary file
+        Its text; the place in it is kept.
+    name : str, optional
+        A dialect that was asked for: whoever asks has no doubts.
+
+    Notes
+    -----
+    Klipper reads Marlin's flavour: what it does not know there it passes over, as slicers expect.
+    """
+    if name is not None:
+        return []
+    own = dialect_for(machine)
+    place = file.tell()
+    size = file.seek(0, io.SEEK_END)
+    file.seek(0)
+    head = file.read(_END_BYTES)
+    file.seek(max(size - _END_BYTES, 0))
+    found = detect(head, file.read(_END_BYTES))
+    file.seek(place)
+    if found.doubtful or found.dialect == own.name or (own.name, found.dialect) == _EXPECTED:
+        return []
+    why = "; ".join(found.reasons)
+    text = (
+        f"the file looks as if it were written for {found.dialect} ({why}), and {machine.name} "
+        f"reads it as {own.title} does: slice for {own.title}, or say --dialect {own.name} if "
+        "that is what it is"
+    )
+    return [text]
+
+
+def passed_over(reader: Interpreter) -> list[str]:
+    """Return what the firmware passes over or nobody can know, in a few lines."""
+    found = reader.warnings
+    more = [f"... and {len(found) - _SHOWN} more lines like these"] if len(found) > _SHOWN else []
+    return [*found[:_SHOWN], *more]

@@ -1,0 +1,326 @@
+"""What a job found, in figures measured on the written file."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+__all__ = [
+    "AdviceFigures",
+    "AdvisedFeature",
+    "AdvisedShaper",
+    "AxisSpectrum",
+    "BudgetClass",
+    "BudgetFigures",
+    "Channel",
+    "ErrorFigures",
+    "GroupFigures",
+    "LastCheckFigures",
+    "LayerView",
+    "PutBack",
+    "Result",
+    "StageTime",
+    "Track",
+]
+
+
+class _Figures(BaseModel):
+    # The texts below the fields are the descriptions of the published schema.
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+
+class ErrorFigures(_Figures):
+    """Error of the nozzle against the planned path, in micrometres."""
+
+    contour_rms_um: float
+    """Distance to the planned path, root mean square over time [um]."""
+    contour_max_um: float
+    """Distance to the planned path, largest [um]; while the nozzle stands behind the end of a line
+    and rings, 0.1 s at most, it counts for that line."""
+    tracking_rms_um: float
+    """Distance to where the nozzle was planned to be at that moment, root mean square [um]."""
+    tracking_max_um: float
+    """Distance to where the nozzle was planned to be at that moment, largest [um]."""
+
+
+class Channel(_Figures):
+    """One way to drive the machine: as the file came, compensated, or with the best shaper."""
+
+    name: str
+    """`before`, `after` or `shaper`."""
+    label: str
+    """The same for a person."""
+    extruding: ErrorFigures
+    """While something is extruded [um]."""
+    contour_range_um: tuple[float, float] | None = None
+    """Least and largest contour error while extruding, root mean square, of all plants that explain
+    the machine's measurement [um]; null for a machine without such a set."""
+    selected_rms_um: float | None = None
+    """Contour error while extruding, root mean square, of the features that are compensated [um];
+    null where all are. The range is theirs then."""
+    all_motion: ErrorFigures
+    """Over all motion, travel included [um]."""
+    residual_rms_um: float
+    """Vibration in the 0.1 s after each rest begins, root mean square [um]."""
+
+
+class GroupFigures(_Figures):
+    """Contour error while extruding, for one layer or feature, by channel name."""
+
+    name: str
+    """Number of the layer from 0, or the slicer's name of the feature."""
+    seconds: float
+    """Time in which it is extruded [s]."""
+    contour_rms_um: dict[str, float]
+    """Root mean square [um] by channel."""
+    contour_max_um: dict[str, float] = {}
+    """Largest [um] by channel."""
+
+
+class PutBack(_Figures):
+    """A piece of the file that left as it came."""
+
+    line_first: int
+    """First line in the original file, counted from 1."""
+    line_last: int
+    """Last line in the original file."""
+    seconds: float
+    """How long it lasts [s]."""
+    extruding_seconds: float
+    """How much of that it extrudes [s]."""
+    reason: str
+    """Why, for a person."""
+
+
+class Track(_Figures):
+    """Error along the print, one value per bin of time."""
+
+    bin_s: float
+    """Width of a bin [s]; the first begins at 0. Stands longer than 2 s count as 2 s."""
+    contour_rms_um: dict[str, list[float]]
+    """Contour error, root mean square [um], by channel."""
+
+
+class AxisSpectrum(_Figures):
+    """Spectrum of the nozzle's error along one axis while it prints."""
+
+    axis: str
+    """`x` or `y`."""
+    f_hz: list[float]
+    """Frequencies [Hz], rising evenly."""
+    um_per_sqrt_hz: dict[str, list[float]]
+    """Amplitude spectral density of position minus planned position [um/sqrt(Hz)], one-sided, at
+    each of `f_hz`, by channel. Its square adds up over frequency to the mean square."""
+    resonances_hz: list[float]
+    """Resonances of the axis' model [Hz], rising."""
+
+
+class LayerView(_Figures):
+    """Path of one layer, thinned for display; layers.bin holds the whole."""
+
+    layer: int
+    """Number of the layer, from 0."""
+    z_mm: float
+    """Height [mm]."""
+    x_mm: list[float]
+    """Corners of the path, machine axes [mm]."""
+    y_mm: list[float]
+    """Corners of the path, machine axes [mm]."""
+    extruding: list[bool]
+    """Whether the stretch that ends at the corner extrudes."""
+    line: list[int]
+    """Line of the original file, counted from 1."""
+    contour_um: dict[str, list[float]]
+    """Largest contour error of the stretch that ends at the corner [um], by channel."""
+
+
+class StageTime(_Figures):
+    """CPU seconds that one stage of the road took."""
+
+    stage: str
+    """Name of the stage."""
+    cpu_s: float
+    """CPU time [s]."""
+
+
+class BudgetClass(_Figures):
+    """How quick one class of moves became within a budget, and its error."""
+
+    name: str
+    """The slicer's name of the feature, `travel`, or `all that stays as sliced`: the first layer,
+    and lines that leave as they came."""
+    acceleration_factor: float
+    """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
+    shaper_acceleration_factor: float
+    """The same with the best firmware shaper at the same budget."""
+    contour_rms_um: float
+    """Contour error of what it extrudes, root mean square of the worst plant of the machine's set
+    [um]; for travel of what is extruded in the 50 ms behind one, where it may be two budgets (it
+    counts for its feature as well)."""
+    seconds: float
+    """Time in which that was measured [s]."""
+
+
+class BudgetFigures(_Figures):
+    """What a budget of contour error bought."""
+
+    budget_um: float
+    """Contour error that every feature may have [um]."""
+    saved_share: float
+    """Part of the original's print time that is saved."""
+    shaper_time_s: float | None
+    """How long the print takes with the best firmware shaper instead, as quick as the same budget
+    allows [s]; null where it cannot keep the budget."""
+    saved_share_against_shaper: float | None
+    """Part of that time that is saved."""
+    classes: list[BudgetClass]
+    """By class of moves."""
+
+
+class AdvisedShaper(_Figures):
+    """A firmware shaper that is advised."""
+
+    layer: int
+    """From which layer on; the first holds from the beginning of the file."""
+    label: str
+    """Type and frequencies for a person."""
+
+
+class AdvisedFeature(_Figures):
+    """What is advised for one feature, and what it does."""
+
+    name: str
+    """The slicer's name of the feature, or `unnamed`."""
+    accel_mm_s2: float | None
+    """Acceleration [mm/s^2]; null: as the file has it."""
+    exact: bool
+    """Whether it is exactly this, as for walls, or only where the file has less."""
+    bound_um: float | None
+    """Contour error that it may have, root mean square of the worst plant of the machine's set
+    [um]; null where the file's accelerations are kept whatever they do."""
+    within_bound: bool
+    """Whether it has no more."""
+    before_um: float
+    """Contour error as sliced, root mean square of the worst plant of the machine's set [um]."""
+    after_um: float
+    """The same of the advised file [um]."""
+    before_s: float
+    """Time in which it is extruded as sliced [s]."""
+    after_s: float
+    """The same of the advised file [s]."""
+
+
+class AdviceFigures(_Figures):
+    """What is advised for a file: firmware commands among its lines."""
+
+    before_shaper: str
+    """The firmware's shaper before the file's first line, as the machine states it."""
+    shapers: list[AdvisedShaper]
+    """Those that the file sets now; empty: it leaves the firmware's."""
+    features: list[AdvisedFeature]
+    """By feature."""
+    lines: int
+    """Lines that were added."""
+
+
+class LastCheckFigures(_Figures):
+    """How the written file was compared with the original, by a reader of its own."""
+
+    kept_lines: int
+    """Lines with commands that both files share."""
+    compared_lines: int
+    """Those at which place, filament and modes were compared; within streams the head is on its
+    way, and only the file's own retractions and Z hops are."""
+    not_compared: list[str]
+    """Where the place was not compared, and why."""
+
+
+class Result(_Figures):
+    """Report of one job; `reports` turns it into HTML, the API returns it as JSON."""
+
+    version: str
+    """Version of Stillpath."""
+    machine: str
+    """Name of the machine."""
+    machine_title: str
+    """The machine's name for a person."""
+    machine_revision: str
+    """Digest of the machine's document: the same digest, the same model."""
+    settings: dict[str, str | float]
+    """Options of the job by name; `method` is always there."""
+    source_name: str
+    """Name of the file."""
+    channels: list[Channel]
+    """Figures of the whole print."""
+    best_shaper: str
+    """The best-tuned firmware shaper of this machine, with its frequencies [Hz]."""
+    original_time_s: float
+    """How long the file as it came takes, by the firmware's rules [s]."""
+    time_s: float
+    """How long the written file takes [s]."""
+    slicer: str = ""
+    """The program that made the file, where it says so."""
+    slicer_time_s: float | None = None
+    """The slicer's own estimate for the file as it came, where it has one [s]."""
+    original_bytes: int
+    """Size of the file as it came [bytes]."""
+    written_bytes: int
+    """Size of the written file [bytes]."""
+    segments: int
+    """Straight segments written for what was compensated."""
+    segments_per_s: float
+    """The same per second of compensated print [1/s]."""
+    peak_segments_per_s: float
+    """The most in any second [1/s]."""
+    peak_velocity_mm_s: float
+    """Highest speed of the command [mm/s]."""
+    peak_accel_mm_s2: float
+    """Highest acceleration of the command [mm/s^2]."""
+    emission_rms_um: float
+    """Written motion against computed command, root mean square [um]."""
+    emission_max_um: float
+    """Written motion against computed command, largest [um]."""
+    filament_error_mm: float
+    """Filament of a piece against the original's, largest [mm]."""
+    compensated_s: float
+    """Time of the pieces that are compensated [s]."""
+    extruding_s: float
+    """Time in which something is extruded [s]."""
+    pieces: int
+    """Pieces that the file was cut into."""
+    put_back: list[PutBack]
+    """Those that left as they came, in order."""
+    put_back_extruding_share: float
+    """Their share of the extruding time, 0 to 1."""
+    left_alone_s: float = 0.0
+    """Time of the moves that keep their own lines by rule [s]: those behind homing or an object's
+    mark, steep ones, and others whose place or state is not known; put back pieces not counted."""
+    left_alone_extruding_s: float = 0.0
+    """How much of that extrudes [s]."""
+    left_out_s: float = 0.0
+    """Time of what leaves as sliced because the job asked for less than all (`where`) [s]."""
+    left_out_extruding_s: float = 0.0
+    """How much of that extrudes [s]."""
+    warnings: list[str]
+    """What asks for attention, for a person."""
+    notes: list[str] = []
+    """What is worth knowing and no trouble, for instance how plants followed a schedule."""
+    confirmation: str = ""
+    """What ring tests on the machine said of its model; empty where nothing was compensated."""
+    layers: list[GroupFigures]
+    """Figures by layer, in order."""
+    features: list[GroupFigures]
+    """Figures by feature."""
+    track: Track
+    """Error along the print."""
+    spectra: list[AxisSpectrum] = []
+    """Spectra of the error along x and y; none where nothing is printed for a second."""
+    layer_views: list[LayerView]
+    """Some layers to draw."""
+    stages: list[StageTime]
+    """CPU time by stage."""
+    budget: BudgetFigures | None = None
+    """What the budget bought, where there was one."""
+    advice: AdviceFigures | None = None
+    """What is advised, by method `advise`."""
+    last_check: LastCheckFigures | None = None
+    """What the last check compared; null where nothing was compensated."""

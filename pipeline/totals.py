@@ -1,0 +1,100 @@
+"""What adds up along a file on its way, and what is to be said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from stillpath.gcode.types import Phases
+from stillpath.pipeline.pass_through import last_length_mm
+from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
+from stillpath.pipeline.result import PutBack
+
+__all__ = ["Sums"]
+
+_WARN_SHARE = 0.2
+"""Of the extruding time, above which it is said that it is not compensated."""
+
+
+class Sums:
+    """What adds up along a file."""
+
+    def __init__(self) -> None:
+        self.moves = self.pieces = self.segments = self.written = 0
+        self.original_s = self.time_s = self.compensated_s = self.extruding_s = 0.0
+        self.peak_rate = self.peak_velocity = self.peak_accel = 0.0
+        self.gap2 = self.gap_max = self.filament_error = 0.0
+        self.passed_s, self.passed_motion_s, self.passed_line = 0.0, 0.0, 0
+        self.left_out_s = self.left_out_extruding_s = 0.0
+        self.gap_count = 0
+        self.put_back: list[PutBack] = []
+        self.warnings: list[str] = []
+        self.newline = True
+        self.jumped = True
+
+    def add_piece(self, made: CompensatedPiece, executed: Phases, gap: np.ndarray) -> None:
+        """Add a piece as it was written, and how far its motion is from its command."""
+        timeline, segments = made.timeline, made.segments
+        seconds = executed.duration_s + float(timeline.start_s[0])
+        self.time_s += seconds
+        self.compensated_s += seconds
+        self.extruding_s += DT_S * np.count_nonzero(made.extruding)
+        self.segments += len(segments)
+        if len(segments):
+            rate = np.bincount((segments.end_s - 1e-9).astype(np.int64))
+            self.peak_rate = max(self.peak_rate, float(rate.max()))
+        self.peak_velocity = max(self.peak_velocity, made.step_mm / DT_S)
+        self.peak_accel = max(self.peak_accel, made.bend_mm / DT_S**2)
+        self.gap2 += float(gap @ gap)
+        self.gap_count += len(gap)
+        self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
+        end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * last_length_mm(executed)
+        self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
+
+    @property
+    def put_back_s(self) -> float:
+        """Extruding time of the pieces that left as they came."""
+        return sum(piece.extruding_seconds for piece in self.put_back)
+
+    @property
+    def put_back_share(self) -> float:
+        """The same as a share of all extruding time."""
+        return self.put_back_s / self.extruding_s if self.extruding_s else 0.0
+
+    @property
+    def left_alone_s(self) -> float:
+        """Time of the motion whose lines were never to be changed."""
+        return max(self.passed_motion_s - sum(piece.seconds for piece in self.put_back), 0.0)
+
+    @property
+    def left_alone_extruding_s(self) -> float:
+        """The part of it that extrudes."""
+        return max(self.passed_s - self.put_back_s, 0.0)
+
+    def left_out(self, where: str) -> Iterator[str]:
+        """Yield what was left as sliced because the job asked for less than all."""
+        if where != "all":
+            yield (
+                f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "
+                f"{self.left_out_extruding_s:.0f} s of them extrude. Figures of the whole print "
+                "count them too"
+            )
+
+    def left_alone(self) -> Iterator[str]:
+        """Yield a warning where much was not compensated."""
+        passed_s = self.left_alone_extruding_s
+        if self.put_back_share > _WARN_SHARE:
+            longest = max(self.put_back, key=lambda piece: piece.extruding_seconds)
+            yield (
+                f"{self.put_back_share:.0%} of the extruding time left as it came and is not "
+                f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
+                f"{longest.reason}"
+            )
+        elif passed_s > _WARN_SHARE * self.extruding_s:
+            yield (
+                f"{passed_s / self.extruding_s:.0%} of the extruding time lies in moves that keep "
+                f"their own lines and is not compensated, from line {self.passed_line} on: they "
+                "climb faster than Z can follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), "
+                "take long for their length, or start where the position is not known"
+            )

@@ -1,0 +1,198 @@
+"""What the nozzle does, sample by sample: commanded and simulated motion as a table.
+
+The road is gone once more, on the file as it came, up to the end of what is asked for.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.columns import Table, csv_table, npz_table
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.reading import DialectName
+from stillpath.pipeline.simulate import simulate_file
+from stillpath.pipeline.tracing import Trace
+
+__all__ = ["TrajectoryFormat", "write_trajectories"]
+
+TrajectoryFormat = Literal["csv", "npz"]
+
+_SHOWN = ("before", "after")
+
+
+def write_trajectories(
+    source: Path,
+    target: Path,
+    machine: Machine,
+    options: Options | None,
+    *,
+    format: TrajectoryFormat = "csv",  # noqa: A002 - what everybody calls it
+    start_s: float = 0.0,
+    stop_s: float | None = None,
+    plate: int | None = None,
+    dialect: DialectName | None = None,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+) -> int:
+    """Write the motion of a print, 1000 rows a second.
+
+    Parameters
+    ----------
+    source : Path
+        The file as it came.
+    target : Path
+        Written whole or not at all. Columns: ``t_s``; ``x_mm y_mm z_mm``, the motion that the
+        firmware makes of the file as it came; ``after_x_mm after_y_mm``, that of the written file;
+        ``before_sim_x_mm``, ..., the nozzle according to the machine's model;
+        ``before_contour_um``, ``after_contour_um``, its distance to the planned path; ``line`` and
+        ``layer`` of the file as it came (-1: before the first layer); ``extruding``, 0 or 1.
+    machine : Machine
+    options : Options or None
+        Those of the job; with None the file stays as it came, and no column is called ``after``.
+        Of an advised file the motion is that of the written one, and so are its lines; no column
+        is called ``before``.
+    format : {"csv", "npz"}
+        Text (some 110 bytes a row, lengths to 0.1 um), or NumPy arrays.
+    start_s, stop_s : float
+        Of the time axis of reports: the written file's, stands beyond 2 s left out. None: the end.
+    plate, dialect
+        As `Options` has them, where there are no options.
+    cache_dir, progress
+        As `compensate_file` has them.
+
+    Returns
+    -------
+    int
+        Rows.
+
+    Raises
+    ------
+    GcodeError
+        Nothing lies between `start_s` and `stop_s`; or as `compensate_file` has it.
+    DesignError, ModelError
+    OSError
+    """
+    if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
+        raise GcodeError(
+            f"from {start_s:g} s to {stop_s or 0.0:g} s is no time; it begins at 0 or later and "
+            "ends behind its start"
+        )
+    names = _SHOWN if options is not None else _SHOWN[:1]
+    if options is not None and options.method == "advise":
+        names = _SHOWN[1:]
+    with (
+        _table(target, format, names) as table,
+        tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-road-") as folder,
+    ):
+        window = _Window(table, names, start_s, stop_s)
+        try:
+            if options is not None and options.method == "advise":
+                written = Path(folder, "advised.gcode")
+                compensate_file(source, written, machine, options, cache_dir=cache_dir)
+                source, plate, dialect = written, None, options.dialect
+                options = None
+            if options is None:
+                simulate_file(
+                    source,
+                    machine,
+                    plate=plate,
+                    dialect=dialect,
+                    cache_dir=cache_dir,
+                    progress=progress,
+                    trace=window.add,
+                )
+            else:
+                compensate_file(
+                    source,
+                    Path(folder, "written.gcode"),
+                    machine,
+                    options,
+                    cache_dir=cache_dir,
+                    progress=progress,
+                    trace=window.add,
+                )
+        except _Passed:
+            pass
+        if window.rows == 0:
+            raise GcodeError(
+                f"nothing moves from {start_s:g} s on: the print ends at {window.end_s:.3f} s"
+            )
+        return window.rows
+
+
+class _Window:
+    """Write what lies between two times; `end_s` is how far the motion went."""
+
+    def __init__(
+        self, table: Table, names: tuple[str, ...], start_s: float, stop_s: float | None
+    ) -> None:
+        self._table, self._names = table, names
+        self._first = round(np.ceil(start_s / DT_S - 1e-6))
+        self._stop = None if stop_s is None else round(np.ceil(stop_s / DT_S - 1e-6))
+        self.rows = 0
+        self.end_s = 0.0
+
+    def add(self, trace: Trace) -> None:
+        count = len(trace.line)
+        first = max(self._first - trace.first, 0)
+        last = count if self._stop is None else min(self._stop - trace.first, count)
+        self.end_s = (trace.first + count) * DT_S
+        if first < last:
+            part = slice(first, last)
+            columns: dict[str, np.ndarray] = {
+                "t_s": (trace.first + np.arange(first, last)) * DT_S,
+                "x_mm": trace.path_mm[0, part],
+                "y_mm": trace.path_mm[1, part],
+                "z_mm": trace.z_mm[part],
+            }
+            if "after" in self._names:
+                columns |= {
+                    "after_x_mm": trace.executed_mm[0, part],
+                    "after_y_mm": trace.executed_mm[1, part],
+                }
+            for c, name in enumerate(self._names):
+                columns[f"{name}_sim_x_mm"] = trace.simulated_mm[c, 0, part]
+                columns[f"{name}_sim_y_mm"] = trace.simulated_mm[c, 1, part]
+            for c, name in enumerate(self._names):
+                columns[f"{name}_contour_um"] = 1e3 * trace.error_mm[c, part]
+            columns |= {"line": trace.line[part], "layer": trace.layer[part]}
+            columns["extruding"] = trace.extruding[part].astype(np.uint8)
+            self._table.write(columns)
+            self.rows += last - first
+        if self._stop is not None and trace.first + count >= self._stop:
+            raise _Passed
+
+
+class _Passed(Exception):
+    """All that was asked for is written."""
+
+
+@contextmanager
+def _table(target: Path, form: str, names: tuple[str, ...]) -> Iterator[Table]:
+    lengths = ["x_mm", "y_mm", "z_mm"]
+    if "after" in names:
+        lengths += ["after_x_mm", "after_y_mm"]
+    lengths += [f"{name}_sim_{axis}_mm" for name in names for axis in ("x", "y")]
+    errors = [f"{name}_contour_um" for name in names]
+    if form == "csv":
+        formats = {"t_s": "%.3f"} | dict.fromkeys(lengths, "%.4f") | dict.fromkeys(errors, "%.2f")
+        with csv_table(target, formats | dict.fromkeys(_NUMBERS, "%d")) as table:
+            yield table
+    else:
+        types = dict.fromkeys(["t_s", *lengths, *errors], "<f8") | _NUMBERS
+        with npz_table(target, types) as table:
+            yield table
+
+
+_NUMBERS = {"line": "<i8", "layer": "<i4", "extruding": "|u1"}

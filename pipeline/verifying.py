@@ -1,0 +1,143 @@
+"""Whether a compensated piece may be printed: executed as commanded, and better than it came."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import Machine
+from stillpath.models.schedule import OperatingPoint
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.pass_through import last_length_mm
+from stillpath.pipeline.piece_compensator import (
+    DT_S,
+    CompensatedPiece,
+    Unfit,
+    follow_tolerance_mm,
+    strayed,
+)
+from stillpath.simulation.measures import MotionMeter
+from stillpath.simulation.scheduled import MachineStream
+
+__all__ = ["NEGLIGIBLE_UM", "Verifier"]
+
+NEGLIGIBLE_UM = 1.0
+"""Contour error that nobody sees, whoever has less of it."""
+
+_TIME_EXCESS_S = 20e-3
+_END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
+"""How far a piece may end from where the original does, x y z e, beyond a step of the motors."""
+_STRIDE = 6
+_PAST = 2000
+"""Samples of motion before a piece, whose vibration may last into it."""
+_CLEARLY = 1.1
+
+
+class Verifier:
+    """Judge compensated pieces by their read-back motion.
+
+    Parameters
+    ----------
+    machine : Machine
+    tolerance_um : float
+    """
+
+    def __init__(self, machine: Machine, tolerance_um: float) -> None:
+        firmware = kit(machine)
+        self._machine = machine
+        self._step_mm = np.array(firmware.step_mm)
+        self._tolerance_mm = follow_tolerance_mm(firmware, tolerance_um)
+        # What is too short for a move of its own is executed by the next one.
+        self._waits_mm = firmware.shortest_move_mm
+        self._end_mm = self._step_mm + _END_MM
+        if self._waits_mm > 0.0:
+            self._end_mm[3] *= self._waits_mm / np.max(self._step_mm[:2])
+        self._past_mm = np.zeros((2, 0))
+
+    def check_motion(
+        self, piece: Piece, made: CompensatedPiece, gap_mm: NDArray[np.float64], executed: Phases
+    ) -> None:
+        """Compare executed with intended motion.
+
+        Parameters
+        ----------
+        piece : Piece
+            As it came.
+        made : CompensatedPiece
+        gap_mm : ndarray
+            Distance from the command, as `pipeline.piece_compensator.deviation` gives it.
+        executed : Phases
+
+        Raises
+        ------
+        Unfit
+            With the reason.
+        """
+        if (reason := strayed(gap_mm, made.extruding, self._tolerance_mm)) is not None:
+            raise Unfit(f"read back, {reason}")
+        timeline, begins_s = made.timeline, float(made.timeline.start_s[0])
+        lasts_s = float(timeline.end_s[-1] - timeline.start_s[-1])
+        begun_s = float(made.encoded.group_start_s[-1]) - begins_s
+        late_s = executed.duration_s - begun_s - lasts_s
+        tolerance_mm = self._end_mm
+        last_mm = made.command_mm[:2, round(timeline.start_s[-1] / timeline.dt_s) :]
+        if np.max(np.ptp(last_mm, axis=1)) < self._waits_mm:
+            # All of the last stretch may wait.
+            late_s = max(late_s, min(late_s + lasts_s, 0.0))
+            tolerance_mm = np.maximum(tolerance_mm, [self._waits_mm, self._waits_mm, 0.0, 0.0])
+        if abs(late_s) > _TIME_EXCESS_S:
+            raise Unfit(f"read back, the piece takes {1e3 * late_s:+.2f} ms longer than planned")
+        end = executed.start_mm[-1] + executed.direction[-1] * last_length_mm(executed)
+        wanted = piece.moves.end_mm[-1]
+        if np.any(np.abs(end - wanted) > tolerance_mm):
+            raise Unfit(f"read back, the piece ends at {end.round(6)}, not at {wanted.round(6)}")
+
+    def passed(self, command_mm: NDArray[np.float64] | None) -> None:
+        """Take note of motion, shape (2, n): the machine vibrates on when a piece begins.
+
+        None: the position is lost, and the machine stands still when motion goes on.
+        """
+        if command_mm is None:
+            self._past_mm = self._past_mm[:, :0]
+        elif command_mm.shape[1] >= _PAST:
+            self._past_mm = command_mm[:2, -_PAST:].copy()
+        else:
+            self._past_mm = np.hstack([self._past_mm, command_mm[:2]])[:, -_PAST:]
+
+    def check_gain(self, motion: MotionSamples, point: OperatingPoint) -> None:
+        """Compare a piece with what came, on motors with steps: those cost fine motion most.
+
+        Parameters
+        ----------
+        motion : MotionSamples
+            With what came. If that is as planned, nothing is done.
+        point : OperatingPoint
+            Where the machine is.
+
+        Raises
+        ------
+        Unfit
+            When what came would print better.
+        """
+        if motion.sliced_mm is None:
+            return
+        commands = (motion.sliced_mm, motion.executed_mm)
+        meter = MotionMeter(DT_S, stride=_STRIDE, channels=len(commands))
+        past = self._past_mm
+        path_mm = np.hstack([past, motion.path_mm])
+        answers = [
+            MachineStream(self._machine, DT_S, point).push(np.hstack([past, command]), path_mm)
+            for command in commands
+        ]
+        extruding = np.append(np.zeros(past.shape[1], np.bool_), motion.extruding)
+        meter.push(path_mm, np.stack(answers), extruding)
+        meter.flush()
+        came_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
+        if ours_um > max(_CLEARLY * came_um, NEGLIGIBLE_UM):
+            raise Unfit(
+                f"on the motors' steps its contour error would be {ours_um:.1f} um rms, and it is "
+                f"{came_um:.1f} um as it came"
+            )

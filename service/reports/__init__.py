@@ -1,6 +1,0 @@
-"""The report of one job: figures as JSON, and one self-contained page."""
-
-from service.reports.report import render_report, write_report
-from service.reports.schema import report_schema
-
-__all__ = ["render_report", "report_schema", "write_report"]

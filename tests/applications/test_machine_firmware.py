@@ -1,0 +1,104 @@
+"""Machines with another firmware than Klipper: the examples, and how a machine gets one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from stillpath.applications.machines.checks import differences
+from stillpath.applications.machines.klipper_config import PrinterConfig
+from stillpath.cli.main import run
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine, read_machine
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
+KINDS = ("marlin", "reprapfirmware")
+
+
+@pytest.fixture(autouse=True)
+def data_dir(tmp_path, monkeypatch):
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+
+
+def stillpath(capsys, *words) -> tuple[int, str, str]:
+    code = run([str(word) for word in words])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_examples_are_machines(capsys, kind: str) -> None:
+    code, out, err = stillpath(
+        capsys, "machines", "set-firmware", "ender3", EXAMPLES / f"{kind}.json", "--as", "mine"
+    )
+    assert (code, err) == (0, "")
+    code, out, _ = stillpath(capsys, "machines", "mine")
+    machine = read_machine(out)
+    assert machine.firmware.kind == kind
+    assert machine.axes == load_machine("ender3").axes
+    for section in json.loads((EXAMPLES / f"{kind}.json").read_text()):
+        assert section in machine.firmware.model_fields_set
+
+
+def test_next_revision_of_an_own_machine(capsys) -> None:
+    marlin, reprap = (EXAMPLES / f"{kind}.json" for kind in KINDS)
+    stillpath(capsys, "machines", "set-firmware", "ender3", marlin, "--as", "mine")
+    code, out, _ = stillpath(capsys, "machines", "set-firmware", "mine", reprap)
+    assert code == 0
+    assert out.startswith("mine: revision 2")
+    _, out, _ = stillpath(capsys, "machines", "diff", "mine", "1", "2")
+    assert "firmware.kind: marlin -> reprapfirmware" in out
+
+
+def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) -> None:
+    file = tmp_path / "firmware.json"
+    file.write_text('{"kind": "marlin", "variant": "bambu"}')
+    code, out, _ = stillpath(capsys, "machines", "set-firmware", "ender3", file, "--as", "mine")
+    assert code == 0
+    assert "mine can be simulated, not compensated: Bambu" in out
+    code, out, _ = stillpath(capsys, "machines", "check", "mine")
+    assert code == 2
+    assert "not compensated" in out
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("{", "neither a section as JSON"),
+        ("[]", "says its kind"),
+        ('{"planner": {}}', "says its kind"),
+        ('{"kind": "grbl"}', "firmware: kind must be klipper, marlin or reprapfirmware"),
+        ('{"kind": "marlin", "steps_per_mm": {"x": 0}}', "firmware.steps_per_mm.x: "),
+        ('{"kind": "klipper", "planner": {"max_accel_mm_s2": -1}}', "firmware.planner.max_accel"),
+    ],
+)
+def test_a_wrong_section_is_named(capsys, tmp_path, section: str, message: str) -> None:
+    file = tmp_path / "firmware.json"
+    file.write_text(section)
+    code, _, err = stillpath(capsys, "machines", "set-firmware", "ender3", file, "--as", "mine")
+    assert code == 2
+    assert message in err
+
+
+def test_built_in_machines_stay(capsys) -> None:
+    code, _, err = stillpath(capsys, "machines", "set-firmware", "ender3", EXAMPLES / "marlin.json")
+    assert code == 2
+    assert "ender3" in err
+
+
+def test_a_section_without_kind_is_klippers() -> None:
+    machine = load_machine("ender3")
+    document = machine.model_dump(mode="json")
+    del document["firmware"]["kind"]
+    assert Machine.model_validate(document) == machine
+
+
+def test_a_printer_cfg_says_nothing_of_marlin() -> None:
+    section = json.loads((EXAMPLES / "marlin.json").read_text())
+    document = load_machine("ender3").model_dump(mode="json")
+    machine = Machine.model_validate({**document, "firmware": section})
+    with pytest.raises(ModelError, match=r"runs marlin; a printer.cfg is Klipper's"):
+        differences(machine, PrinterConfig("printer.cfg"))

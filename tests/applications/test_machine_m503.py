@@ -1,0 +1,163 @@
+"""A machine from what Marlin prints for M503."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stillpath.cli.main import run
+from stillpath.models.store import read_machine
+
+M503 = """\
+Send: M503
+Recv: echo:; Linear Units:
+Recv: echo:  G21 ; (mm)
+Recv: echo:; Filament settings (Disabled):
+Recv: echo:  M200 S0 D1.75
+Recv: echo:; Steps per unit:
+Recv: echo:  M92 X80.00 Y80.40 Z400.00 E93.00
+Recv: echo:; Max feedrates (units/s):
+Recv: echo:  M203 X500.00 Y400.00 Z5.00 E25.00
+Recv: echo:; Max Acceleration (units/s2):
+Recv: echo:  M201 X500.00 Y600.00 Z100.00 E5000.00
+Recv: echo:; Acceleration (units/s2) (P<print-accel> R<retract-accel> T<travel-accel>):
+Recv: echo:  M204 P510.00 R520.00 T530.00
+Recv: echo:; Advanced (B<min_segment_time_us> S<min_feedrate> T<min_travel_feedrate> J<junc_dev>):
+Recv: echo:  M205 B20000.00 S0.00 T0.00 J0.08
+Recv: echo:; Retract (S<length> F<feedrate> Z<lift>)
+Recv: echo:  M207 S3.00 W13.00 F2700.00 Z0.00
+Recv: echo:; Recover (S<length> F<feedrate>)
+Recv: echo:  M208 S0.10 W0.00 F480.00
+Recv: echo:; Input Shaping:
+Recv: echo:  M593 X F40.50 D0.15
+Recv: echo:  M593 Y F31.00 D0.10
+Recv: echo:; Linear Advance:
+Recv: echo:  M900 T0 K0.05
+Recv: echo:  M900 T1 K0.80
+Recv: ok
+"""
+
+
+@pytest.fixture(autouse=True)
+def data_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+
+
+@pytest.fixture
+def make(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Return a function that makes `mine` of a text: its exit code, stdout and stderr."""
+
+    def made(text: str, *more: str) -> tuple[int, str, str]:
+        file = tmp_path / "m503.txt"
+        file.write_text(text)
+        words = ["--name", "mine", "--travel", "235x235x250", *more]
+        code = run(["machines", "from-m503", str(file), *words])
+        return code, *capsys.readouterr()
+
+    return made
+
+
+def stored(capsys: pytest.CaptureFixture[str]):
+    assert run(["machines", "show", "mine"]) == 0
+    return read_machine(capsys.readouterr().out.encode(), "mine")
+
+
+def test_what_m503_says_is_in_the_machine(make, capsys) -> None:
+    code, out, err = make(
+        M503, "--set", "min_steps_per_segment=1", "--set", "variant=2.0", "--fy", "29"
+    )
+    assert (code, err) == (0, "")
+    assert "mine: revision 1" in out
+    assumed = next(line for line in out.splitlines() if "assumed" in line)
+    assert "block_buffer_size=16, s_curve=false" in assumed
+    assert "min_steps_per_segment" not in assumed
+
+    machine = stored(capsys)
+    firmware = machine.firmware
+    assert (firmware.kind, firmware.variant) == ("marlin", "2.0")
+    assert firmware.min_steps_per_segment == 1
+    assert firmware.steps_per_mm.y == 80.4
+    assert firmware.planner.max_feedrate_mm_s.y == 400
+    assert firmware.planner.max_accel_mm_s2.y == 600
+    limits = firmware.planner
+    assert (limits.accel_mm_s2, limits.retract_accel_mm_s2) == (510, 520)
+    assert (limits.travel_accel_mm_s2, limits.junction_deviation_mm) == (530, 0.08)
+    assert firmware.junction == "deviation"
+    assert (firmware.shaper.freq_x_hz, firmware.shaper.damping_y) == (40.5, 0.1)
+    assert (firmware.linear_advance, firmware.linear_advance_k_s) == (True, 0.05)
+    assert (firmware.retraction.retract_speed_mm_s, firmware.retraction.unretract_speed_mm_s) == (
+        45,
+        8,
+    )
+    assert machine.travel["z"].max_mm == 250
+    nominal = [machine.axes[axis].nominal.modes[0].f_hz for axis in ("x", "y")]
+    assert nominal == [40.5, 29]
+
+
+def test_what_is_not_built_in_is_not_there(make, capsys) -> None:
+    kept = [
+        line for line in M503.splitlines() if not any(c in line for c in ("M207", "M593", "M900"))
+    ]
+    text = "\n".join(kept).replace("J0.08", "X10.00 Y9.00 Z0.30 E5.00")
+    assert make(text)[0] == 0
+    firmware = stored(capsys).firmware
+    assert firmware.junction == "classic_jerk"
+    assert firmware.planner.jerk_mm_s.y == 9
+    assert (firmware.linear_advance, firmware.retraction) == (False, None)
+    assert (firmware.shaper.freq_x_hz, firmware.shaper.freq_y_hz) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "more", "words"),
+    [
+        ("[printer]\nkinematics: corexy\n", (), ("m503.txt", "M203", "save all of")),
+        (M503.replace("M92 X80.00", "M92"), (), ("M92 X",)),
+        (M503.replace("G21", "G20"), (), ("inches", "G21")),
+        (M503, ("--travel", "235"), ("--travel", "235x235x250")),
+        (M503, ("--set", "s_curve"), ("FIELD=VALUE",)),
+        (M503, ("--set", "s_curv=true"), ("s_curv",)),
+        (M503, ("--kinematics", "delta"), ("kinematics", "delta")),
+    ],
+)
+def test_what_is_wrong_is_one_line(make, text: str, more: tuple[str, ...], words) -> None:
+    code, out, err = make(text, *more)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    for word in words:
+        assert word in err
+
+
+def test_an_own_machine_takes_a_later_answer_and_keeps_what_that_does_not_say(
+    make, capsys, tmp_path: Path
+) -> None:
+    make(M503, "--set", "min_steps_per_segment=1", "--set", "variant=2.0")
+    file = tmp_path / "later.txt"
+    file.write_text(M503.replace("P510.00", "P900.00").replace("M593 Y F31.00 D0.10", ""))
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 0
+    assert capsys.readouterr().out.startswith("mine: revision 2")
+    firmware = stored(capsys).firmware
+    assert (firmware.variant, firmware.min_steps_per_segment) == ("2.0", 1)
+    assert (firmware.planner.accel_mm_s2, firmware.planner.travel_accel_mm_s2) == (900, 530)
+    assert (firmware.shaper.freq_x_hz, firmware.shaper.freq_y_hz) == (40.5, 0)
+    assert run(["machines", "diff", "mine", "1", "2"]) == 0
+    assert "firmware.planner.accel_mm_s2: 510 -> 900" in capsys.readouterr().out
+
+
+def test_a_machine_of_another_firmware_becomes_one_with_marlin(capsys, tmp_path: Path) -> None:
+    file = tmp_path / "m503.txt"
+    file.write_text(M503)
+    assert run(["machines", "set-firmware", "ender3", str(file), "--as", "mine"]) == 0
+    capsys.readouterr()
+    firmware = stored(capsys).firmware
+    assert (firmware.kind, firmware.variant, firmware.steps_per_mm.y) == ("marlin", "2.1", 80.4)
+    file.write_text("echo:  M92 X80.00 Y80.00 Z400.00 E93.00\n")
+    assert run(["machines", "set-firmware", "mine", str(file)]) == 2
+    assert "no M203 X in it; send M503 and save all" in capsys.readouterr().err
+
+
+def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> None:
+    fast = M503.replace("X500.00 Y400.00", "X900.00 Y900.00").replace("P510", "P30000")
+    make(fast.replace("M201 X500.00", "M201 X40000.00"))
+    command = stored(capsys).command
+    assert command.velocity_mm_s > 900
+    assert command.accel_mm_s2 > 30000

@@ -1,0 +1,84 @@
+"""The search for lost steps: what is written, and what a console's text leads to."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from stillpath.applications.proof.motor_test import borne, levels_of, motor_test
+from stillpath.cli.main import run
+from stillpath.models.errors import ModelError
+from stillpath.models.store import load_machine
+from tests.gcode.cutting import ender3_with
+from tests.gcode.plain_reader import read
+
+
+def console(*counts: tuple[int, int]) -> str:
+    return "\n".join(f"// mcu: stepper_x:{x} stepper_y:{y} stepper_z:0" for x, y in counts)
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_what_is_written(name: str) -> None:
+    machine = load_machine(name)
+    text = motor_test(machine, 20_000.0)
+    levels = levels_of(text)
+    assert levels[0].accel_mm_s2 == machine.firmware.planner.max_accel_mm_s2
+    assert levels[-1].accel_mm_s2 == 20_000
+    assert all(1.0 < b.accel_mm_s2 / a.accel_mm_s2 < 1.26 for a, b in pairwise(levels))
+    assert text.count("GET_POSITION") == len(levels) + 1
+    reading = read(text.encode())
+    for k, axis in enumerate(("x", "y")):
+        assert machine.travel[axis].min_mm <= reading.low_mm[k]
+        assert reading.high_mm[k] <= machine.travel[axis].max_mm
+    # The printer is left as it was, but for a shaper that nobody states.
+    assert text.index("SHAPER_FREQ_X=0") < text.index("level 1")
+    assert "the shaper stays off until FIRMWARE_RESTART" in text
+    assert "ACCEL=5000 " in text.split("SET_VELOCITY_LIMIT")[-1]
+
+
+def test_what_the_console_says() -> None:
+    levels = levels_of(motor_test(load_machine("ender3"), 9000.0))
+    fine = [(100, -200), (103, -198), (96, -205), (100, -215)]
+    assert len(levels) == 4
+    assert borne(levels, console((0, 0), *fine, fine[0]), 16) == 4
+    assert borne(levels, console(*fine, (1000, 0)), 16) == 3
+    assert borne(levels, console(fine[0], (100, -216), *fine[:3]), 16) == 0
+    with pytest.raises(ModelError, match="holds 4 answers"):
+        borne(levels, console(*fine), 16)
+    with pytest.raises(ModelError, match="has no levels"):
+        levels_of("G28")
+
+
+def test_other_firmwares_and_limits_that_are_not_above() -> None:
+    with pytest.raises(ModelError, match="runs marlin"):
+        motor_test(ender3_with("marlin"), 9000.0)
+    with pytest.raises(ModelError, match="5000 mm/s2 already"):
+        motor_test(load_machine("ender3"), 5000.0)
+
+
+def test_from_the_search_to_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+    written, said = tmp_path / "motors.gcode", tmp_path / "console.txt"
+    assert run(["machines", "put", str(machine_file(tmp_path))]) == 0
+    assert run(["motor-test", "--machine", "mine", "-o", str(written), "--to", "9000"]) == 0
+    best = levels_of(written.read_text())[2]
+    said.write_text(console((5, 5), (5, 5), (6, 5), (5, 9), (5, 90)))
+    assert run(["machines", "motors", "mine", str(written), str(said), "--margin", ".8"]) == 0
+    assert "level 4 lost steps" in capsys.readouterr().out
+    assert run(["machines", "show", "mine"]) == 0
+    shown = capsys.readouterr().out
+    assert f'"accel_mm_s2": {round(0.8 * best.accel_mm_s2)}.0' in shown
+    said.write_text(console((5, 5), (5, 50), (5, 50), (5, 50), (5, 50)))
+    assert run(["machines", "motors", "mine", str(written), str(said)]) == 2
+    assert "lost at the printer's own limits" in capsys.readouterr().err
+
+
+def machine_file(folder: Path) -> Path:
+    machine = load_machine("ender3").model_copy(update={"name": "mine"})
+    file = folder / "mine.json"
+    file.write_text(machine.model_dump_json())
+    return file

@@ -1,0 +1,240 @@
+"""Ring tests: printed by bodies with dry friction that the model does not know, and read back."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.applications.proof.confirming import verify_ring
+from stillpath.applications.proof.recorders import RingSettings
+from stillpath.applications.proof.ring_figures import RingReport
+from stillpath.applications.proof.ring_motion import is_ring_test, read_ring_motion
+from stillpath.applications.proof.ring_test import RingTest, write_ring_test
+from stillpath.cli.machines import open_machines
+from stillpath.cli.main import run
+from stillpath.models.confirmation import Confirmation, confirmation_text
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from tests.service.ringing import SENSOR, TRUE, Chain, machine_of, recorded
+
+TODAY = date(2026, 11, 24)
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return machine_of({axis: chain.spec() for axis, chain in TRUE.items()})
+
+
+@pytest.fixture(scope="module")
+def ring(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ring")
+    write_ring_test(machine, folder / "ring.gcode", cache_dir=folder)
+    return folder / "ring.gcode"
+
+
+@pytest.fixture(scope="module")
+def log(ring: Path, machine: Machine) -> Path:
+    path = ring.with_name("adxl345-ring.csv")
+    path.write_bytes(recorded(ring, machine).raw_data())
+    return path
+
+
+@pytest.fixture(scope="module")
+def told(ring: Path, machine: Machine, log: Path) -> RingReport:
+    return verify_ring(ring, [log], machine, today=TODAY)
+
+
+def verdicts(report: RingReport) -> list[str]:
+    return [axis.verdict for axis in report.axes]
+
+
+def said_of(path: Path, ring: Path, machine: Machine, content: bytes) -> RingReport:
+    path.write_bytes(content)
+    return verify_ring(ring, [path], machine, today=TODAY)
+
+
+# The file
+
+
+def test_half_of_the_stops_are_compensated(ring: Path, machine: Machine) -> None:
+    motion = read_ring_motion(ring, machine)
+    for axis in ("x", "y"):
+        off, on = (motion.of(axis, compensated=half) for half in (False, True))
+        assert len(off) == len(on) == 12
+    assert motion.command.rows.shape[1] < 120_000  # two minutes at 1 kHz
+    assert is_ring_test(ring)
+
+
+def test_it_stays_within_the_travel_and_extrudes_nothing(ring: Path, machine: Machine) -> None:
+    rows = read_ring_motion(ring, machine).command.rows
+    for row, axis in zip(rows, ("x", "y"), strict=True):
+        assert row.min() >= machine.travel[axis].min_mm
+        assert row.max() <= machine.travel[axis].max_mm
+    commands = [line.split(";")[0] for line in ring.read_text().splitlines()]
+    assert not any(word.startswith("E") for line in commands for word in line.split()[1:])
+    assert not any(line.startswith(("M104", "M109", "M140", "M190")) for line in commands)
+
+
+def test_klipper_logs_every_sensor_once(machine: Machine) -> None:
+    lines = RingTest(machine, RingSettings("head", "bed")).text().splitlines()
+    logged = [line for line in lines if line.startswith("ACCELEROMETER")]
+    assert logged == [
+        "ACCELEROMETER_MEASURE CHIP=head",
+        "ACCELEROMETER_MEASURE CHIP=bed",
+        "ACCELEROMETER_MEASURE CHIP=head NAME=ring",
+        "ACCELEROMETER_MEASURE CHIP=bed NAME=ring",
+    ]
+
+
+def test_a_travel_without_room_is_refused(machine: Machine) -> None:
+    small = machine.model_copy(
+        update={
+            "travel": machine.travel
+            | {"x": machine.travel["x"].model_copy(update={"min_mm": 0.0, "max_mm": 30.0})}
+        }
+    )
+    with pytest.raises(ModelError, match=r"moves x by 20 mm at least.*correct the machine"):
+        RingTest(small, RingSettings())
+
+
+# What a log says
+
+
+def test_a_machine_like_its_plants_is_confirmed(told: RingReport, ring: Path, log: Path) -> None:
+    assert verdicts(told) == ["confirmed", "confirmed"]
+    for axis in told.axes:
+        assert axis.as_planned is not None
+        assert axis.compensated is not None
+        assert axis.gain == pytest.approx(1.08, abs=0.02)  # the sensor's own
+        assert axis.compensated.measured_um < 0.05 * axis.as_planned.measured_um
+        # Dry friction damps what is large.
+        low, high = axis.as_planned.predicted_um
+        assert 0.8 * low < axis.as_planned.measured_um < high
+        found = axis.confirmation
+        assert found is not None
+        assert found.sources[0].name == log.name
+        assert found.tested_on == TODAY
+
+
+def test_a_mode_that_moved_is_not_confirmed(ring: Path, machine: Machine, tmp_path: Path) -> None:
+    moved = {**TRUE, "x": Chain((43.0, 112.0))}
+    report = said_of(tmp_path / "a.csv", ring, machine, recorded(ring, machine, moved).raw_data())
+    assert verdicts(report) == ["not confirmed", "confirmed"]
+    assert "It rings at 42." in report.axes[0].text
+    assert "measure the machine again" in report.axes[0].text
+
+
+def test_a_sensor_that_one_axis_does_not_move_says_nothing_of_it(
+    ring: Path, machine: Machine, tmp_path: Path
+) -> None:
+    content = recorded(ring, machine, sees=(1.0, 0.02)).raw_data()
+    report = said_of(tmp_path / "a.csv", ring, machine, content)
+    assert verdicts(report) == ["confirmed", "says nothing"]
+    assert "it is not fixed to the part that moves in Y" in report.axes[1].text
+
+
+@pytest.mark.parametrize("what", ["another motion", "part of it", "noise"])
+def test_logs_that_say_nothing(what: str, ring: Path, machine: Machine, tmp_path: Path) -> None:
+    if what == "part of it":
+        record, words = recorded(ring, machine, part_s=(0.0, 15.0)), "log the whole file"
+    elif what == "noise":
+        noisy = replace(SENSOR, noise_mm_s2=4000.0)
+        record, words = recorded(ring, machine, sensor=noisy), "noise of the log"
+    else:
+        record = recorded(ring, machine)
+        record = replace(record, accel_mm_s2=record.accel_mm_s2[::-1].copy())
+        words = "is not of this file"
+    report = said_of(tmp_path / "a.csv", ring, machine, record.raw_data())
+    assert verdicts(report) == ["says nothing", "says nothing"]
+    assert all(words in axis.text for axis in report.axes)
+    assert all(axis.confirmation is None for axis in report.axes)
+
+
+@pytest.mark.shared
+def test_real_logs_of_other_motion_say_nothing(
+    ring: Path, machine: Machine, shared_dir: Path, tmp_path: Path
+) -> None:
+    files = sorted((shared_dir / "measurements" / "serval").glob("*accel*.csv.gz"))
+    assert files
+    for file in files:
+        content = gzip.decompress(file.read_bytes())
+        report = said_of(tmp_path / "real.csv", ring, machine, content)
+        assert verdicts(report) == ["says nothing", "says nothing"]
+
+
+def test_a_ring_test_for_other_plants_says_nothing(ring: Path, log: Path, machine: Machine) -> None:
+    other = machine_of({"x": Chain((45.0, 120.0)).spec(), "y": TRUE["y"].spec()})
+    report = verify_ring(ring, [log], other, today=TODAY)
+    assert verdicts(report) == ["says nothing", "confirmed"]
+    assert "write a new ring test" in report.axes[0].text
+
+
+def test_a_log_without_raw_accelerations_is_refused(
+    ring: Path, machine: Machine, tmp_path: Path
+) -> None:
+    path = tmp_path / "resonances_x_1.csv"
+    path.write_bytes(recorded(ring, machine).resonances())
+    with pytest.raises(ModelError, match="holds no raw accelerations but a Spectrum"):
+        verify_ring(ring, [path], machine)
+
+
+# What the machine remembers
+
+
+def confirmed(machine: Machine, told: RingReport) -> Machine:
+    axes: dict[str, Confirmation] = {
+        a.axis: a.confirmation for a in told.axes if a.confirmation is not None
+    }
+    return machine.model_copy(update={"confirmations": axes})
+
+
+def test_what_reports_say(machine: Machine, told: RingReport) -> None:
+    assert confirmation_text(machine) == "never confirmed on this machine"
+    known = confirmed(machine, told)
+    text = confirmation_text(known)
+    assert text.startswith("X confirmed on 2026-11-24: predicted 0.3")
+    assert "; Y confirmed on 2026-11-24" in text
+    # Of other plants, and of a copy under another name, it says nothing.
+    anew = known.model_copy(update={"axes": load_machine("ender3").axes})
+    assert "never confirmed with the plants it has now" in confirmation_text(anew)
+    copy = known.model_copy(update={"name": "another"})
+    assert confirmation_text(copy) == "never confirmed on this machine"
+
+
+def test_a_machine_without_confirmations_keeps_its_revision(
+    machine: Machine, told: RingReport
+) -> None:
+    assert machine.model_copy(update={"confirmations": {}}).revision == machine.revision
+    assert confirmed(machine, told).revision != machine.revision
+    text = confirmed(machine, told).model_dump_json()
+    assert Machine.model_validate_json(text).confirmations == confirmed(machine, told).confirmations
+
+
+def test_the_command_remembers(
+    ring: Path,
+    log: Path,
+    machine: Machine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
+    (tmp_path / "mine.json").write_text(machine.model_dump_json())
+    assert run(["machines", "import", str(tmp_path / "mine.json")]) == 0
+    store = open_machines().store
+    args = ["verify", str(ring), str(log), "-m", "mine"]
+    assert run([*args, "--no-remember"]) == 0
+    assert not store.current("mine").machine.confirmations
+    assert run([*args, "--report", str(tmp_path / "told")]) == 0
+    assert "X confirmed" in capsys.readouterr().out
+    assert set(store.current("mine").machine.confirmations) == {"x", "y"}
+    report = json.loads((tmp_path / "told" / "ring-test.json").read_text())
+    assert report["axes"][0]["verdict"] == "confirmed"
+    assert np.isfinite(report["axes"][0]["misses"])

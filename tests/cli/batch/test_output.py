@@ -1,0 +1,109 @@
+"""The output folder through kills at every step."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from stillpath.cli.batch.output import Figures, Outcome, OutputFolder, sha256_of
+
+TEXT = "; compensated\nG28\n"
+
+
+class Killed(BaseException):
+    """Stands for kill -9: nothing of ours runs any more on the way out."""
+
+
+def done(output: OutputFolder, text: str = TEXT) -> Outcome:
+    scratch = output.scratch("m/a.stillpath.gcode")
+    scratch.result.write_text(text)
+    scratch.report.mkdir()
+    (scratch.report / "report.html").write_text("page of " + text)
+    outcome = Outcome(
+        state="done",
+        source="a.gcode",
+        machine="m",
+        output="m/a.stillpath.gcode",
+        report="reports/m/a.gcode",
+        output_sha256=sha256_of(scratch.result),
+        figures=Figures(after_um=1.0),
+    )
+    output.keep(scratch, outcome)
+    return outcome
+
+
+def test_result_report_and_record(tmp_path):
+    with OutputFolder.opened(tmp_path / "out") as output:
+        outcome = done(output)
+        assert output.recorded(outcome.output) == outcome
+        assert output.is_there(outcome)
+    assert (tmp_path / "out/m/a.stillpath.gcode").read_text() == TEXT
+    assert (tmp_path / "out/reports/m/a.gcode/report.html").exists()
+    assert not list((tmp_path / "out/.stillpath/work").iterdir())
+
+
+def test_what_somebody_changed_stays(tmp_path):
+    with OutputFolder.opened(tmp_path) as output:
+        outcome = done(output)
+        done(output, "; other options\n")  # what we wrote ourselves may be replaced
+        (tmp_path / outcome.output).write_text("edited by hand")
+        with pytest.raises(FileExistsError, match="changed or not written by this command"):
+            done(output)
+    assert (tmp_path / outcome.output).read_text() == "edited by hand"
+
+
+def test_a_noted_failure_does_not_disown_the_result(tmp_path):
+    with OutputFolder.opened(tmp_path) as output:
+        outcome = done(output)
+        failed = Outcome(state="failed", source="a.gcode", machine="m", trouble="file")
+        output.note(outcome.output, failed)
+        assert output.recorded(outcome.output).state == "failed"
+        done(output, "; the next one\n")
+    assert (tmp_path / outcome.output).read_text() == "; the next one\n"
+
+
+def test_one_at_a_time(tmp_path):
+    with (
+        OutputFolder.opened(tmp_path),
+        pytest.raises(OSError, match="another batch or watch"),
+        OutputFolder.opened(tmp_path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("step", range(12))
+def test_killed_at_any_step(step, tmp_path, monkeypatch):
+    left = step
+    with OutputFolder.opened(tmp_path) as output:
+        done(output, "; before\n")
+
+    def count(act):
+        def counted(*arguments, **named):
+            nonlocal left
+            if left == 0:
+                raise Killed
+            left -= 1
+            return act(*arguments, **named)
+
+        return counted
+
+    was_killed = False
+    with monkeypatch.context() as patched, OutputFolder.opened(tmp_path) as output:
+        patched.setattr(Path, "replace", count(Path.replace))
+        patched.setattr(os, "fsync", count(os.fsync))
+        patched.setattr(os, "rmdir", count(os.rmdir))
+        try:
+            done(output)
+        except Killed:
+            was_killed = True
+    assert was_killed or step > 8
+    with OutputFolder.opened(tmp_path) as output:
+        record = output.recorded("m/a.stillpath.gcode")
+        assert output.is_there(record)
+        text = (tmp_path / record.output).read_text()
+        assert text in ("; before\n", TEXT)
+        report = tmp_path / record.report / "report.html"
+        assert report.read_text() == "page of " + text
+        assert not list((tmp_path / ".stillpath/work").iterdir())

@@ -1,0 +1,306 @@
+"""The command line with a pretended road: options, messages, exit codes, what is left behind."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from stillpath.cli.main import run
+from stillpath.compensation.base import DesignError
+from stillpath.gcode.errors import GcodeError
+from stillpath.pipeline.files import replacing
+from stillpath.pipeline.progress import Progress
+from stillpath.pipeline.simulate import PlannedTime
+from stillpath.version import __version__
+from tests.service.synthetic import make_result
+
+TEXT = b"G28\nG1 X10 Y10 F6000\n"
+
+
+@pytest.fixture
+def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
+    """Put a road in place that does what `road.behave` says."""
+    seen = types.SimpleNamespace(behave=lambda: None, options=None, machine=None, rate_hz=None)
+
+    def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None, **_):
+        seen.machine, seen.options = machine.name, options
+        seen.behave()
+        if progress is not None:
+            progress(Progress("compensating", 0.5, 1.0, 1.0, None))
+        target.write_bytes(b"; compensated\n" + source.read_bytes())
+        return make_result(layers=2)
+
+    def simulate_file(source, machine, *, plate=None, dialect=None, **_):
+        seen.plate, seen.dialect = plate, dialect
+        seen.behave()
+        return make_result(channels=("before", "shaper"), layers=2)
+
+    def plan_file(
+        source, target_npz, machine, *, rate_hz=1000.0, plate=None, dialect=None, progress=None
+    ):
+        seen.rate_hz, seen.plate, seen.dialect = rate_hz, plate, dialect
+        target_npz.write_bytes(b"npz")
+        return PlannedTime(12.0, "Slicer", 11.0, ["the file is for Marlin"])
+
+    module = types.ModuleType("stillpath.pipeline.compensate")
+    module.compensate_file = compensate_file
+    module.simulate_file = simulate_file
+    module.plan_file = plan_file
+    monkeypatch.setitem(sys.modules, "stillpath.pipeline.compensate", module)
+    return seen
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "part.gcode"
+    path.write_bytes(TEXT)
+    return path
+
+
+def compensate(source: Path, *more: str) -> int:
+    return run(["compensate", str(source), *more])
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    error = capsys.readouterr().err
+    assert error.startswith("stillpath: error: ")
+    assert error.count("\n") == 1
+    return error
+
+
+def test_compensate_writes_file_report_and_table(road, source, tmp_path, capsys):
+    out, report = tmp_path / "out.gcode", tmp_path / "report"
+    code = compensate(source, "-o", str(out), "-m", "ender3", "--report", str(report))
+    assert code == 0
+    assert out.read_bytes() == b"; compensated\n" + TEXT
+    assert sorted(path.name for path in report.iterdir()) == ["report.html", "report.json"]
+    assert (road.machine, road.options.method, road.options.tolerance_um) == ("ender3", "fbf", 2.0)
+    shown = capsys.readouterr().out
+    assert "contour rms, extruding" in shown
+    assert "put back" in shown
+
+
+def test_options_reach_the_road(road, source, tmp_path):
+    chosen = [
+        "--method",
+        "shaper:2hump_ei",
+        "--basis",
+        "bspline",
+        "--robust",
+        "minimax",
+        "--along",
+        ".1",
+        "--tolerance-um",
+        "2",
+        "--plate",
+        "3",
+        "--dialect",
+        "marlin",
+    ]
+    assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
+    assert road.machine == "voron-v0"
+    assert road.options.model_dump() == {
+        "method": "shaper:2hump_ei",
+        "basis": "bspline",
+        "robust": "minimax",
+        "along": 0.1,
+        "plate": 3,
+        "tolerance_um": 2.0,
+        "times": "new",
+        "dialect": "marlin",
+    }
+
+
+def test_in_place(road, source):
+    assert compensate(source, "--in-place", "-m", "ender3") == 0
+    assert source.read_bytes() == b"; compensated\n" + TEXT
+
+
+def test_a_link_is_followed(road, source, tmp_path):
+    link = tmp_path / "link.gcode"
+    link.symlink_to(source)
+    assert compensate(link, "--in-place", "-m", "ender3") == 0
+    assert link.is_symlink()
+    assert source.read_bytes().startswith(b"; compensated")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("-o {out} -m nope", ["nope", "ender3"]),
+        ("-o {out} -m {folder}/none.json", ["none.json"]),
+        ("-o {out} -m ender3 --method magic", ["magic", "shaper:zv"]),
+        ("-o {out} -m ender3 --method shaper:best", ["shaper:best"]),
+        ("-o {out} -m ender3 --basis fourier", ["--basis: must be ce-opt, ", "fourier"]),
+        (
+            "-o {out} -m ender3 --tolerance-um 0.1",
+            ["--tolerance-um: must be at least 0.5 µm (given: 0.1)"],
+        ),
+        ("-o {out} -m ender3 --tolerance-um nan", ["--tolerance-um: must be a finite number"]),
+        (
+            "-o {out} -m ender3 --tolerance-um wide",
+            ["--tolerance-um: must be a number (given: 'wide')"],
+        ),
+        ("-o {out} -m ender3 --budget-um -1", ["--budget-um: must be at least 0.5 µm (given: -1)"]),
+        ("-o {out} -m ender3 --plate 0", ["--plate: must be at least 1 (given: '0')"]),
+        ("-o {out} -m ender3 --in-place", ["either"]),
+        ("-m ender3", ["either"]),
+        ("-o {source} -m ender3", ["is the input", "--in-place"]),
+        ("-o {out}", ["machine"]),
+        ("-o {folder} -m ender3", ["folder"]),
+        ("-o {folder}/no/out.gcode -m ender3", ["does not exist"]),
+        ("-o {out} -m ender3 --report {source}", ["--report"]),
+        ("-o {out} -m ender3 --colour blue", ["colour"]),
+    ],
+)
+def test_bad_requests(road, source, tmp_path, capsys, arguments, words):
+    out = tmp_path / "out.gcode"
+    filled = arguments.format(out=out, folder=tmp_path, source=source)
+    assert compensate(source, *filled.split()) == 2
+    message = one_line(capsys)
+    for word in words:
+        assert word in message
+    assert source.read_bytes() == TEXT
+    assert sorted(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize("name", ["missing.gcode", "."])
+def test_bad_inputs(road, tmp_path, capsys, name):
+    assert compensate(tmp_path / name, "-o", str(tmp_path / "o"), "-m", "ender3") == 2
+    one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (GcodeError("X is no number", line=7, text="G1 Xnan"), 2, ["line 7", "G1 Xnan"]),
+        (DesignError("n is too large"), 2, ["n is too large"]),
+        (OSError(28, "No space left on device"), 1, ["No space left"]),
+        (MemoryError(), 1, ["memory"]),
+        (KeyboardInterrupt(), 130, ["interrupted"]),
+    ],
+)
+def test_errors_of_the_road(road, source, tmp_path, capsys, error, code, words):
+    def fail() -> None:
+        raise error
+
+    road.behave = fail
+    out = tmp_path / "out.gcode"
+    assert compensate(source, "-o", str(out), "-m", "ender3") == code
+    message = capsys.readouterr().err
+    assert "stillpath: error: " in message
+    for word in words:
+        assert word in message
+    assert not out.exists()
+
+
+def test_a_bug_is_not_dressed_up_as_a_bad_file(road, source, tmp_path):
+    def fail() -> None:
+        raise ValueError("ours")
+
+    road.behave = fail
+    with pytest.raises(ValueError, match="ours"):
+        compensate(source, "-o", str(tmp_path / "o"), "-m", "ender3")
+
+
+def test_plan_and_simulate(road, source, tmp_path, capsys):
+    motion, report = tmp_path / "motion.npz", tmp_path / "report"
+    plan = ["plan", str(source), "-m", "ender3"]
+    assert run([*plan, "-o", str(motion), "--rate", "500", "--dialect", "klipper"]) == 0
+    assert (road.rate_hz, road.dialect) == (500.0, "klipper")
+    out, err = capsys.readouterr()
+    assert "print time 12.0 s; Slicer says 11 s" in out
+    assert "warning: the file is for Marlin" in err
+    assert run([*plan, "-o", str(motion), "--dialect", "grbl"]) == 2
+    assert "--dialect: must be klipper, " in capsys.readouterr().err
+    assert run([*plan, "-o", str(source)]) == 2
+    assert source.read_bytes() == TEXT
+    assert run([*plan, "-o", str(motion), "--rate", "0"]) == 2
+    assert run(["simulate", str(source), "-m", "ender3", "--report", str(report)]) == 0
+    assert (report / "report.html").exists()
+
+
+def test_machines(capsys):
+    assert run(["machines"]) == 0
+    assert "ender3" in capsys.readouterr().out
+    assert run(["machines", "ender3"]) == 0
+    assert '"kinematics": "cartesian"' in capsys.readouterr().out
+    assert run(["machines", "nope"]) == 2
+
+
+@pytest.mark.parametrize(
+    "arguments", ["serve --host 0.0.0.0", "serve --host printer.lan", "serve --workers 0", "fly"]
+)
+def test_refusals(arguments, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path))
+    monkeypatch.setenv("STILLPATH_KEYS", "false")
+    assert run(arguments.split()) == 2
+    one_line(capsys)
+
+
+def test_help_and_version_are_quick_and_light():
+    code = (
+        "import sys; from cli.main import run; run(['--help']); run(['--version']); "
+        "sys.exit(any(name in sys.modules for name in ('numpy', 'numba', 'fastapi', 'jinja2')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert __version__ in done.stdout
+
+
+def test_a_job_loads_only_what_it_needs():
+    """Each of these costs every job a tenth of a second or more."""
+    program = (
+        "import sys, cli.main, pipeline.compensate\n"
+        "from cli.machines import open_machines\n"
+        "open_machines().for_job('ender3', files=True)\n"
+        "heavy = ('scipy.signal', 'scipy.stats', 'pydantic_settings', 'fastapi', 'sqlite3')\n"
+        "print([name for name in heavy if name in sys.modules])\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
+def test_pipes_and_devices_are_neither_read_nor_replaced(road, source, tmp_path, capsys):
+    pipe, out = tmp_path / "pipe", tmp_path / "out.gcode"
+    os.mkfifo(pipe)
+    for command in (
+        ["compensate", str(pipe), "-m", "ender3", "-o", str(out)],
+        ["simulate", str(pipe), "-m", "ender3", "--report", str(tmp_path / "report")],
+        ["compensate", str(source), "-m", "ender3", "-o", str(pipe)],
+        ["plan", str(source), "-m", "ender3", "-o", str(pipe)],
+    ):
+        assert run(command) == 2
+        assert f"{pipe} is a pipe or a device; " in one_line(capsys)
+    with pytest.raises(OSError, match="is no regular file"), replacing(pipe):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["part.gcode", "pipe"]
+
+
+def test_the_longest_name_that_a_file_can_have(tmp_path):
+    target = tmp_path / ("ü" * 124 + ".gcode")
+    with replacing(target) as temporary:
+        temporary.write_bytes(TEXT)
+    assert target.read_bytes() == TEXT
+
+
+def test_a_full_disk_is_told_with_its_place(road, source, tmp_path, capsys):
+    target = tmp_path / "out.gcode"
+
+    def full():
+        with replacing(target):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    road.behave = full
+    assert compensate(source, "-o", str(target), "-m", "ender3") == 1
+    assert f"{target}: No space left on device; make room there" in one_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]

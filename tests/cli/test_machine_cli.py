@@ -1,0 +1,389 @@
+"""`stillpath machines ...`, and jobs that name a machine of the user's store."""
+
+from __future__ import annotations
+
+import configparser
+import json
+from datetime import date, timedelta
+from pathlib import Path
+
+import pytest
+
+from stillpath.applications.machines.checks import check_before_job, differences
+from stillpath.applications.machines.klipper_config import read_printer_config
+from stillpath.applications.machines.store import MachineStore
+from stillpath.cli.main import run
+from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.store import builtin_machines
+from tests.cli.test_cli import compensate, one_line, road, source
+from tests.service.machines import make_machine, make_plants
+
+__all__ = ["road", "source"]  # fixtures
+
+CONFIG = """\
+[include mainsail.cfg]  # not for us
+[mcu]
+serial: /dev/serial/by-id/usb-Klipper_stm32
+[printer]
+kinematics: corexy
+max_velocity: 300  # mm/s
+max_accel = 4000   ; the old one was [4500]
+max_z_velocity: 15
+square_corner_velocity: 8
+[stepper_x]
+position_min: -2
+position_max: 250
+[stepper_y]
+position_max: 255
+[stepper_z]
+position_max: 240
+[Extruder]
+nozzle_diameter: 0.6
+filament_diameter: 1.75
+max_extrude_only_distance: 101
+[gcode_arcs]
+resolution: 0.1
+[gcode_macro START]
+gcode:
+  [printer]
+  max_accel: 1
+  G28
+[input_shaper]
+shaper_type_x: ei
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.
+#*#
+#*# [input_shaper]
+#*# shaper_type_x = mzv
+#*# shaper_freq_x = 61.2
+#*# shaper_type_y = 2hump_ei
+#*# shaper_freq_y = 45.0
+#*#
+#*# [extruder]
+#*# pressure_advance = 0.04
+"""
+
+
+@pytest.fixture(autouse=True)
+def store(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path_factory.mktemp("data")
+    monkeypatch.setenv("STILLPATH_DATA_DIR", str(folder))
+    return MachineStore(folder / "machines")
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "printer.cfg"
+    path.write_text(CONFIG)
+    return path
+
+
+def machines(*arguments: object) -> int:
+    return run(["machines", *map(str, arguments)])
+
+
+def test_the_old_form_still_works(capsys):
+    assert machines() == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in builtin_machines())
+    assert machines("ender3") == 0
+    document = capsys.readouterr().out
+    assert Machine.model_validate_json(document).name == "ender3"
+    assert machines("show", "ender3") == 0
+    assert capsys.readouterr().out == document
+    assert machines("histroy", "ender3") == 2
+    assert "'history'" in one_line(capsys)
+    assert machines("nope") == 2
+    assert "nope" in one_line(capsys)
+
+
+def test_a_machine_through_its_life(store: MachineStore, tmp_path: Path, capsys):
+    file = tmp_path / "m.json"
+    file.write_text(make_machine().model_dump_json())
+    assert machines("import", file, "--by", "anna") == 0
+    file.write_text(make_machine(mesh_slope=0.02).model_dump_json())
+    assert machines("put", file, "--by", "anna", "-M", "mesh") == 0
+    assert machines("rollback", "mine", 1, "--by", "bob") == 0
+    assert machines("approve", "mine", "--revision", 2, "--by", "carl") == 0
+    capsys.readouterr()
+    assert machines("history", "mine") == 0
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("anna", "bob", "carl", "mesh", "60.0", "50.0"))
+    assert machines("diff", "mine", 1, 2) == 0
+    assert capsys.readouterr().out == "mesh_slope: 0 -> 0.02\n"
+    assert machines("diff", "mine", 1, 3) == 0
+    assert capsys.readouterr().out == "no difference\n"
+    assert machines("show", "mine", "--revision", 2) == 0
+    assert json.loads(capsys.readouterr().out)["mesh_slope"] == 0.02
+    assert machines() == 0
+    assert "mine" in capsys.readouterr().out
+    assert machines("delete", "mine") == 0
+    assert machines("restore", "mine") == 0
+    assert store.current("mine").number == 3
+    assert store.current("mine").restored == 1
+
+
+def test_export_and_import(store: MachineStore, tmp_path: Path, capsys):
+    store.add_revision("mine", make_machine(), author="anna")
+    store.add_revision("mine", make_machine(mesh_slope=0.02), author="anna")
+    document, old, history = (tmp_path / name for name in ("d.json", "o.json", "h.json"))
+    assert machines("export", "mine", "-o", document) == 0
+    assert machines("export", "mine", "-o", old, "--revision", 1) == 0
+    assert machines("export", "mine", "-o", history, "--history") == 0
+    assert Machine.model_validate_json(document.read_text()).mesh_slope == 0.02
+    assert Machine.model_validate_json(old.read_text()).mesh_slope == 0.0
+    assert machines("import", history) == 2
+    assert "--as" in one_line(capsys)
+    assert machines("import", history, "--as", "copy") == 0
+    assert machines("import", document, "--as", "ender3") == 2
+    assert "built-in" in one_line(capsys)
+    before = store.history("mine")
+    assert machines("delete", "mine") == 0
+    assert machines("import", history) == 0
+    assert store.history("mine") == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("history nope", "nope"),
+        ("diff mine 1 2", "mine"),
+        ("approve ender3", "ender3"),
+        ("import {folder}/none.json", "none.json"),
+        ("put {folder}/none.json", "none.json"),
+        ("from-config {folder}/none.cfg --name ../x", "none.cfg"),
+        ("export nope -o {folder}/x.json", "nope"),
+        ("export ender3 -o {folder}/x.json --history --revision 1", "either"),
+        ("check ender3 --printer-cfg {folder}/none.cfg", "none.cfg"),
+        ("from-config {folder}/none.cfg --name mine", "none.cfg"),
+    ],
+)
+def test_refusals(store: MachineStore, tmp_path: Path, capsys, arguments: str, words: str):
+    assert machines(*arguments.format(folder=tmp_path).split()) == 2
+    assert words in one_line(capsys)
+    assert list(tmp_path.iterdir()) == []
+    assert store.names() == []
+
+
+@pytest.mark.parametrize(
+    ("by", "message", "field"),
+    [("", "", "author"), ("a\x1b[31m", "", "author"), ("anna", "x" * 2001, "message")],
+)
+def test_who_and_why_are_text(store: MachineStore, tmp_path: Path, capsys, by, message, field):
+    file = tmp_path / "m.json"
+    file.write_text(make_machine().model_dump_json())
+    assert machines("import", file, "--by", by, "-M", message) == 2
+    assert field in one_line(capsys)
+    assert machines("import", file) == 0
+    assert machines("approve", "mine", "--by", by, "-M", message) == 2
+    assert field in one_line(capsys)
+    assert store.approvals("mine") == {}
+
+
+def test_bad_settings_are_refused(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setenv("STILLPATH_REQUIRE_APPROVAL", "perhaps")
+    assert machines("ender3") == 2
+    assert "STILLPATH_REQUIRE_APPROVAL: must be true or false" in one_line(capsys)
+
+
+# Klipper's configuration
+
+
+def test_what_a_printer_cfg_says(config: Path):
+    found = read_printer_config(config)
+    assert found.includes == ("mainsail.cfg",)
+    assert found.number("printer", "max_accel") == 4000.0  # the macro's text is none
+    assert found.text("input_shaper", "shaper_type_x") == "ei"  # the file's own wins
+    assert found.number("input_shaper", "shaper_freq_x") == 61.2
+    assert found.sections["printer"]["max_velocity"].line == 6
+
+
+def test_indentation_counts_as_in_configparser(tmp_path: Path):
+    file = tmp_path / "printer.cfg"
+    file.write_text(
+        "[printer]\n  max_velocity: 300\n\n  max_accel: 4000\n[gcode_macro A]\ngcode:\n\n"
+        "  [printer]\n  max_accel: 1\n[extruder]\n\tnozzle_diameter: 0.6\n"
+    )
+    found = read_printer_config(file)
+    theirs = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";", "#"))
+    theirs.read(file)
+    for section in ("printer", "extruder"):
+        options = {name: option.value for name, option in found.sections[section].items()}
+        assert options == dict(theirs[section])
+
+
+def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys):
+    assert machines("from-config", config, "--name", "mine", "--title", "My Voron") == 0
+    assert "note: [include mainsail.cfg] in printer.cfg: not followed" in capsys.readouterr().out
+    machine = store.current("mine").machine
+    assert (machine.title, machine.kinematics) == ("My Voron", "corexy")
+    planner, extruder = machine.firmware.planner, machine.firmware.extruder
+    assert (planner.max_velocity_mm_s, planner.max_accel_mm_s2) == (300.0, 4000.0)
+    assert (planner.max_z_velocity_mm_s, planner.max_z_accel_mm_s2) == (15.0, 4000.0)
+    assert (planner.square_corner_velocity_mm_s, planner.minimum_cruise_ratio) == (8.0, 0.5)
+    assert (machine.travel["x"].min_mm, machine.travel["x"].max_mm) == (-2.0, 250.0)
+    # Klipper's own defaults: 4 d^2, and that over the filament's 2.405 mm^2 times the limits.
+    assert extruder.max_extrude_cross_section_mm2 == pytest.approx(1.44)
+    assert extruder.max_extrude_only_velocity_mm_s == pytest.approx(300 * 1.44 / 2.40528, rel=1e-5)
+    assert extruder.max_extrude_only_accel_mm_s2 == pytest.approx(4000 * 1.44 / 2.40528, rel=1e-5)
+    assert machine.pressure_advance_s == 0.04
+    assert machine.firmware.arc_resolution_mm == 0.1
+    shaper = machine.firmware.shaper
+    assert shaper is not None
+    assert (shaper.type_x, shaper.freq_x_hz, shaper.type_y) == ("ei", 61.2, "2hump_ei")
+    plants = machine.axes["x"]
+    assert plants.provenance is not None
+    assert plants.provenance.kind == "typed in"
+    assert plants.nominal.modes[0].f_hz == 61.2  # type: ignore[union-attr]
+    assert len(plants.weighted_members()) == 15
+    # What it was made from says nothing else; a second machine of that name is refused.
+    assert differences(machine, read_printer_config(config)) == []
+    assert machines("from-config", config, "--name", "mine") == 2
+    assert "already" in one_line(capsys)
+
+
+def test_what_the_motors_bear_is_derived_from_their_limits(store: MachineStore, config: Path):
+    assert machines("from-config", config, "--name", "slow") == 0
+    slow = CommandLimits(velocity_mm_s=1.2 * 300, accel_mm_s2=1.5 * 4000, speed_step_mm_s=45.0)
+    assert store.current("slow").machine.command == slow
+    fast = CONFIG.replace("max_velocity: 300", "max_velocity: 600")
+    config.write_text(fast.replace("max_accel = 4000", "max_accel = 30000"))
+    assert machines("from-config", config, "--name", "fast") == 0
+    command = store.current("fast").machine.command
+    assert command.velocity_mm_s == pytest.approx(1.2 * 600)
+    assert command.accel_mm_s2 == pytest.approx(1.5 * 30_000)
+
+
+def test_typed_in_resonances(store: MachineStore, config: Path):
+    arguments = ["--name", "mine", "--fx", 70, "--fy", 55, "--zeta", 0.1]
+    assert machines("from-config", config, *arguments) == 0
+    axes = store.current("mine").machine.axes
+    modes = [axes[axis].nominal.modes[0] for axis in ("x", "y")]  # type: ignore[index,union-attr]
+    assert [(mode.f_hz, mode.zeta) for mode in modes] == [(70.0, 0.1), (55.0, 0.1)]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("max_velocity: 300", "max_velocity: fast", ["line 6", "max_velocity", "fast"]),
+        ("max_velocity: 300", "max_velocity: nan", ["line 6", "max_velocity"]),
+        ("max_accel = 4000", "", ["[printer] lacks max_accel", "mainsail.cfg", "not followed"]),
+        ("kinematics: corexy", "kinematics: delta", ["kinematics", "delta", "corexy"]),
+        ("[stepper_z]", "[stepper_q]", ["travel", "z"]),
+        ("position_max: 250", "position_max: -9", ["travel", "-2.0", "-9.0"]),
+    ],
+)
+def test_bad_configurations(store: MachineStore, config: Path, capsys, old, new, words):
+    config.write_text(CONFIG.replace(old, new))
+    assert machines("from-config", config, "--name", "mine") == 2
+    message = one_line(capsys)
+    assert all(word in message for word in ["printer.cfg", *words])
+    assert store.names() == []
+
+
+@pytest.mark.parametrize("content", [b"", b"G28\nG1 X1\n", b"\x00\xff" * 999])
+def test_what_is_no_configuration(tmp_path: Path, capsys, content: bytes):
+    file = tmp_path / "printer.cfg"
+    file.write_bytes(content)
+    assert machines("from-config", file, "--name", "mine") == 2
+    assert "no [section]" in one_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        ("max_accel = 4000", "max_accel = 5000", "[printer] max_accel: the printer has 5000, the"),
+        ("advance = 0.04", "advance = 0.05", "[extruder] pressure_advance: the printer has 0.05"),
+        ("freq_x = 61.2", "freq_x = 58", "[input_shaper] shaper_freq_x: the printer has 58, the"),
+        ("type_x: ei", "type_x: zv", "[input_shaper] shaper_type_x: the printer has zv, the mach"),
+        ("kinematics: corexy", "kinematics: cartesian", "[printer] kinematics: the printer has c"),
+        ("max_accel = 4000", "max_accel = 4000\nmax_accel_to_decel: 1000", "has 0.75, the machin"),
+        ("[gcode_arcs]", "[firmware_retraction]\n[x]", "[firmware_retraction] retract_length: t"),
+    ],
+)
+def test_changes_of_the_printer_are_found(config: Path, capsys, old: str, new: str, line: str):
+    config.write_text(CONFIG.replace("[include mainsail.cfg]", ""))
+    machines("from-config", config, "--name", "mine")
+    config.write_text(config.read_text().replace(old, new))
+    capsys.readouterr()
+    assert machines("check", "mine", "--printer-cfg", config) == 2
+    found = capsys.readouterr().out
+    assert line in found
+    assert "put " in found
+
+
+def test_a_section_that_is_gone_is_a_change(config: Path, capsys):
+    config.write_text(CONFIG.replace("[include mainsail.cfg]", ""))
+    machines("from-config", config, "--name", "mine")
+    config.write_text(config.read_text().split("[input_shaper]")[0])
+    capsys.readouterr()
+    machines("check", "mine", "--printer-cfg", config)
+    assert "[input_shaper]: the printer has none, the machine type_x ei" in capsys.readouterr().out
+
+
+def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
+    fresh = make_plants(on=date.today())
+    config.write_text(CONFIG.replace("[include mainsail.cfg]", ""))
+    machines("from-config", config, "--name", "mine")
+    store.update_axis("mine", {"x": fresh, "y": fresh}, author="anna")
+    capsys.readouterr()
+    assert machines("check", "mine", "--printer-cfg", config) == 0
+    assert capsys.readouterr().out == "mine: nothing speaks against it\n"
+    config.write_text(CONFIG)  # what is included was not looked at: said, but no difference
+    assert machines("check", "mine", "--printer-cfg", config) == 0
+    assert "note: [include mainsail.cfg]" in capsys.readouterr().out
+    capsys.readouterr()
+    # A note for machines whose command is no such multiple, and no difference.
+    assert machines("check", "generic-corexy") == 0
+    assert "note: generic-corexy: a command may ask the motors for 20000" in capsys.readouterr().out
+    # Somebody else's printer, and years ago.
+    assert machines("check", "ender3") == 2
+
+
+def test_the_age_of_a_measurement():
+    from datetime import UTC, datetime
+
+    now = datetime(2026, 11, 21, tzinfo=UTC)
+
+    def warnings(days: int, limit: float = 180.0) -> list[str]:
+        plants = make_plants(on=now.date() - timedelta(days=days))
+        machine = make_machine(axes={"x": plants, "y": make_plants(on=now.date())})
+        return check_before_job(machine, now, max_age_days=limit)
+
+    assert warnings(180) == []
+    (line,) = warnings(181)
+    assert line.startswith("axis x of mine: measured on 2026-05-24, 181 days ago (limit 180")
+    assert warnings(181, 200.0) == []
+
+
+# Jobs
+
+
+def test_a_job_uses_the_users_machine_and_hears_of_its_age(
+    store: MachineStore, road, source, tmp_path, capsys, monkeypatch
+):
+    old = make_plants(on=date(2020, 1, 31))
+    store.add_revision("mine", make_machine(axes={"x": old, "y": old}), author="anna")
+    out, report = tmp_path / "out.gcode", tmp_path / "report"
+    assert compensate(source, "-o", str(out), "-m", "mine", "--report", str(report)) == 0
+    assert road.machine == "mine"
+    assert "warning: axis x of mine: measured on 2020-01-31" in capsys.readouterr().out
+    written = json.loads((report / "report.json").read_text())["warnings"]
+    assert any("measured on 2020-01-31" in warning for warning in written)
+    monkeypatch.setenv("STILLPATH_MEASUREMENT_MAX_AGE_DAYS", "1e6")
+    assert compensate(source, "-o", str(out), "-m", "mine") == 0
+    assert "measured on" not in capsys.readouterr().out
+
+
+def test_a_job_needs_an_approved_machine_where_that_is_switched_on(
+    store: MachineStore, road, source, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("STILLPATH_REQUIRE_APPROVAL", "true")
+    store.add_revision("mine", make_machine(), author="anna")
+    out = tmp_path / "out.gcode"
+    assert compensate(source, "-o", str(out), "-m", "mine") == 2
+    assert "stillpath machines approve mine --revision 1" in one_line(capsys)
+    assert not out.exists()
+    assert machines("approve", "mine") == 0
+    assert compensate(source, "-o", str(out), "-m", "mine") == 0
+    assert compensate(source, "-o", str(out), "-m", "ender3") == 0

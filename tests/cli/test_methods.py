@@ -1,0 +1,85 @@
+"""The methods stand in several places that must not import one another; here they are compared."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from stillpath.cli.arguments import METHODS
+from stillpath.cli.post import Refused, compensate_in_place
+from stillpath.compensation.registry import COMPENSATORS
+from stillpath.pipeline.options import MethodName, Options
+from stillpath.service.api.schemas import JobQuery
+
+ROOT = Path(__file__).parents[2]
+ALL = {*COMPENSATORS, "none", "advise"}
+
+
+def literal(path: str, name: str) -> Any:
+    """Return what a module assigns to a name, without running it."""
+    for node in ast.parse((ROOT / path).read_text()).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            return ast.literal_eval(node.value)
+    raise LookupError(name)
+
+
+def test_options_take_every_compensator_and_nothing_else():
+    method: TypeAdapter[str] = TypeAdapter(MethodName)
+    for name in COMPENSATORS:
+        assert method.validate_python(name) == name
+        assert method.validate_python(f"{name}+ripple") == f"{name}+ripple"
+    for name in ("none", "none+ripple", "advise"):
+        assert method.validate_python(name) == name
+    for wrong in (
+        "",
+        "magic",
+        "fbf+",
+        "fbf\n",
+        "advise+ripple",
+        "shaper:",
+        "FBF",
+        "fbf+ripple+ripple",
+    ):
+        with pytest.raises(ValidationError, match="no such method, but fbf"):
+            Options(method=wrong)
+
+
+def test_what_slicers_call_says_which_option_is_wrong(tmp_path: Path):
+    options = {"machine": "ender3", "budget_um": -1.0}
+    with pytest.raises(Refused, match=r"^--budget-um: must be at least 0\.5 µm \(given: -1\)$"):
+        compensate_in_place(tmp_path / "part.gcode", options, name="part", tell=print)
+
+
+def test_the_help_names_them_all():
+    listed = re.split(r"; any with", METHODS)[0]
+    assert {*listed.split(", "), "advise"} == ALL
+    assert "or advise: " in METHODS
+
+
+def test_the_api_names_them_all():
+    description = str(JobQuery.model_fields["method"].description)
+    named = set(re.findall(r"`([a-z-]+)`", description))
+    shapers = re.search(r"`shaper:NAME` \(([^)]+)\)", description)
+    assert shapers is not None
+    assert named | {f"shaper:{name}" for name in shapers[1].split(", ")} == ALL
+
+
+def test_the_page_offers_them_all():
+    script = (ROOT / "service/web/views/new-job.js").read_text()
+    block = script.split("const METHODS = [", 1)[1].split("];\n", 1)[0]
+    assert set(re.findall(r'\["([^"]+)", "', block)) == ALL
+
+
+def test_cura_offers_them_all():
+    assert set(literal("integrations/cura/Stillpath.py", "_SETTINGS")["method"]["options"]) == ALL
+
+
+def test_octoprint_offers_all_that_change_a_file():
+    offered = literal("integrations/octoprint/octoprint_stillpath/choices.py", "METHODS")
+    assert {name for name, _ in offered} == ALL - {"none"}

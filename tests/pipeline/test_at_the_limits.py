@@ -1,0 +1,113 @@
+"""Prints that go right to the limits of the machine are compensated, not put back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.gcode.firmware.registry import kit
+from stillpath.models.firmware import RepRapFirmware
+from stillpath.models.firmware.reprapfirmware import Drive
+from stillpath.models.machine import AxisTravel, CommandLimits, Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import PieceCompensator, deviation
+from tests.gcode.cutting import HEAD, pieces_of
+
+
+@pytest.mark.parametrize("edge_mm", [100.0, 100.0006])
+def test_a_wall_on_the_edge_of_the_bed(edge_mm: float) -> None:
+    """The path and its command lie on the edge; neither tolerance nor rounding may leave it."""
+    machine = load_machine("ender3")
+    edges = AxisTravel(min_mm=0.0, max_mm=edge_mm)
+    machine = machine.model_copy(update={"travel": machine.travel | {"x": edges}})
+    wall = f"G1 X{edge_mm} Y60 E2 F6000\nG1 Y90 E2\nG1 X60 E2\n"
+    piece = pieces_of(HEAD + wall, machine)[-1]
+    made = PieceCompensator(machine, Options()).compensate(piece)
+    assert edge_mm - 1e-3 < made.encoded.position[:, 0].max() / 1e6 <= edge_mm
+
+
+def test_a_diagonal_near_the_command_s_speed() -> None:
+    """X and Y each keep the command's limit; the firmware may not limit the way they make."""
+    machine = fast(load_machine("voron-v0"), 150.0)
+    moves = "G1 X100 Y90 F8400\nG1 X60 Y50\nG1 X105 Y95 E1 F8400\nG1 X60 Y50 E1\n"
+    piece = pieces_of(HEAD + moves, machine)[-1]
+    made = PieceCompensator(machine, Options()).compensate(piece)
+    speed = made.encoded.phases.cruise_mm_s
+    assert speed.max() > 150.0
+    assert speed.max() < kit(machine).stream_limits(kit(machine).initial_limits()).as_row()[0]
+    end_s = made.segments.end_s[-1]
+    assert made.encoded.phases.duration_s == pytest.approx(end_s, abs=2e-3)
+
+
+def test_a_vase_on_a_machine_with_a_slow_z() -> None:
+    """Z's acceleration holds for X and Y as well where they climb: evenly, no vertex is late."""
+    machine = load_machine("voron-v0")
+    planner = machine.firmware.planner.model_copy(update={"max_z_accel_mm_s2": 100.0})
+    firmware = machine.firmware.model_copy(update={"planner": planner})
+    machine = machine.model_copy(update={"firmware": firmware})
+    angle = 2 * np.pi * np.arange(49) / 12
+    places = zip(
+        60 + 20 * np.cos(angle), 50 + 20 * np.sin(angle), 5 + 0.016 * np.arange(49), strict=True
+    )
+    wall = [f"G1 X{x:.3f} Y{y:.3f} Z{z:.4f} E0.3 F4800" for x, y, z in places]
+    piece = pieces_of(HEAD + "G1 X80\n" + "\n".join(wall) + "\n", machine)[-1]
+    made = PieceCompensator(machine, Options()).compensate(piece)
+    assert deviation(made, made.encoded.phases)[made.extruding].max() < 15e-3
+
+
+def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far() -> None:
+    """20 m/s2 of X and of Y are 40 m/s2 for a motor, 40 mm/s in a segment of 1 ms."""
+    ring = "G1 X60 Y84.6 E1.1\nG1 X35.4 Y60 E1.1\nG1 X60 Y35.4 E1.1\nG1 X84.6 Y60 E1.1\n"
+    text = f"{HEAD}SET_VELOCITY_LIMIT ACCEL=12000\nG1 X84.6 F24000\n{ring}"
+    bends_mm = []
+    for step_mm_s in (100.0, 30.0):
+        command = CommandLimits(accel_mm_s2=20_000.0, speed_step_mm_s=step_mm_s)
+        changes = {"kinematics": "corexy", "command": command}
+        machine = load_machine("ender3").model_copy(update=changes)
+        piece = pieces_of(text, machine)[-1]
+        work = PieceCompensator(machine, Options())
+        work.compensator.reset(piece.phases.start_mm[0, :2])
+        made = work.compensate(piece)
+        phases = made.encoded.phases
+        speed = phases.direction[:, :2] * phases.cruise_mm_s[:, None]
+        motors = speed @ np.array([[1.0, 1.0], [1.0, -1.0]])
+        assert np.max(np.abs(np.diff(motors, axis=0))) <= step_mm_s
+        bends_mm.append(made.bend_mm)
+    assert bends_mm[1] <= bends_mm[0] <= 20.4e-3
+    assert bends_mm[1] <= 16e-3 * 1.001
+
+
+def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
+    """Moves that keep their own lines because Z could not follow are no secret."""
+    machine = load_machine("voron-v0")
+    wall = "".join(f"G1 X{60 + 20 * (i % 2)} Z{6 + i} E1 F1200\n" for i in range(20))
+    source = tmp_path / "climb.gcode"
+    source.write_text(HEAD + wall)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert result.put_back == []
+    assert any("climb faster than Z can follow" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize(("steps_per_mm", "told"), [(25.0, True), (400.0, False)])
+def test_where_the_shaper_would_serve_better_it_is_said(
+    steps_per_mm: float, told: bool, tmp_path: Path
+) -> None:
+    """Vertices on steps of .04 mm shake the printer more than the file as it came: that stays."""
+    drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
+    own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
+    machine = load_machine("annex-k3").model_copy(update={"firmware": own})
+    source = tmp_path / "ring.gcode"
+    ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
+    source.write_text(HEAD + "G1 F6000\n" + 4 * ring)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert ["as it came" in one.reason for one in result.put_back] == [True] * told
+    assert any("shaper would serve this file better" in w for w in result.warnings) is told
+
+
+def fast(machine: Machine, speed_mm_s: float) -> Machine:
+    """The machine with another highest speed of the command."""
+    return machine.model_copy(update={"command": CommandLimits(velocity_mm_s=speed_mm_s)})

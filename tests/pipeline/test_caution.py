@@ -1,0 +1,113 @@
+"""How much of the compensation a machine's set bears."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.compensation.registry import compensator
+from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.machine import Machine
+from stillpath.models.plants import (
+    PlantSetSpec,
+    RelativeMode,
+    RelativeModesSpec,
+    WeightedMember,
+    plant_set,
+)
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import load_machine
+from stillpath.pipeline.caution import (
+    caution_for,
+    choose_caution,
+    design_mode,
+    prediction_note,
+)
+from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
+from stillpath.pipeline.options import Options
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
+
+DT_S = 1e-3
+NO_RESTS = np.zeros((0, 2), np.int64)
+
+
+def one_mode(f_hz: float) -> RelativeModesSpec:
+    return RelativeModesSpec(modes=(RelativeMode(f_hz=f_hz, zeta=0.06, share=1.0),))
+
+
+def machine_of(*frequencies_hz: float) -> Machine:
+    """A machine whose axes may have any of these resonances, the first the nominal one."""
+    plants = PlantSetSpec(
+        nominal=one_mode(frequencies_hz[0]),
+        members=tuple(WeightedMember(plant=one_mode(f)) for f in frequencies_hz),
+        band_hz=(8.0, 130.0),
+    )
+    return load_machine("generic-corexy").model_copy(update={"axes": {"x": plants, "y": plants}})
+
+
+def shaper(f_hz: float) -> BestShaper:
+    return BestShaper("mzv", f_hz, f_hz, 0.1, 0.0, 0.0)
+
+
+def contour_um(machine: Machine, command: np.ndarray, member: int) -> float:
+    """Contour error of a member, by another road than the choice's."""
+    path, extruding = reference_motion(DT_S)
+    plants = [plant_set(machine.axes[a], DT_S).members[member] for a in ("x", "y")]  # type: ignore[index]
+    error = contour_error(path, response(plants, command), DT_S)
+    return float(1e3 * np.sqrt(np.mean(error[extruding] ** 2)))
+
+
+def test_a_wide_set_asks_for_more_of_the_shaper(tmp_path: Path) -> None:
+    narrow, wide = (
+        choose_caution(machine_of(*f), shaper(45.0), tmp_path, DT_S)[1]
+        for f in ((45.0, 44.5, 45.5), (45.0, 25.0, 90.0))
+    )
+    assert min(narrow.shares) > max(wide.shares)
+    # Where the plants leave little error, straight segments must not be the larger one.
+    assert narrow.rms_um < wide.rms_um
+    assert narrow.fit_share == 0.5
+    assert wide.fit_share == 1.0
+    assert narrow.mean < wide.mean <= wide.worst
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+def test_no_member_fares_worse_than_with_the_shaper(name: str, tmp_path: Path) -> None:
+    """The promise, member by member, measured without the code that made the choice."""
+    machine = load_machine(name)
+    best = cached_shaper(machine, tmp_path)
+    options = Options()
+    assert design_mode(machine, options) == "ensemble"
+    chosen = caution_for(machine, options, best, tmp_path, DT_S)
+    assert chosen is not None
+    caution, choice = chosen
+    assert f"({choice.worst:.2f} on the worst of them)" in prediction_note(machine, choice)
+    path, extruding = reference_motion(DT_S)
+    ours = compensator("fbf", machine, DT_S, robust="ensemble", caution=caution)
+    ours.reset(path[:, 0])
+    smooth = ShaperCompensator(machine, DT_S, shaper=best.type, fx_hz=best.fx_hz, fy_hz=best.fy_hz)
+    commands = [one.compensate(path, extruding, NO_RESTS) for one in (ours, smooth)]
+    for member in range(len(machine.axes["x"].weighted_members())):
+        a, b = (contour_um(machine, command, member) for command in commands)
+        assert a <= b
+        assert a < contour_um(machine, path, member)
+
+
+def test_chosen_once(tmp_path: Path) -> None:
+    machine = machine_of(45.0, 40.0)
+    first = choose_caution(machine, shaper(45.0), tmp_path, DT_S)
+    (kept,) = tmp_path.iterdir()
+    assert choose_caution(machine, shaper(45.0), tmp_path, DT_S) == first
+    kept.write_text("{ half")
+    assert choose_caution(machine, shaper(45.0), tmp_path, DT_S) == first
+
+
+def test_nobody_is_cautious_without_a_measured_set(tmp_path: Path) -> None:
+    machine = load_machine("generic-corexy")
+    assert design_mode(machine, Options()) == "off"
+    for options in (Options(), Options(robust="off"), Options(method="shaper:mzv")):
+        assert caution_for(machine, options, shaper(45.0), tmp_path, DT_S) is None
+    measured = machine_of(45.0, 40.0)
+    assert caution_for(measured, Options(robust="minimax"), shaper(45.0), tmp_path, DT_S) is None

@@ -1,0 +1,81 @@
+"""Small files that would print for months: refused on every road, before anything is computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.progress import Progress, ProgressCallback
+from tests.gcode.cutting import HEAD
+
+MOVES = "G1 X120 E1 F6000\nG1 X60 E1\n"
+FILES = {
+    "dwell": (HEAD + MOVES + "G4 P4000000000\n" + MOVES, "the print takes .* more than 1000 h"),
+    "dwells": (HEAD + "G4 P60000000\n" * 61 + MOVES, "line .*the print takes .* more than 1000 h"),
+    "move": (
+        HEAD + MOVES + "SET_VELOCITY_LIMIT VELOCITY=1e-9\nG1 X80\n",
+        "line 10: the move takes .* more than 20 min; correct its F",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(FILES))
+@pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
+def test_refused(tmp_path: Path, cache: Path, name: str, road: str) -> None:
+    text, message = FILES[name]
+    source, target = tmp_path / "in.gcode", tmp_path / "out"
+    source.write_text(text)
+    with pytest.raises(GcodeError, match=message):
+        go(road, source, target, cache)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
+
+
+def go(
+    road: str, source: Path, target: Path, cache: Path, progress: ProgressCallback | None = None
+) -> None:
+    machine = load_machine("ender3")
+    if road == "plan":
+        plan_file(source, target, machine, rate_hz=1.0, progress=progress)
+    elif road == "simulate":
+        simulate_file(source, machine, cache_dir=cache, progress=progress)
+    else:
+        options = Options(method=road)
+        compensate_file(source, target, machine, options, cache_dir=cache, progress=progress)
+
+
+@pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
+def test_refused_before_it_is_computed(tmp_path: Path, cache: Path, road: str) -> None:
+    """What makes the print endless stands behind two long days of it: the file is read to its end
+    before hours are spent on its beginning."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out"
+    days = "G4 P180000000\n"  # cheap ones
+    source.write_text(HEAD + MOVES + days + MOVES * 8000 + "G4 P3600000000\n" + MOVES)
+    told: list[Progress] = []
+    with pytest.raises(GcodeError, match=r"line 16012: .* takes 1052\.76 h, more than 1000 h"):
+        go(road, source, target, cache, told.append)
+    assert all(report.print_seconds < 60.0 for report in told)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def test_long_stands_cost_no_figures(tmp_path: Path, cache: Path) -> None:
+    """Forty hours of dwells: the time is told, the figures are those of short ones."""
+    source, machine = tmp_path / "in.gcode", load_machine("ender3")
+    found = []
+    for dwell_ms in (3_000, 20 * 3_600_000):
+        source.write_text(HEAD + (MOVES + f"G4 P{dwell_ms}\n") * 2 + MOVES)
+        found.append(simulate_file(source, machine, cache_dir=cache))
+    short, long = found
+    assert long.time_s - short.time_s == pytest.approx(2 * (20 * 3600 - 3))
+    for one, other in zip(long.channels, short.channels, strict=True):
+        assert one.all_motion.model_dump() == pytest.approx(other.all_motion.model_dump(), rel=1e-6)

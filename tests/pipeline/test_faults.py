@@ -1,0 +1,51 @@
+"""Pieces that cannot be compensated stay as they came, and the rest of the file is printed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import PieceCompensator
+from tests.pipeline.test_compensate import check_file
+
+HEAD = "G28\nM83\nG90\nG1 X50 Y50 Z0.2 F6000\n"
+SQUARE = "G1 X90 E1 F3000\nG1 Y90 E1\nG1 X50 E1\nG1 Y50 E1\n"
+TINY = "G1 X50.0001 Y50.0001 E.00001\nG1 X50.0002 E.00001\nG1 X50 Y50 E.00001\n"
+STOP = "M400\nG4 P10\n"
+
+
+def test_a_fault_of_ours_costs_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, calls = PieceCompensator.compensate, []
+
+    def faulty(self: PieceCompensator, *given: object) -> object:
+        calls.append(given)
+        if len(calls) == 2:
+            raise IndexError("index 3 is out of bounds")
+        return whole(self, *given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(PieceCompensator, "compensate", faulty)
+    data = (HEAD + 3 * (SQUARE + STOP)).encode()
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(data)
+    machine = load_machine("ender3")
+    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+    (fault,) = result.put_back
+    assert "internal error (IndexError: index 3 is out of bounds)" in fault.reason
+    assert fault.reason.startswith(f"line {fault.line_first}:")
+    assert len(calls) > 2
+    check_file(data, target.read_bytes(), machine)
+
+
+@pytest.mark.parametrize("name", ["ender3", "generic-corexy"])
+def test_moves_below_the_grid_of_a_file(name: str, tmp_path: Path) -> None:
+    data = (HEAD + SQUARE + STOP + TINY + STOP + SQUARE).encode()
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(data)
+    machine = load_machine(name)
+    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+    assert all("internal error" not in piece.reason for piece in result.put_back)
+    check_file(data, target.read_bytes(), machine)

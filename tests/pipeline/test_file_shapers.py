@@ -1,0 +1,144 @@
+"""Files that set the firmware's own shaper: it never works on top of compensation in silence."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
+from tests.gcode.prints import polygon
+
+EXAMPLES = Path(__file__).parents[3] / "examples" / "firmware"
+HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\n"
+PART = "\n".join(polygon(6, 15)) + "\n"
+BEHIND = "G1 E-1 F2100\nG28 X\nG1 X60 Y60 F6000\n"
+
+pytestmark = pytest.mark.slow
+
+# A line that sets the firmware's shaper, and what leaves it on and off.
+SETS = {
+    "klipper": "SET_INPUT_SHAPER SHAPER_FREQ_X=45 SHAPER_FREQ_Y=40 SHAPER_TYPE=ei",
+    "marlin": "M593 F42 D0.1",
+    "reprapfirmware": 'M593 P"zvd" F42',
+}
+ON = {
+    "klipper": re.compile(r"SET_INPUT_SHAPER .*FREQ_X=(?!0\b)"),
+    "marlin": re.compile(r"M593 .*F(?!0\b)"),
+    "reprapfirmware": re.compile(r'M593 P"zvd"'),
+}
+OFF = {
+    "klipper": re.compile(r"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0$"),
+    "marlin": re.compile(r"M593 F0$"),
+    "reprapfirmware": re.compile(r'M593 P"none"$'),
+}
+
+
+def machine_with(kind: str, **firmware: object) -> Machine:
+    document = load_machine("ender3").model_dump(mode="json")
+    if kind == "klipper":
+        return Machine.model_validate(document)
+    section = json.loads((EXAMPLES / f"{kind}.json").read_text()) | firmware
+    return Machine.model_validate(document | {"firmware": section})
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def tuned_for(machine: Machine, cache: Path) -> None:
+    """Let a machine of the same plants have the same best shaper: tuning takes its seconds."""
+    best = cached_shaper(load_machine("ender3"), cache)
+    name = f"shaper-{machine.revision}-1000us-v1.json"
+    (cache / name).write_text(json.dumps(asdict(best)))
+
+
+def compensated(text: str, machine: Machine, folder: Path, cache: Path) -> tuple[Result, list[str]]:
+    source, target = folder / "in.gcode", folder / "out.gcode"
+    source.write_text(text)
+    options = Options(method="zpetc")
+    tuned_for(machine, cache)
+    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    return result, target.read_text().splitlines()
+
+
+def moves_by_shaper(lines: list[str], kind: str) -> tuple[set[tuple[str, str]], str]:
+    """Return under which shaper moves of a stream, and of the file, are made; and the last one."""
+    shaper, place = "untouched", "file"
+    found = set()
+    for line in lines:
+        if ON[kind].match(line):
+            shaper = "on"
+        elif OFF[kind].match(line):
+            shaper = "off"
+        elif line.startswith("; stillpath: stream "):
+            place = "stream" if line.endswith("on") else "file"
+        elif re.match(r"G1 .*X", line):
+            found.add((place, shaper))
+    return found, shaper
+
+
+@pytest.mark.parametrize("kind", SETS)
+@pytest.mark.parametrize("place", ["start code", "in the middle"])
+def test_it_is_off_in_stretches_and_on_around_them(
+    kind: str, place: str, tmp_path: Path, cache: Path
+):
+    text = (
+        f"{SETS[kind]}\n{HEAD}{PART}{BEHIND}"
+        if place == "start code"
+        else f"{HEAD}{PART}{SETS[kind]} ; mine\n{PART}{BEHIND}"
+    )
+    result, lines = compensated(text, machine_with(kind), tmp_path, cache)
+    assert result.put_back == []
+    under, last = moves_by_shaper(lines, kind)
+    assert ("stream", "on") not in under
+    assert ("stream", "off") in under
+    assert last == "on"
+    number = next(n for n, line in enumerate(text.splitlines(), 1) if line.startswith(SETS[kind]))
+    [warning] = [line for line in result.warnings if "sets the firmware's input shaper" in line]
+    assert f"{SETS[kind].split()[0]} (line {number})" in warning
+    assert "off, around them as the file sets it" in warning
+
+
+def test_a_machine_that_states_no_shaper_and_a_file_that_sets_one(tmp_path: Path, cache: Path):
+    """Marlin: without one in the document none is switched off, but for the file's own."""
+    off = {"freq_x_hz": 0.0, "freq_y_hz": 0.0}
+    machine = machine_with("marlin", shaper=off)
+    _, lines = compensated(f"{SETS['marlin']}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    under, last = moves_by_shaper(lines, "marlin")
+    assert ("stream", "on") not in under
+    assert last == "on"
+    _, lines = compensated(f"{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    assert not [line for line in lines if line.startswith("M593")]
+
+
+def test_without_one_nothing_is_said(tmp_path: Path, cache: Path):
+    text = f"M572 S0.04\n{HEAD}{PART}{BEHIND}"
+    for kind in SETS:
+        result, _ = compensated(text, machine_with(kind), tmp_path, cache)
+        assert not [line for line in result.warnings if "sets the firmware's" in line]
+
+
+@pytest.mark.parametrize("line", ["M493 S1 X C1 A45", "M493 X A40", "M493S2 ; S0"])
+def test_fixed_time_motion_is_refused_with_line_and_remedy(line: str, tmp_path: Path, cache: Path):
+    with pytest.raises(GcodeError, match=r"line 2: M493 .* on top of .*; take it out"):
+        compensated(f"G28\n{line}\n{PART}", machine_with("marlin"), tmp_path, cache)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
+
+
+def test_fixed_time_motion_that_is_off_or_that_the_machine_has(tmp_path: Path, cache: Path):
+    for line in ("M493 S0", "M493"):
+        compensated(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
+    with pytest.raises(ModelError, match="fixed-time motion"):
+        compensated(HEAD + PART, machine_with("marlin", ft_motion=True), tmp_path, cache)

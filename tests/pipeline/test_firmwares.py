@@ -1,0 +1,153 @@
+"""The whole road for machines that run something else than Klipper."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.options import Options
+from tests.gcode.prints import polygon
+from tests.gcode.states import differences, tagged
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
+KINDS = ("marlin", "reprapfirmware")
+
+LIMITS = {"marlin": "M204 P1200 T1500", "reprapfirmware": "M204 P1200 T1500"}
+BODY = (
+    "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 F6000\nG4 P10\nG1 X120 Y100 F6000\n"
+    + "\n".join(polygon(6, 15))
+    + "\nG1 E-1 F2100\nG1 Z5.4 F600\nG1 X60 Y60 F9000\nG1 Z5 F600\nG1 E1 F2100\n{limits}\n"
+    + "M106 S100\nG91\nM83\nG1 X20 Y5 E1 F3000\nG1 X-20 Y15 E1\nG90\n{relative}"
+    + "G1 X100 Y90 E1\nM82\nG92 E0\nG1 X60 Y70 E2\nG1 X80 Y100 E4\nG1 E3 F2100\nM400\nG1 X5 Y5\n"
+)
+
+
+def machine_with(kind: str, base: str = "ender3") -> Machine:
+    document = load_machine(base).model_dump(mode="json")
+    section = json.loads((EXAMPLES / "firmware" / f"{kind}.json").read_text())
+    return Machine.model_validate(document | {"firmware": section})
+
+
+def body(kind: str) -> bytes:
+    # Marlin's G90 makes E absolute.
+    relative = "M83\n" if kind == "marlin" else ""
+    return BODY.format(limits=LIMITS[kind], relative=relative).encode()
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
+    machine = machine_with(kind)
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    data = tagged(body(kind))
+    source.write_bytes(data)
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
+    written = target.read_bytes()
+    assert result.put_back == []
+    assert result.pieces >= 1
+    assert differences(data, written, machine) == []
+    rms = {c.name: c.extruding.contour_rms_um for c in result.channels}
+    assert rms["after"] < 0.6 * min(rms["before"], rms["shaper"])
+    assert result.time_s == pytest.approx(result.original_time_s, rel=5e-3)
+    assert result.filament_error_mm < 1e-2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path) -> None:
+    """Seen by fuzzing: of a wipe that the motors round away nothing is left but its filament."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    lines = ("G28", "G90", "M83", "G1 X78.802 Y50 F6000", "G4 P1", "G1 X78.800 Y50 E-.17", "G4 P1")
+    data = tagged("\n".join([*lines, "G1 X90 E1", ""]).encode())
+    source.write_bytes(data)
+    compensate_file(source, target, machine_with(kind), Options(), cache_dir=cache)
+    assert differences(data, target.read_bytes(), machine_with(kind)) == []
+
+
+def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(body("marlin"))
+    compensate_file(source, target, machine_with("marlin"), Options(), cache_dir=cache)
+    text = target.read_text()
+    stream = text[text.index("stream on") :]
+    ours = re.findall(r"^G90\nM83\nG1 X", stream, re.MULTILINE)
+    assert ours
+    assert not re.search(r"^G90\nG1 X", stream, re.MULTILINE)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_none_keeps_every_byte(kind: str, tmp_path: Path, cache: Path) -> None:
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(body(kind))
+    options = Options(method="none")
+    compensate_file(source, target, machine_with(kind), options, cache_dir=cache)
+    assert target.read_bytes() == body(kind)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_plan_and_simulate_agree(kind: str, tmp_path: Path, cache: Path) -> None:
+    source = tmp_path / "in.gcode"
+    source.write_bytes(body(kind))
+    machine = machine_with(kind)
+    planned = plan_file(source, tmp_path / "motion.npz", machine)
+    simulated = simulate_file(source, machine, cache_dir=cache)
+    assert simulated.time_s == pytest.approx(planned.time_s)
+    assert [c.name for c in simulated.channels] == ["before", "shaper"]
+    assert cached_shaper(machine, cache, 1e-3).label == simulated.best_shaper
+
+
+def test_what_a_firmware_cannot_execute_is_refused(tmp_path: Path, cache: Path) -> None:
+    machine = machine_with("marlin")
+    firmware = machine.firmware.model_copy(update={"variant": "bugfix"})
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    source.write_bytes(body("marlin"))
+    with pytest.raises(ModelError, match=r"ender3 cannot execute .*; install release 2\.1\.2"):
+        compensate_file(
+            source,
+            target,
+            machine.model_copy(update={"firmware": firmware}),
+            Options(),
+            cache_dir=cache,
+        )
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_a_dialect_that_the_machine_does_not_read_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "in.gcode"
+    source.write_bytes(body("marlin"))
+    with pytest.raises(ModelError, match=r"ender3 runs Klipper and reads every file as Klipper"):
+        plan_file(source, tmp_path / "m.npz", load_machine("ender3"), dialect="marlin")
+    plan_file(source, tmp_path / "m.npz", machine_with("marlin"), dialect="prusa")
+
+
+def test_a_file_for_another_firmware_is_doubted(tmp_path: Path, cache: Path) -> None:
+    foreign = b"; gcode_flavor = reprapfirmware\nM566 X600 Y600 Z30 E300\n"
+    source = tmp_path / "in.gcode"
+    source.write_bytes(foreign + body("reprapfirmware"))
+    marlin, motion = machine_with("marlin"), tmp_path / "m.npz"
+    (warning,) = plan_file(source, motion, marlin).warnings
+    assert "written for reprapfirmware (gcode_flavor = reprapfirmware; " in warning
+    assert "ender3 reads it as Marlin does" in warning
+    assert plan_file(source, motion, marlin, dialect="marlin").warnings == []
+    assert plan_file(source, motion, machine_with("reprapfirmware")).warnings == []
+    assert simulate_file(source, marlin, cache_dir=cache).warnings[0] == warning
+    target = tmp_path / "out.gcode"
+    compensated = compensate_file(source, target, marlin, Options(), cache_dir=cache)
+    assert warning in compensated.warnings
+
+
+def test_klipper_reads_marlins_flavour(tmp_path: Path) -> None:
+    source = tmp_path / "in.gcode"
+    source.write_bytes(b"; gcode_flavor = marlin2\nM205 X8 Y8\nM900 K.05\n" + body("marlin"))
+    assert plan_file(source, tmp_path / "m.npz", load_machine("ender3")).warnings == []

@@ -1,0 +1,144 @@
+"""The search for the quickest paces, on made-up machines whose errors follow known laws."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stillpath.gcode.pacing import TRAVEL, FirstLayer
+from stillpath.models.store import load_machine
+from stillpath.pipeline.measuring.set_errors import ClassError, ErrorSum
+from stillpath.pipeline.pacing.budget import SpeedBudget
+from stillpath.pipeline.pacing.pace_search import PaceChoice, allowed_um, search
+from stillpath.pipeline.pacing.pace_trials import Factors, Tried
+
+WALL, INFILL = 0, 1
+
+
+@dataclass
+class Law:
+    """Errors of a class: its own, and what travel adds behind it."""
+
+    own_um: dict[int, float]
+    from_travel_um: dict[int, float] = field(default_factory=dict)
+    power: float = 1.0
+    unfit_above: float = np.inf
+    trials: list[Factors] = field(default_factory=list)
+
+    def __call__(self, factors: Factors) -> Tried:
+        self.trials.append(dict(factors))
+        errors = {}
+        for one, own_um in self.own_um.items():
+            shaken_um = self.from_travel_um.get(one, 0.0) * factors.get(TRAVEL, 1.0) ** self.power
+            error_um = float(np.hypot(own_um * factors.get(one, 1.0) ** self.power, shaken_um))
+            errors[one] = ClassError(error_um, 10.0)
+        unfit = {one for one, factor in factors.items() if factor > self.unfit_above}
+        return Tried(errors, unfit, sum(1.0 + 1.0 / factor for factor in factors.values()))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    own=st.lists(st.floats(0.01, 2.0), min_size=2, max_size=2),
+    shaken=st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2),
+    power=st.floats(0.5, 1.8),
+    unfit=st.floats(1.5, 30.0),
+)
+def test_it_keeps_bounds_and_limits(
+    own: list[float], shaken: list[float], power: float, unfit: float
+) -> None:
+    law = Law(
+        {WALL: own[0], INFILL: own[1], TRAVEL: 0.1},
+        dict(zip((WALL, INFILL), shaken, strict=True)),
+        power,
+        unfit,
+    )
+    most = {WALL: 20.0, INFILL: 8.0, TRAVEL: 5.0}
+    found = search(law, 1.0, most, 1.0)
+    came = law(found.factors)
+    assert found.reached
+    assert not came.unfit
+    assert all(1.0 <= found.factors[one] <= most[one] for one in most)
+    at_first = law.trials[0]
+    assert set(at_first.values()) == {1.0}
+    for one, error in came.errors.items():
+        first_um = law(at_first).errors[one].rms_um
+        # What exceeds the budget as it was sliced becomes at most a tenth worse.
+        assert error.rms_um <= max(allowed_um(one, 1.0), 1.1 * first_um)
+    assert came.seconds <= law(at_first).seconds
+    assert search(law, 1.0, most, 1.0) == found
+
+
+def test_it_uses_the_budget() -> None:
+    found = search(Law({WALL: 0.1, INFILL: 0.3}), 1.0, {WALL: 50.0, INFILL: 2.0}, 1.0)
+    assert found.factors[INFILL] == 2.0
+    assert 0.1 * found.factors[WALL] == pytest.approx(0.95, abs=0.05)
+
+
+def test_travel_comes_down_for_what_it_shakes() -> None:
+    law = Law({WALL: 0.8, TRAVEL: 0.01}, {WALL: 0.2})
+    found = search(law, 1.0, {WALL: 1.0, TRAVEL: 50.0}, 1.0)
+    assert 1.5 < found.factors[TRAVEL] < 3.0
+
+
+def test_a_shaper_may_be_slower_than_the_file() -> None:
+    found = search(Law({WALL: 4.0}), 0.05, {WALL: 10.0}, 1.0)
+    assert found.reached
+    assert 0.2 < found.factors[WALL] < 0.25
+    never = search(Law({WALL: 400.0}), 0.05, {WALL: 10.0}, 1.0)
+    assert not never.reached
+
+
+def sums(rms_um: float, seconds: float) -> ErrorSum:
+    return ErrorSum(np.array([0.5, 1.0]) * rms_um**2 * seconds, seconds)
+
+
+def budget(**factors: float) -> SpeedBudget:
+    numbers = {"wall": WALL, "travel": TRAVEL}
+    chosen = {numbers[name]: factor for name, factor in factors.items()}
+    bounds = {one: allowed_um(one, 10.0) for one in chosen}
+    choice = PaceChoice(chosen, bounds)
+    tops = dict.fromkeys(chosen, 6.0)
+    return SpeedBudget(load_machine("ender3"), 10.0, FirstLayer(), choice, choice, tops)
+
+
+def factors(paces: SpeedBudget, errors: dict[int, ErrorSum]) -> dict[str, float]:
+    figures = paces.figures(errors, ["Perimeter"], 2.0, 1.0)
+    return {one.name: one.acceleration_factor for one in figures.classes}
+
+
+def test_paces_follow_the_errors_both_ways() -> None:
+    paces = budget(wall=4.0, travel=2.0)
+    low = {WALL: sums(3.0, 30.0), TRAVEL: sums(3.0, 30.0)}
+    paces.correct(low)
+    raised = factors(paces, low)
+    assert raised["Perimeter"] > 4.0
+    assert raised["travel"] > 2.0
+    high = {WALL: sums(12.0, 90.0), TRAVEL: sums(3.0, 90.0)}
+    paces.correct(high)
+    assert factors(paces, high)["Perimeter"] < raised["Perimeter"]
+    for k in range(60):
+        paces.correct({WALL: sums(1.0, 100.0 + 30.0 * k), TRAVEL: sums(1.0, 100.0 + 30.0 * k)})
+    # Never above the machine's limits, nor far above what the samples said.
+    assert factors(paces, low) == {"Perimeter": 6.0, "travel": 4.0}
+
+
+def test_a_file_above_its_budget_is_written_anew() -> None:
+    first = budget(wall=4.0, travel=2.0)
+    over = {WALL: sums(12.0, 90.0), TRAVEL: sums(3.0, 90.0)}
+    assert first.milder({WALL: sums(9.9, 90.0)}) is None
+    second = first.milder(over)
+    assert second is not None
+    assert 1.0 < factors(second, over)["Perimeter"] < 4.0
+    third = second.milder(over)
+    assert third is not None
+    assert 1.0 < factors(third, over)["travel"] < 2.0
+    last = third.milder(over)
+    assert last is not None
+    assert set(factors(last, over).values()) == {1.0}
+    assert last.milder(over) is None
+    # What is as it was sliced cannot be milder.
+    assert budget(wall=1.0, travel=1.0).milder(over) is None

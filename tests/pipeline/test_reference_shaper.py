@@ -1,0 +1,117 @@
+"""The best-tuned shaper: same optimum as brute force, and its cache."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.models.reference_motion import reference_motion
+from stillpath.models.store import builtin_machines, load_machine
+from stillpath.pipeline import yardstick
+from stillpath.pipeline.measuring.reference_shaper import (
+    FREQUENCIES_HZ,
+    BestShaper,
+    cached_shaper,
+    evaluate_shaper,
+    tune_shaper,
+)
+
+
+def test_reference_motion_is_a_planner_s() -> None:
+    y_d, extruding = reference_motion()
+    velocity = np.diff(y_d, axis=1) / 1e-3
+    assert 20 < y_d.shape[1] * 1e-3 < 30
+    assert len(extruding) == y_d.shape[1]
+    assert 0.6 < extruding.mean() < 0.95
+    assert np.hypot(*velocity).max() <= 250 + 1e-6
+    # Corners at 5 mm/s: a reversal steps by 10, and one sample may hold two such corners.
+    assert np.hypot(*np.diff(velocity, axis=1)).max() < 25
+    assert np.all(velocity[:, 0] ** 2 < 10)
+    assert np.all(velocity[:, -1] == 0)
+
+
+def test_frequencies() -> None:
+    assert FREQUENCIES_HZ[0] == 20
+    assert FREQUENCIES_HZ[-1] <= 200 < FREQUENCIES_HZ[-1] * 1.02
+    np.testing.assert_allclose(FREQUENCIES_HZ[1:] / FREQUENCIES_HZ[:-1], 1.02)
+
+
+def test_same_optimum_as_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a third of the grid and a short motion, every type and pair."""
+    monkeypatch.setattr(yardstick, "FREQUENCIES_HZ", FREQUENCIES_HZ[::3])
+    y_d, extruding = reference_motion()
+    y_d, extruding = y_d[:, 9000:13000] - y_d[:, 9000:9001], extruding[9000:13000]
+    machine = load_machine("voron-v24-250")
+    best = tune_shaper(machine, y_d, 1e-3, extruding)
+    trial = yardstick._Trial(machine, y_d, 1e-3, extruding)
+    every = trial.points(10**6)
+    count = len(yardstick.FREQUENCIES_HZ)
+    value, kind, i, j = min(
+        (trial.rms(kind, i, j, every), kind, i, j)
+        for kind in ("zv", "mzv")
+        for i in range(count)
+        for j in range(count)
+    )
+    assert best.contour_rms_um <= 1e3 * value * 1.01
+    if best.type in ("zv", "mzv"):
+        assert (best.type, best.fx_hz, best.fy_hz) == (
+            kind,
+            yardstick.FREQUENCIES_HZ[i],
+            yardstick.FREQUENCIES_HZ[j],
+        )
+
+
+def test_shifted_copies_are_the_shaped_command() -> None:
+    """The shortcut (plant first, then shaper) gives the figure of the long way."""
+    machine = load_machine("ender3")
+    y_d, extruding = reference_motion()
+    y_d, extruding = y_d[:, :6000], extruding[:6000]
+    # The long way measures every second sample.
+    trial = yardstick._Trial(machine, y_d, 1e-3, np.arange(6000) % 2 == 0)
+    points = trial.points(10**6)
+    long_way = evaluate_shaper(
+        machine, y_d, 1e-3, np.ones(6000, bool), "ei", FREQUENCIES_HZ[40], FREQUENCIES_HZ[22]
+    )
+    assert trial.rms("ei", 40, 22, points) * 1e3 == pytest.approx(long_way.contour_rms_um, rel=1e-6)
+
+
+def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def tune(*_: object) -> BestShaper:
+        calls.append(1)
+        return BestShaper("mzv", 40.0, 50.0, 0.1, 1.5, 20.0)
+
+    monkeypatch.setattr(yardstick, "tune_shaper", tune)
+    machine = load_machine("ender3").model_copy(update={"title": "Mine"})
+    folder = tmp_path / "cache"
+    first = cached_shaper(machine, folder)
+    assert cached_shaper(machine, folder) == first
+    assert len(calls) == 1
+    (file,) = folder.iterdir()
+    assert machine.revision in file.name
+    for broken in ("", "{", "[]", json.dumps({"type": "mzv"}), '{"type": 1}'):
+        file.write_text(broken)
+        assert cached_shaper(machine, folder) == first
+    assert len(calls) == 6
+    assert json.loads(file.read_text())["fx_hz"] == 40.0
+
+
+@pytest.mark.parametrize("name", builtin_machines())
+def test_that_of_a_built_in_machine_comes_with_the_program(name: str, tmp_path: Path) -> None:
+    """After a change of such a machine: python benchmarks/yardsticks.py --write."""
+    best = cached_shaper(load_machine(name), tmp_path)
+    assert best.contour_rms_um > 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_what_comes_with_the_program_is_what_is_found(tmp_path: Path) -> None:
+    machine = load_machine("voron-v0")
+    shipped = cached_shaper(machine, tmp_path)
+    found = cached_shaper(machine.model_copy(update={"title": "Mine"}), tmp_path)
+    assert (found.type, found.fx_hz, found.fy_hz) == (shipped.type, shipped.fx_hz, shipped.fy_hz)
+    assert found.contour_rms_um == pytest.approx(shipped.contour_rms_um, rel=1e-9)

@@ -1,0 +1,56 @@
+"""Samples of a file: what is taken, and what is known of the first layer."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from stillpath.gcode.pacing import AS_SLICED, FirstLayer
+from stillpath.models.store import load_machine
+from stillpath.pipeline.pacing.samples import FileSamples, take_samples
+from stillpath.pipeline.reading import dialect_for
+
+MACHINE = load_machine("ender3")
+PURGE = "G28\nM83\nG1 Z.3 F600\nG1 X5 Y5 F6000\nG1 Y80 E8 F1500\n"
+
+
+def layer(z_mm: float, mark: str = ";LAYER_CHANGE\n") -> str:
+    ring = "G1 X60 Y40 E1 F3600\nG1 X60 Y60 E1\nG1 X40 Y60 E1\nG1 X40 Y40.4 E1\n"
+    return f"{mark}G1 Z{z_mm} F600\nG1 X40 Y40 F9000\n;TYPE:Perimeter\n{4 * ring}"
+
+
+def taken(text: str) -> FileSamples:
+    return take_samples(io.BytesIO(text.encode()), MACHINE, dialect_for(MACHINE))
+
+
+def heights(samples: FileSamples) -> set[float]:
+    """Heights of all moves whose pace may change."""
+    found: set[float] = set()
+    for sample in samples.samples:
+        free = sample.classes != AS_SLICED
+        found |= set(np.round(sample.piece.moves.end_mm[free, 2], 3).tolist())
+    return found
+
+
+def test_the_first_layer_is_left_alone() -> None:
+    found = taken(PURGE + layer(0.2) + layer(0.4) + layer(0.6))
+    assert found.first_layer == FirstLayer(1, 0.2)
+    assert min(heights(found)) == 0.4
+
+
+def test_a_print_of_one_layer_has_nothing_else() -> None:
+    found = taken(PURGE + layer(0.2))
+    assert found.first_layer == FirstLayer(0, 0.2)
+    assert heights(found) == set()
+
+
+def test_every_object_has_a_first_layer() -> None:
+    found = taken(PURGE + 2 * (layer(0.2) + layer(0.4)))
+    assert heights(found) == {0.4}
+
+
+def test_without_layers_there_is_no_first_one() -> None:
+    found = taken(PURGE + layer(0.2, mark=""))
+    assert found.first_layer == FirstLayer(-1)
+    assert heights(found) == {0.2, 0.3}

@@ -1,0 +1,118 @@
+"""Only what shows is compensated: smaller files whose visible features print as well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
+from stillpath.service.wrong_options import wrong_option
+from tests.gcode.cutting import ender3_with
+from tests.gcode.plain_reader import Firmware, read
+from tests.gcode.states import differences, tagged
+
+GEAR = Path(__file__).parents[3] / "examples" / "cura_ender3_gear24.gcode"
+KINDS: tuple[Firmware, ...] = ("klipper", "marlin", "reprapfirmware")
+
+
+@pytest.fixture(scope="module")
+def gear(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two layers and a half of the gear: all its features, and no end."""
+    lines = GEAR.read_bytes().splitlines(keepends=True)
+    path = tmp_path_factory.mktemp("gear") / "gear.gcode"
+    path.write_bytes(tagged(b"".join(lines[:5800])))
+    return path
+
+
+def run(gear: Path, target: Path, machine: Machine, **options: object) -> Result:
+    cache = gear.parent / "cache"
+    return compensate_file(gear, target, machine, Options.model_validate(options), cache_dir=cache)
+
+
+def rms(result: Result, feature: str) -> dict[str, float]:
+    return next(g.contour_rms_um for g in result.features if g.name == feature)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
+    machine = ender3_with(kind)
+    all_of_it = run(gear, tmp_path / "all.gcode", machine)
+    walls = run(gear, tmp_path / "walls.gcode", machine, where="walls")
+    text, written = gear.read_bytes(), (tmp_path / "walls.gcode").read_bytes()
+    assert walls.put_back == []
+
+    # The printer is where the file leaves it, at every line that both have.
+    assert differences(text, written, machine) == []
+    came, leaves = read(text, kind), read(written, kind)
+    assert leaves.modes() == came.modes()
+    assert leaves.position_mm == pytest.approx(came.position_mm, abs=1e-3)
+    assert leaves.extruded_mm[0] == pytest.approx(came.extruded_mm[0], abs=1e-3)
+    # Inner walls leave line by line as they came.
+    inner = text.split(b";TYPE:WALL-INNER\n")[3].split(b";TYPE:")[0]
+    kept = [line for line in inner.splitlines() if b"E" in line and not line.startswith(b";@")]
+    assert len(kept) > 10
+    assert all(line in written for line in kept[1:-1])
+
+    assert walls.written_bytes < 0.7 * all_of_it.written_bytes
+    assert walls.left_out_extruding_s > 20.0
+    assert walls.left_alone_s <= all_of_it.left_alone_s + 0.1
+    assert walls.original_time_s == pytest.approx(all_of_it.original_time_s, rel=1e-6)
+    assert walls.time_s <= 1.005 * all_of_it.time_s
+    outer, sliced = rms(walls, "WALL-OUTER"), rms(walls, "WALL-INNER")
+    # Marlin starts from a stand less exactly, and between parts there are more of them.
+    more = 1.5 if kind == "marlin" else 1.1
+    assert outer["after"] <= more * rms(all_of_it, "WALL-OUTER")["after"] + 0.1
+    assert sliced["after"] == pytest.approx(sliced["before"], rel=0.05)
+    assert any("where=walls" in note for note in walls.notes)
+    # What counts, and its range, are those of the walls (the skirt and purge lines left out).
+    selected = {c.name: c for c in walls.channels}["after"]
+    assert selected.selected_rms_um == pytest.approx(outer["after"], rel=0.3)
+    assert selected.contour_range_um is not None
+    assert selected.contour_range_um[0] <= selected.selected_rms_um
+    assert selected.contour_range_um[1] < selected.extruding.contour_rms_um * 3
+    assert not any("shaper would serve" in warning for warning in walls.warnings)
+
+
+def test_the_firmwares_shaper_is_not_switched_between_walls(gear: Path, tmp_path: Path) -> None:
+    document = ender3_with("klipper").model_dump(mode="json")
+    document["firmware"]["shaper"] = {"freq_x_hz": 45.0, "freq_y_hz": 35.0}
+    target = tmp_path / "out.gcode"
+    run(gear, target, Machine.model_validate(document), where="walls")
+    assert target.read_bytes().count(b"SET_INPUT_SHAPER") <= 6
+
+
+def test_a_file_that_must_not_be_large(gear: Path, tmp_path: Path) -> None:
+    machine, target = ender3_with("klipper"), tmp_path / "out.gcode"
+    sizes = [
+        run(gear, target, machine, where=where).written_bytes
+        for where in ("all", "visible", "walls")
+    ]
+    assert sizes[0] > sizes[1] > sizes[2]
+    for limit_mb, where in ((10.0, "all"), (1e-6 * sizes[1] + 1e-3, "visible")):
+        found = run(gear, target, machine, max_mb=limit_mb)
+        assert found.settings.get("where", "all") == where
+        assert found.written_bytes == target.stat().st_size <= 1e6 * limit_mb
+    target.write_bytes(b"precious")
+    with pytest.raises(GcodeError, match=r"does not fit into max_mb 0\.2"):
+        run(gear, target, machine, max_mb=0.2)
+    assert target.read_bytes() == b"precious"
+    assert [p.name for p in tmp_path.iterdir()] == ["out.gcode"]
+
+
+def test_a_budget_is_for_the_whole_print() -> None:
+    from pydantic import ValidationError
+
+    with pytest.raises(ValidationError) as refused:
+        Options(budget_um=10, where="walls")
+    assert "budget_um" in wrong_option(refused.value)
+
+
+def test_digests_of_older_options_stay() -> None:
+    assert "where" not in Options().model_dump()
+    assert "max_mb" not in Options().model_dump()
+    assert Options(where="walls").model_dump()["where"] == "walls"

@@ -1,0 +1,80 @@
+"""Times in a compensated file, on the whole road."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
+from tests.gcode.cutting import HEAD
+from tests.gcode.prints import polygon
+
+LAYER = "\n".join(polygon(6, 15))
+TEXT = (
+    ";FLAVOR:Marlin\n;TIME:100\n;Generated with Cura_SteamEngine 5.0.0\n"
+    f"{HEAD}G1 X120 Y100 F6000\n;LAYER:0\n;TYPE:WALL-OUTER\n{LAYER}\n;TIME_ELAPSED:50.000000\n"
+    f"M73 P50 R1\nG1 E-1 F2100\nG4 P500\nG1 E1 F2100\n;LAYER:1\n{LAYER}\n;TIME_ELAPSED:100.000000\n"
+    "G1 E-1 F2100\n;End of Gcode\n;SETTING_3 {}\n"
+).encode()
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def compensated(folder: Path, cache: Path, **options: object) -> tuple[Result, list[bytes]]:
+    source, target = folder / "in.gcode", folder / "out.gcode"
+    source.write_bytes(TEXT)
+    machine = load_machine("ender3")
+    result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
+    assert sorted(p.name for p in folder.iterdir()) == ["in.gcode", "out.gcode"]
+    return result, target.read_bytes().splitlines()
+
+
+def elapsed(lines: list[bytes]) -> list[float]:
+    start = b";TIME_ELAPSED:"
+    return [float(x.removeprefix(start)) for x in lines if x.startswith(start)]
+
+
+def test_times_follow_the_motion(tmp_path: Path, cache: Path) -> None:
+    # A robust design weighs the path more than the time.
+    result, lines = compensated(tmp_path, cache, along=0.01)
+    delay_s = result.time_s - result.original_time_s
+    first, last = (b - a for a, b in zip((50.0, 100.0), elapsed(lines), strict=True))
+    assert last == pytest.approx(delay_s, abs=0.02)
+    assert 0.0 < first < last
+    assert b";TIME:%d" % round(100.0 + delay_s) in lines
+    assert (result.slicer, result.slicer_time_s) == ("Cura", 100.0)
+
+
+def test_the_ends_of_the_file_stay_the_slicers(tmp_path: Path, cache: Path) -> None:
+    _, lines = compensated(tmp_path, cache)
+    assert lines[0] == b";FLAVOR:Marlin"
+    assert lines[-1] == b";SETTING_3 {}"
+    stamps = [k for k, line in enumerate(lines) if line.startswith(b"; Processed by stillpath")]
+    assert len(stamps) == 2
+    assert all(line.startswith(b";") for line in lines[: stamps[0]] if line)
+    assert lines[stamps[1] + 1 :] == [b";End of Gcode", b";SETTING_3 {}"]
+
+
+def test_kept_times_and_the_method_none(tmp_path: Path, cache: Path) -> None:
+    _, lines = compensated(tmp_path, cache, times="kept", along=0.01)
+    assert elapsed(lines) == [50.0, 100.0]
+    _, lines = compensated(tmp_path, cache, method="none")
+    assert b"\n".join(lines) + b"\n" == TEXT
+
+
+def test_plan_and_simulate_tell_the_slicers_time(tmp_path: Path, cache: Path) -> None:
+    source = tmp_path / "in.gcode"
+    source.write_bytes(TEXT)
+    machine = load_machine("ender3")
+    planned = plan_file(source, tmp_path / "motion.npz", machine)
+    simulated = simulate_file(source, machine, cache_dir=cache)
+    assert planned.slicer_time_s == simulated.slicer_time_s == 100.0
+    assert planned.slicer == simulated.slicer == "Cura"
+    assert planned.time_s == pytest.approx(simulated.time_s)

@@ -1,0 +1,148 @@
+"""Tables of the motion: against the plan, the written file and distances worked out plainly."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.cli.main import run
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.trajectories import write_trajectories
+from stillpath.simulation.measures import contour_error
+from tests.gcode.cutting import HEAD
+from tests.gcode.prints import polygon
+
+SMALL = HEAD + ";LAYER_CHANGE\n;Z:0.2\nG1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\n"
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "in.gcode"
+    path.write_text(SMALL)
+    return path
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as found:
+        return dict(found)
+
+
+@pytest.mark.slow
+def test_the_whole_print(source: Path, tmp_path: Path, cache: Path) -> None:
+    machine, options = load_machine("ender3"), Options()
+    target = tmp_path / "t.npz"
+    rows = write_trajectories(source, target, machine, options, format="npz", cache_dir=cache)
+    table = load(target)
+    assert {len(v) for v in table.values()} == {rows}
+    assert np.allclose(table["t_s"], 1e-3 * np.arange(rows))
+    planned = np.stack([table["x_mm"], table["y_mm"]])
+    for name in ("before", "after"):
+        simulated = np.stack([table[f"{name}_sim_x_mm"], table[f"{name}_sim_y_mm"]])
+        expected = 1e3 * contour_error(planned, simulated)
+        assert table[f"{name}_contour_um"] == pytest.approx(expected, abs=1e-6)
+    report = compensate_file(source, tmp_path / "o.gcode", machine, options, cache_dir=cache)
+    for channel in report.channels[:2]:
+        error = table[f"{channel.name}_contour_um"][table["extruding"] > 0]
+        rms = float(np.sqrt(np.mean(error**2)))
+        assert rms == pytest.approx(channel.extruding.contour_rms_um, rel=1e-6)
+        # The print ends with its last line: the nozzle stands on it and rings.
+        behind = table["t_s"] > table["t_s"][table["extruding"] > 0][-1]
+        most = max(float(error.max()), float(table[f"{channel.name}_contour_um"][behind].max()))
+        assert most == pytest.approx(channel.extruding.contour_max_um, rel=1e-6)
+    # The written file is planned by itself, and moves as the table says.
+    plan_file(tmp_path / "o.gcode", tmp_path / "p.npz", machine)
+    own = load(tmp_path / "p.npz")
+    after = np.stack([table["after_x_mm"], table["after_y_mm"]])
+    path = np.stack([own["x"], own["y"]])
+    for k in range(0, rows, 97):
+        assert np.min(np.hypot(*(path - after[:, k : k + 1]))) < 0.11  # 1 ms at 100 mm/s
+    lines = SMALL.split("\n")
+    assert all(lines[k - 1].startswith("G1") for k in np.unique(table["line"]))
+    assert set(table["layer"]) <= {-1, 0}
+
+
+@pytest.mark.parametrize("options", [Options(), None])
+def test_a_part_of_it_as_text(
+    source: Path, tmp_path: Path, cache: Path, options: Options | None
+) -> None:
+    machine = load_machine("ender3")
+    whole, part = tmp_path / "w.npz", tmp_path / "p.csv"
+    write_trajectories(source, whole, machine, options, format="npz", cache_dir=cache)
+    rows = write_trajectories(
+        source, part, machine, options, start_s=0.25, stop_s=0.75, cache_dir=cache
+    )
+    table = load(whole)
+    with part.open(newline="") as file:
+        read = list(csv.DictReader(file))
+    assert rows == len(read) == 500
+    assert list(read[0]) == list(table)
+    assert ("after_x_mm" in read[0]) == (options is not None)
+    for name, values in table.items():
+        column = np.array([float(row[name]) for row in read])
+        assert column == pytest.approx(values[250:750], abs=6e-3)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.gcode", "p.csv", "w.npz"]
+
+
+def test_the_same_bytes(source: Path, tmp_path: Path, cache: Path) -> None:
+    machine = load_machine("ender3")
+    for form in ("csv", "npz"):
+        made = []
+        for name in ("one", "two"):
+            target = tmp_path / f"{name}.{form}"
+            write_trajectories(
+                source, target, machine, None, format=form, stop_s=0.3, cache_dir=cache
+            )
+            made.append(target.read_bytes())
+        assert made[0] == made[1]
+
+
+@pytest.mark.parametrize(
+    ("start_s", "stop_s", "message"),
+    [
+        (2.0, 1.0, "from 2 s to 1 s is no time"),
+        (-1.0, None, "no time"),
+        (1e5, None, r"nothing moves from 100000 s on: the print ends at [\d.]+ s"),
+    ],
+)
+def test_no_such_time(
+    source: Path, tmp_path: Path, cache: Path, start_s: float, stop_s: float | None, message: str
+) -> None:
+    with pytest.raises(GcodeError, match=message):
+        write_trajectories(
+            source,
+            tmp_path / "t.csv",
+            load_machine("ender3"),
+            None,
+            start_s=start_s,
+            stop_s=stop_s,
+            cache_dir=cache,
+        )
+    assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
+
+
+def test_from_the_command_line(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "t.npz"
+    given = ["trajectories", str(source), "-m", "ender3", "-o", str(target)]
+    assert run([*given, "--from", "0.1", "--to", "0.3"]) == 0
+    assert "200 rows" in capsys.readouterr().out
+    assert len(load(target)["t_s"]) == 200
+    assert run([*given, "--format", "xlsx"]) == 2
+    assert run([*given, "--budget-um", "0"]) == 2
+    assert "csv and npz" in capsys.readouterr().err
+    assert run([*given[:-1], str(source)]) == 2
+    assert source.read_text() == SMALL
+    assert run([*given, "--method", "magic"]) == 2
+    assert "method" in capsys.readouterr().err

@@ -1,0 +1,131 @@
+"""The report: what stands in it, that it asks nobody, and that a name cannot become code."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from stillpath.pipeline.result import Result
+from stillpath.reports import render_report, write_report
+from tests.service.synthetic import make_result
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    return make_result(layers=6)
+
+
+@pytest.fixture(scope="module")
+def page(result: Result) -> str:
+    return render_report(result)
+
+
+def embedded(page: str) -> dict:
+    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page)
+    return json.loads(text)
+
+
+def test_both_files_are_written_whole(result: Result, tmp_path: Path):
+    write_report(result, tmp_path / "a" / "b")
+    write_report(result, tmp_path / "a" / "b")  # a second time: replaced
+    assert sorted(path.name for path in (tmp_path / "a" / "b").iterdir()) == [
+        "report.html",
+        "report.json",
+    ]
+    text = (tmp_path / "a" / "b" / "report.json").read_text().replace("null", '"nan"')
+    for name in ("contour_range_um", "selected_rms_um"):
+        text = text.replace(f'"{name}":"nan"', f'"{name}":null')
+    read = Result.model_validate(
+        json.loads(text) | {"budget": None, "advice": None, "last_check": None}
+    )
+    assert read.channels == result.channels
+    assert read.put_back == result.put_back
+
+
+def test_headline_and_table(page: str):
+    assert "23 times smaller" in page
+    assert "153" in page
+    assert "+0.06 % against the original" in page
+    assert "missed its command by 13.1 µm" in page
+    assert "The firmware&#39;s shaper is off" in page
+
+
+def test_a_set_of_plants_says_a_range(result: Result):
+    ranges = {"before": (120.0, 190.0), "after": (4.21, 17.3), "shaper": (20.0, 41.0)}
+    channels = [c.model_copy(update={"contour_range_um": ranges[c.name]}) for c in result.channels]
+    page = render_report(result.model_copy(update={"channels": channels}))
+    assert "4.21 to 17.3" in page
+    assert "20.0 to 41.0" in page
+    assert "all plants that explain" in page
+    assert "times smaller" not in page
+
+
+def test_nothing_is_fetched(page: str):
+    assert "default-src 'none'" in page
+    references = re.findall(r"https?://[^\s\"'<>]+", page)
+    assert set(references) <= {"http://www.w3.org/2000/svg"}  # a namespace, not an address
+    assert re.findall(r"(?:src|href)=(?!\"data:)|@import|url\(|fetch\(", page) == []
+    assert re.findall(r"\sstyle=|\son\w+=", page) == []  # the policy would block them
+
+
+@pytest.mark.parametrize("element", ["style", "script"])
+def test_the_policy_knows_its_own_code(page: str, element: str):
+    (code,) = re.findall(rf"<{element}>(.*?)</{element}>", page, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
+    assert f"{element}-src 'sha256-{digest}'" in page
+
+
+def test_names_cannot_become_code(result: Result):
+    evil = "</script><script>alert(1)</script><!--"
+    changed = result.model_copy(
+        update={
+            "source_name": evil,
+            "warnings": [evil],
+            "layers": [group.model_copy(update={"name": evil}) for group in result.layers],
+            "features": [group.model_copy(update={"name": evil}) for group in result.features],
+            "channels": [c.model_copy(update={"label": evil}) for c in result.channels],
+        }
+    )
+    page = render_report(changed)
+    assert "<script>alert" not in page
+    assert embedded(page)["layers"][0]["name"] == evil
+    assert embedded(page)["channels"][0]["label"] == evil.split(" (")[0]
+
+
+def test_the_scale_is_shared_and_round(page: str, result: Result):
+    data = embedded(page)
+    worst = max(max(view.contour_um["before"]) for view in result.layer_views)
+    assert 0.3 * worst < data["scale_um"] <= 2 * worst
+    assert data["scale_um"] in {s * 10**p for s in (1, 1.5, 2, 3, 4, 5, 6, 8) for p in (0, 1, 2)}
+
+
+def test_gaps_stay_gaps(page: str):
+    assert embedded(page)["track"]["values"]["before"][50] is None
+
+
+def test_a_simulation_promises_nothing():
+    page = render_report(make_result(channels=("before", "shaper"), layers=1))
+    assert "the file as it came" in page
+    for word in ("times smaller", "Put back", "The written file", "Compensated"):
+        assert word not in page
+
+
+def test_a_result_without_motion_still_renders(result: Result):
+    empty = result.model_copy(
+        update={
+            "layers": [],
+            "features": [],
+            "layer_views": [],
+            "stages": [],
+            "time_s": 0.0,
+            "original_time_s": 0.0,
+            "put_back": [],
+            "pieces": 0,
+        }
+    )
+    assert "Nothing: all 0 pieces" in render_report(empty)
