@@ -24,7 +24,7 @@ from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline import road
+from stillpath.pipeline import compensate
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.pass_through import last_length_mm
@@ -63,7 +63,7 @@ class Spread:
         return float(_BIN_UM * (1 + np.searchsorted(total, share * total[-1])))
 
 
-class Watched(road._Job):
+class Watched(compensate._Job):
     """The road, with every verified piece measured."""
 
     def prepare(self) -> None:
@@ -73,7 +73,7 @@ class Watched(road._Job):
         """What of the extruding motion's distance lies along the command and across it."""
         self.late_s = self.off_grid_s = self.end_mm = 0.0
 
-    def _attempt(self, piece: Piece, paced: Piece) -> road._Attempt:
+    def _attempt(self, piece: Piece, paced: Piece) -> compensate._Attempt:
         found = super()._attempt(piece, paced)
         self._watch(piece, found.made, found.executed)
         return found

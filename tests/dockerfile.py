@@ -105,7 +105,9 @@ def context_of(checkout: Path, target: Path) -> Path:
         source, place = checkout / line[1:], target / line[1:]
         place.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
-            shutil.copytree(source, place, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                source, place, symlinks=True, ignore=shutil.ignore_patterns("__pycache__")
+            )
         else:
             shutil.copy2(source, place)
     return target

@@ -125,7 +125,7 @@ def test_it_serves_without_the_sources_and_writes_only_data(image: Image):
         assert python.startswith(str(installed))
         subprocess.run(plainly([python, *check[1:]]), env=image.environment, check=True)
         where = subprocess.run(
-            [python, "-c", "import service; print(service.__file__)"],
+            [python, "-c", "import stillpath; print(stillpath.__file__)"],
             env=image.environment,
             cwd=ROOT,
             capture_output=True,

@@ -49,7 +49,7 @@ Ints = NDArray[np.int64]
 _ZETA = 0.1
 _VERSION = 1
 """Part of the cache's name; rises when the definition changes."""
-_SHIPPED, _SHIPPED_US = Path(__file__).with_name("yardsticks.json"), 1000
+_SHIPPED, _SHIPPED_US = Path(__file__).with_name("reference_shapers.json"), 1000
 _COARSE = 4
 _COARSE_POINTS, _FINE_POINTS, _FINAL_POINTS = 1500, 8000, 60_000
 _STARTS, _FINALISTS, _FINALISTS_EACH = 4, 6, 2

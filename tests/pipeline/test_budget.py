@@ -9,7 +9,7 @@ import pytest
 
 from stillpath.cli.console import budget_line
 from stillpath.models.store import load_machine
-from stillpath.pipeline import compensating
+from stillpath.pipeline import piece_compensator
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
@@ -116,7 +116,7 @@ def test_what_no_command_follows_is_slower(
 ) -> None:
     # An inverse asks for more acceleration than the machine allows where the plan is quickest, and
     # corners are not rounded for it here.
-    monkeypatch.setattr(compensating, "_SOFT_S", ())
+    monkeypatch.setattr(piece_compensator, "_SOFT_S", ())
     result, _ = compensated(sliced, tmp_path, cache, method="zpetc", budget_um=40)
     assert result.put_back == []
     assert any("slower than the budget allows" in warning for warning in result.warnings)

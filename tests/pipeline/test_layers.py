@@ -19,9 +19,9 @@ from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec
 from stillpath.models.store import load_machine
-from stillpath.pipeline import _layer_kernels as kernels
-from stillpath.pipeline import layers as layers_module
 from stillpath.pipeline.compensate import compensate_file, plan_file, simulate_file
+from stillpath.pipeline.measuring import _layer_kernels as kernels
+from stillpath.pipeline.measuring import layers as layers_module
 from stillpath.pipeline.measuring.layers import UNKNOWN, LayerRecorder, LayerTile
 from stillpath.pipeline.options import Options
 from tests.gcode.cutting import HEAD

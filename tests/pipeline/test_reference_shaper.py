@@ -10,7 +10,7 @@ import pytest
 
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import builtin_machines, load_machine
-from stillpath.pipeline import yardstick
+from stillpath.pipeline.measuring import reference_shaper
 from stillpath.pipeline.measuring.reference_shaper import (
     FREQUENCIES_HZ,
     BestShaper,
@@ -41,14 +41,14 @@ def test_frequencies() -> None:
 
 def test_same_optimum_as_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a third of the grid and a short motion, every type and pair."""
-    monkeypatch.setattr(yardstick, "FREQUENCIES_HZ", FREQUENCIES_HZ[::3])
+    monkeypatch.setattr(reference_shaper, "FREQUENCIES_HZ", FREQUENCIES_HZ[::3])
     y_d, extruding = reference_motion()
     y_d, extruding = y_d[:, 9000:13000] - y_d[:, 9000:9001], extruding[9000:13000]
     machine = load_machine("voron-v24-250")
     best = tune_shaper(machine, y_d, 1e-3, extruding)
-    trial = yardstick._Trial(machine, y_d, 1e-3, extruding)
+    trial = reference_shaper._Trial(machine, y_d, 1e-3, extruding)
     every = trial.points(10**6)
-    count = len(yardstick.FREQUENCIES_HZ)
+    count = len(reference_shaper.FREQUENCIES_HZ)
     value, kind, i, j = min(
         (trial.rms(kind, i, j, every), kind, i, j)
         for kind in ("zv", "mzv")
@@ -59,8 +59,8 @@ def test_same_optimum_as_brute_force(monkeypatch: pytest.MonkeyPatch) -> None:
     if best.type in ("zv", "mzv"):
         assert (best.type, best.fx_hz, best.fy_hz) == (
             kind,
-            yardstick.FREQUENCIES_HZ[i],
-            yardstick.FREQUENCIES_HZ[j],
+            reference_shaper.FREQUENCIES_HZ[i],
+            reference_shaper.FREQUENCIES_HZ[j],
         )
 
 
@@ -70,7 +70,7 @@ def test_shifted_copies_are_the_shaped_command() -> None:
     y_d, extruding = reference_motion()
     y_d, extruding = y_d[:, :6000], extruding[:6000]
     # The long way measures every second sample.
-    trial = yardstick._Trial(machine, y_d, 1e-3, np.arange(6000) % 2 == 0)
+    trial = reference_shaper._Trial(machine, y_d, 1e-3, np.arange(6000) % 2 == 0)
     points = trial.points(10**6)
     long_way = evaluate_shaper(
         machine, y_d, 1e-3, np.ones(6000, bool), "ei", FREQUENCIES_HZ[40], FREQUENCIES_HZ[22]
@@ -85,7 +85,7 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         calls.append(1)
         return BestShaper("mzv", 40.0, 50.0, 0.1, 1.5, 20.0)
 
-    monkeypatch.setattr(yardstick, "tune_shaper", tune)
+    monkeypatch.setattr(reference_shaper, "tune_shaper", tune)
     machine = load_machine("ender3").model_copy(update={"title": "Mine"})
     folder = tmp_path / "cache"
     first = cached_shaper(machine, folder)
@@ -102,7 +102,7 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", builtin_machines())
 def test_that_of_a_built_in_machine_comes_with_the_program(name: str, tmp_path: Path) -> None:
-    """After a change of such a machine: python benchmarks/yardsticks.py --write."""
+    """After a change of such a machine: python benchmarks/reference_shapers.py --write."""
     best = cached_shaper(load_machine(name), tmp_path)
     assert best.contour_rms_um > 0
     assert list(tmp_path.iterdir()) == []

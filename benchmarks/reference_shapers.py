@@ -1,6 +1,6 @@
 """Tune the firmware's best shaper for every built-in machine, and keep what is found.
 
-    python benchmarks/yardsticks.py [--write]
+    python benchmarks/reference_shapers.py [--write]
 
 Prints machine, revision, shaper and error, and whether
 `pipeline/measuring/reference_shapers.json` says the same; exits with 1 if it does not. With
@@ -18,10 +18,10 @@ from pathlib import Path
 
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import builtin_machines, load_machine
-from stillpath.pipeline import yardstick
 from stillpath.pipeline.files import replacing
+from stillpath.pipeline.measuring import reference_shaper
 
-FILE = Path(yardstick.__file__).with_name("yardsticks.json")
+FILE = Path(reference_shaper.__file__).with_name("reference_shapers.json")
 DT_S = 1e-3
 
 
@@ -34,7 +34,7 @@ def main() -> int:
     found = {}
     for name in builtin_machines():
         machine = load_machine(name)
-        best = yardstick.tune_shaper(machine, motion, DT_S, extruding)
+        best = reference_shaper.tune_shaper(machine, motion, DT_S, extruding)
         found[name] = {"revision": machine.revision, "shaper": asdict(best)}
         verdict = "" if known.get(name) == found[name] else "MISS"
         print(
@@ -43,7 +43,7 @@ def main() -> int:
         )
     if given.write:
         with replacing(FILE) as temporary:
-            document = {"version": yardstick._VERSION, "machines": found}
+            document = {"version": reference_shaper._VERSION, "machines": found}
             temporary.write_text(json.dumps(document, indent=1) + "\n")
         return 0
     return 0 if known == found else 1
