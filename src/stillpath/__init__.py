@@ -1,5 +1,46 @@
 """Stillpath: print compensation for G-code.
 
-The rooms of the package lie in the checkout's root; here are links to them, so that all of it has
-one import name, ``stillpath``.
+``compensate``, ``simulate``, ``plan``, ``identify``, ``design``, ``load_machine``, ``Machine`` and
+``Client`` are the public interface (`stillpath.library`); everything else may change from one
+version to the next. The rooms of the package lie in the checkout's root. Here are links to them, so
+that all of it has one import name.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from stillpath.version import __version__
+
+if TYPE_CHECKING:
+    from stillpath.library import (
+        Client,
+        Machine,
+        compensate,
+        design,
+        identify,
+        load_machine,
+        plan,
+        simulate,
+    )
+
+__all__ = [
+    "Client",
+    "Machine",
+    "__version__",
+    "compensate",
+    "design",
+    "identify",
+    "load_machine",
+    "plan",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the library when it is first asked for: commands begin without it."""
+    if name not in __all__:
+        raise AttributeError(f"module 'stillpath' has no attribute {name!r}")
+    from stillpath import library
+
+    return getattr(library, name)

@@ -1,0 +1,69 @@
+"""The public Python interface: the examples of docs/python.md run as they stand there."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stillpath
+from stillpath.models.identification.synthetic import simulate_log, write_raw_data
+from stillpath.models.identification.types import Excitation
+from stillpath.models.plants import PairsSpec, PolePair
+from tests.web.served import running
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"^## (.+?)\n.*?```python\n(.+?)```", PAGE, re.DOTALL | re.MULTILINE))
+
+
+def test_what_is_public_is_there_and_told() -> None:
+    assert set(stillpath.__all__) <= set(dir(stillpath)) | set(stillpath.__all__)
+    for name in stillpath.__all__:
+        assert getattr(stillpath, name) is not None
+        assert name == "__version__" or f"`{name}" in PAGE
+    with pytest.raises(AttributeError, match="no attribute 'compensator'"):
+        stillpath.compensator  # noqa: B018
+
+
+def test_nothing_of_ours_takes_a_name_of_others() -> None:
+    """Folders of the checkout are reached below `stillpath` only."""
+    files = [path for room in (ROOT / "src" / "stillpath").iterdir() for path in room.rglob("*.py")]
+    assert len(files) > 300
+    rooms = "|".join(path.name for path in (ROOT / "src" / "stillpath").iterdir() if path.is_dir())
+    other = re.compile(rf"^\s*(?:from|import) (?:{rooms})\b", re.MULTILINE)
+    assert [path for path in files if other.search(path.read_text(encoding="utf-8"))] == []
+    assert importlib.util.find_spec("stillpath") is not None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("title", EXAMPLES)
+def test_an_example_of_the_page_runs(
+    title: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode", "part.gcode")
+    code = EXAMPLES[title]
+    if "raw_data" in code:
+        for k, axis in enumerate("xy"):
+            plants = {axis: PairsSpec(poles=(PolePair(f_hz=40.0 + 10.0 * k, zeta=0.05),))}
+            direction = Excitation((1.0, 0.0) if axis == "x" else (0.0, 1.0))
+            log = simulate_log(plants, direction, rng=np.random.default_rng(k))
+            write_raw_data(log, tmp_path, f"20261120_18{10 + 5 * k}00")
+    if "Client" in code:
+        with running(tmp_path / "service") as service:
+            exec(code.replace("http://127.0.0.1:8000", service.url), {})
+    else:
+        exec(code, {})
+    if "part.stillpath.gcode" in code:
+        assert b"; Processed by stillpath" in Path("part.stillpath.gcode").read_bytes()
+    if "print" in code:
+        assert capsys.readouterr().out.strip()
+
+
+def test_there_are_examples() -> None:
+    assert len(EXAMPLES) >= 5
