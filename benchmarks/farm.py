@@ -114,7 +114,7 @@ def server(data: Path, workers: int) -> Iterator[tuple[str, int]]:
 
 
 def stillpath(*arguments: str) -> list[str]:
-    return [sys.executable, "-c", "from cli.main import main; main()", *arguments]
+    return [sys.executable, "-c", "from stillpath.cli.main import main; main()", *arguments]
 
 
 def environment() -> dict[str, str]:

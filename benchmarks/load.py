@@ -117,7 +117,7 @@ def main() -> int:
 
 @contextlib.contextmanager
 def server(data: Path, workers: int) -> Iterator[Server]:
-    command = [sys.executable, "-c", "from cli.main import main; main()", "serve"]
+    command = [sys.executable, "-c", "from stillpath.cli.main import main; main()", "serve"]
     command += ["--port", "0", "--data-dir", str(data), "--workers", str(workers)]
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),

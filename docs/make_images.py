@@ -337,7 +337,7 @@ def _once(made: Path, *arguments: object, data_dir: Path | None = None) -> None:
     """Run `stillpath` if what it makes is not there yet."""
     if made.exists():
         return
-    code = "from cli.main import main; main()"
+    code = "from stillpath.cli.main import main; main()"
     command = [sys.executable, "-c", code, *map(str, arguments)]
     own = {} if data_dir is None else {"STILLPATH_DATA_DIR": str(data_dir)}
     subprocess.run(command, check=True, cwd=ROOT, env=os.environ | own)

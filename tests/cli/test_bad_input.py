@@ -93,7 +93,7 @@ def test_a_processed_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_an_interrupted_command_leaves_nothing(number: int, code: int, tmp_path: Path):
     source = ROOT / "examples" / "cura_ender3_gear24.gcode"
     target = tmp_path / "out.gcode"
-    command = [sys.executable, "-c", "from cli.main import main; main()"]
+    command = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
     command += ["compensate", str(source), "-o", str(target), "-m", "ender3"]
     process = subprocess.Popen(
         command, cwd=tmp_path, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)}

@@ -246,7 +246,7 @@ def test_refusals(arguments, capsys, monkeypatch, tmp_path):
 
 def test_help_and_version_are_quick_and_light():
     code = (
-        "import sys; from cli.main import run; run(['--help']); run(['--version']); "
+        "import sys; from stillpath.cli.main import run; run(['--help']); run(['--version']); "
         "sys.exit(any(name in sys.modules for name in ('numpy', 'numba', 'fastapi', 'jinja2')))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
@@ -258,7 +258,7 @@ def test_a_job_loads_only_what_it_needs():
     """Each of these costs every job a tenth of a second or more."""
     program = (
         "import sys, cli.main, pipeline.compensate\n"
-        "from cli.machines import open_machines\n"
+        "from stillpath.cli.machines import open_machines\n"
         "open_machines().for_job('ender3', files=True)\n"
         "heavy = ('scipy.signal', 'scipy.stats', 'pydantic_settings', 'fastapi', 'sqlite3')\n"
         "print([name for name in heavy if name in sys.modules])\n"

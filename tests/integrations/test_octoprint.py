@@ -188,7 +188,7 @@ def test_the_program_on_this_computer(octoprint: OctoPrint, tmp_path: Path):
     program = tmp_path / "my stillpath"
     program.write_text(
         f"#!/bin/sh\nPYTHONPATH={shlex.quote(str(ROOT))} exec {shlex.quote(sys.executable)} "
-        "-c 'from cli.main import main; main()' \"$@\"\n"
+        "-c 'from stillpath.cli.main import main; main()' \"$@\"\n"
     )
     program.chmod(0o755)
     octoprint.set(where="command", command=str(program), method="shaper:zv")

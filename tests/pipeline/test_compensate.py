@@ -33,7 +33,7 @@ from tests.gcode.cutting import HEAD, pieces_of
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, states, tagged
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "ps_ender3_pauses_hept24f.gcode"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "ps_ender3_pauses_hept24f.gcode"
 SMALL = (HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2100\n").encode()
 
 
@@ -367,7 +367,7 @@ def check_marks(original: bytes, written: bytes, machine: Machine) -> None:
 
 
 def all_files(folder: str) -> list[str]:
-    beside = Path(__file__).parents[4] / "shared" / "corpus" / folder
+    beside = Path(__file__).parents[3] / "shared" / "corpus" / folder
     return [f"{folder}/{p.name}" for p in sorted(beside.glob("*.gz"))] if beside.is_dir() else []
 
 

@@ -19,7 +19,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 from tests.gcode.prints import polygon
 
-EXAMPLES = Path(__file__).parents[3] / "examples" / "firmware"
+EXAMPLES = Path(__file__).parents[2] / "examples" / "firmware"
 HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\n"
 PART = "\n".join(polygon(6, 15)) + "\n"
 BEHIND = "G1 E-1 F2100\nG28 X\nG1 X60 Y60 F6000\n"

@@ -17,7 +17,7 @@ from stillpath.pipeline.options import Options
 from tests.gcode.prints import polygon
 from tests.gcode.states import differences, tagged
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 KINDS = ("marlin", "reprapfirmware")
 
 LIMITS = {"marlin": "M204 P1200 T1500", "reprapfirmware": "M204 P1200 T1500"}

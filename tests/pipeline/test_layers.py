@@ -28,7 +28,7 @@ from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.pipeline.tiles import read_tiles
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "ps_ender3_pauses_hept24f.gcode"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "ps_ender3_pauses_hept24f.gcode"
 SMALL = (
     HEAD
     + "G1 X5 Y5 F6000\nG1 X60 E4\n;LAYER_CHANGE\n;Z:0.2\nG1 Z0.2\nG1 X120 Y100 F6000\n"

@@ -21,7 +21,7 @@ from stillpath.pipeline.simulate import simulate_file
 from stillpath.pipeline.verifying import Verifier
 from tests.gcode.cutting import HEAD, pieces_of
 
-FIRMWARES = Path(__file__).parents[3] / "examples" / "firmware"
+FIRMWARES = Path(__file__).parents[2] / "examples" / "firmware"
 LINES = "G28\nG90\nM83\nG1 X60 Y60.005 Z5 F1200\n" + "".join(
     f"G1 X{60 + 10 * i} Y60.005 E1 F300\n" for i in range(1, 6)
 )

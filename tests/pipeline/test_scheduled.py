@@ -25,7 +25,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 KG_PER_MM = 1e-6 * 1.24 * 0.25 * math.pi * 1.75**2
 
 HEAD = "G28\nG90\nM83\nM204 S1500\n"

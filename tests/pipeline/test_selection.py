@@ -16,7 +16,7 @@ from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import Firmware, read
 from tests.gcode.states import differences, tagged
 
-GEAR = Path(__file__).parents[3] / "examples" / "cura_ender3_gear24.gcode"
+GEAR = Path(__file__).parents[2] / "examples" / "cura_ender3_gear24.gcode"
 KINDS: tuple[Firmware, ...] = ("klipper", "marlin", "reprapfirmware")
 
 

@@ -13,7 +13,7 @@ from stillpath.reports import report_schema
 from stillpath.reports.schema import schema_text
 from tests.service.synthetic import make_result
 
-PUBLISHED = Path(__file__).parents[3] / "docs" / "report.schema.json"
+PUBLISHED = Path(__file__).parents[2] / "docs" / "report.schema.json"
 
 
 def test_what_is_published_is_current() -> None:

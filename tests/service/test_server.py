@@ -19,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PRETEND = [sys.executable, str(Path(__file__).with_name("pretend_server.py"))]
-REAL = [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"]
+REAL = [sys.executable, "-c", "from stillpath.cli.main import main; main()", "serve", "--port", "0"]
 REAL += ["--data-dir"]
 
 

@@ -13,7 +13,14 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-SERVE = [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"]
+SERVE = [
+    sys.executable,
+    "-c",
+    "from stillpath.cli.main import main; main()",
+    "serve",
+    "--port",
+    "0",
+]
 ROOT = Path(__file__).resolve().parents[2]
 
 

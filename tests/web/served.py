@@ -19,7 +19,14 @@ __all__ = ["GEAR", "PATIENCE_MS", "Service", "running"]
 
 ROOT = Path(__file__).resolve().parents[2]
 GEAR = ROOT / "examples" / "cura_ender3_gear24.gcode"
-SERVE = [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"]
+SERVE = [
+    sys.executable,
+    "-c",
+    "from stillpath.cli.main import main; main()",
+    "serve",
+    "--port",
+    "0",
+]
 PATIENCE_MS = 240_000
 """For whatever a job or an identification takes on a loaded machine."""
 _ADDRESS = re.compile(r"stillpath: (http\S+?)/?\s*$")

@@ -17,7 +17,7 @@ from stillpath.service.processes import METHOD, loaded_context
 
 ROOT = Path(__file__).parents[3]
 PRINT = "G28\n" + "".join(f"G1 X{20 + 15 * (n % 2)} Y{20 + 5 * n} E{n} F6000\n" for n in range(20))
-COMMAND = [sys.executable, "-c", "from cli.main import main; main()"]
+COMMAND = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="kills processes")]
 

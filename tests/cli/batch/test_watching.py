@@ -192,10 +192,10 @@ def test_killed_again_and_again(tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     program = (
-        "import cli.batch.worker_pool as crew, sys\n"
+        "import stillpath.cli.batch.worker_pool as crew, sys\n"
         "from tests.cli.batch.pretending import PretendedLane\n"
         "crew.Lane = PretendedLane\n"
-        "from cli.main import run\n"
+        "from stillpath.cli.main import run\n"
         f"sys.exit(run(['watch', {str(folder)!r}, '-m', 'ender3', '-o', {str(out)!r},"
         " '--settle-s', '0.2', '--every-s', '0.5', '--jobs', '2']))\n"
     )

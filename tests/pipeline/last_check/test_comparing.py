@@ -24,7 +24,7 @@ from stillpath.service.jobs.problems import problem_of
 from tests.fuzz.machines import machine_of
 from tests.gcode.container_files import binary, package
 
-ROOT = Path(__file__).parents[4]
+ROOT = Path(__file__).parents[3]
 EXAMPLES = sorted((ROOT / "examples").glob("*.gcode"))
 PRINT = """\
 ; a small print

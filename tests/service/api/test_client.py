@@ -20,7 +20,7 @@ import pytest
 from stillpath.service.client import Client, ClientError
 from tests.service.test_server import PRETEND, ROOT, server, until
 
-STILLPATH = [sys.executable, "-c", "from cli.main import main; main()"]
+STILLPATH = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
 
 
 @pytest.fixture(scope="module")

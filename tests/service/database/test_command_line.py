@@ -68,7 +68,7 @@ def test_a_database_that_is_away_is_one_line(
 @pytest.mark.parametrize("arguments", [["compensate", "--help"], ["machines"]])
 def test_commands_without_a_database_do_not_load_it(arguments: list[str]):
     code = (
-        "import sys; from cli.main import run; "
+        "import sys; from stillpath.cli.main import run; "
         f"assert run({arguments!r}) == 0; "
         "heavy = {'sqlalchemy', 'alembic', 'psycopg', 'distributed'} & {*sys.modules}; "
         "sys.exit(' '.join(heavy) or 0)"

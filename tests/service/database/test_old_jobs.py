@@ -179,8 +179,8 @@ def test_one_that_cannot_be_read(tmp_path: Path, damage: str):
 def test_kills_at_any_moment(tmp_path: Path):
     old_directory(tmp_path, copies=60).close()
     code = (
-        "import sys; from pathlib import Path; from service.settings import Settings; "
-        "from service.database.engine import open_database; print('go', flush=True); "
+        "import sys; from pathlib import Path; from stillpath.service.settings import Settings; "
+        "from stillpath.service.database.engine import open_database; print('go', flush=True); "
         "open_database(Settings(data_dir=Path(sys.argv[1]))).dispose()"
     )
     chance = random.Random(3)

@@ -127,7 +127,7 @@ class Site:
     @contextlib.contextmanager
     def command(self, *arguments: str, **settings: Any) -> Iterator[Process]:
         """Run a command of `stillpath`."""
-        main = [sys.executable, "-c", "from cli.main import main; main()"]
+        main = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
         with self.process([*main, *arguments], **settings) as process:
             yield process
 

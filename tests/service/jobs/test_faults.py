@@ -197,7 +197,14 @@ def test_ends_at_random_moments_leave_every_job_done_once(site: Site):
 
 def test_the_real_road_survives_the_death_of_its_worker(site: Site):
     source = ROOT / "examples" / "ps_ender3_pauses_hept24f.gcode"
-    main = [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"]
+    main = [
+        sys.executable,
+        "-c",
+        "from stillpath.cli.main import main; main()",
+        "serve",
+        "--port",
+        "0",
+    ]
     with site.process(main) as process:
         job_id = site.submit(source.read_text())
         job = until(lambda: (j := site.running(job_id)).stage == "compensating" and j)

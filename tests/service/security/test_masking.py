@@ -87,7 +87,14 @@ def test_a_real_services_logs_hold_no_secret(tmp_path: Path):
     }
     with (tmp_path / "log").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-c", "from cli.main import main; main()", "serve", "--port", "0"],
+            [
+                sys.executable,
+                "-c",
+                "from stillpath.cli.main import main; main()",
+                "serve",
+                "--port",
+                "0",
+            ],
             cwd=ROOT,
             env=environment,
             stdout=subprocess.PIPE,
