@@ -157,7 +157,7 @@ def _machine(name: str, arguments: argparse.Namespace) -> Machine:
 
 
 def _known(machine: Machine, folder: Path) -> Machine:
-    """Spare a machine whose plants are those of another the tuning of its yardstick."""
+    """Spare a machine whose plants are those of another the tuning of its reference shaper."""
     plain = load_machine(machine.name)
     cached_shaper(plain, default_cache_dir())
     for path in default_cache_dir().glob(f"shaper-{plain.revision}-*"):

@@ -27,7 +27,7 @@ from readback import find_input, plain_copy, shared_folder
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Limits, Moves, rows_of
@@ -71,7 +71,7 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
 
 def worst_steps(written: Path, machine: Machine, breaks: int) -> list[float]:
     """Largest change of velocity around breaks of a written file, for each of `FACTORS`."""
-    firmware = kit(machine)
+    firmware = adapter(machine)
     stream = firmware.stream_limits(firmware.initial_limits()).as_row()
     rng = np.random.default_rng(20261124)
     reader = Interpreter(machine)

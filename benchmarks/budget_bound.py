@@ -14,7 +14,7 @@ from readback import find_input, plain_copy, shared_folder
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pacing import AS_SLICED, FirstLayer, Pace, move_classes, quickened
+from stillpath.gcode.pacing import AS_SLICED, FirstLayer, Pace, move_classes, paced
 from stillpath.gcode.pieces import Piece, Splitter
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
@@ -65,7 +65,7 @@ def least_s(file: Path, machine: Machine) -> tuple[float, float]:
                 classes = move_classes(item.moves, FirstLayer(1))
                 raised = {one: _TOP for one in np.unique(classes).tolist() if one != AS_SLICED}
                 sliced_s += item.phases.duration_s
-                quick_s += quickened(item, classes, raised, machine).phases.duration_s
+                quick_s += paced(item, classes, raised, machine).phases.duration_s
             if not data:
                 return sliced_s, quick_s
 

@@ -1,9 +1,10 @@
 """Does the firmware execute what was commanded? Written pieces against their command at 10 kHz.
 
-Runs the road itself and looks over its shoulder: whenever a piece was written and planned again
+Runs the pipeline itself and looks over its shoulder: whenever a piece was written and planned again
 from its text, the executed motion is compared with the command u, linear between its 1 kHz samples.
 Each stretch of X Y motion counts from its own start, since the rests between them take the time
-that the firmware gives them. Pieces that the road puts back afterwards are left out and counted.
+that the firmware gives them. Pieces that the pipeline puts back afterwards are left out and
+counted.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline import compensate
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.pass_through import last_length_mm
 from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.result import Result
+from stillpath.pipeline.verbatim import last_length_mm
 
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
 MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
@@ -64,7 +65,7 @@ class Spread:
 
 
 class Watched(compensate._Job):
-    """The road, with every verified piece measured."""
+    """The pipeline, with every verified piece measured."""
 
     def prepare(self) -> None:
         """Set the sums to nothing."""
@@ -117,7 +118,7 @@ class Watched(compensate._Job):
 def watched(
     source: Path, target: Path, machine: Machine, tolerance_um: float, cache: Path
 ) -> tuple[Watched, Result]:
-    """Compensate a file on the watched road."""
+    """Compensate a file on the watched pipeline."""
     options = Options(tolerance_um=tolerance_um)
     with source.open("rb") as text, target.open("wb") as written:
         unwatched = {"progress": None, "layers": None, "trace": None, "budget": None}

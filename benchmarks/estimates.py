@@ -19,7 +19,7 @@ from readback import shared_folder
 
 from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.estimator import estimated_s, rules_of
 from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
@@ -64,7 +64,7 @@ def marlin(facts: SlicerFacts) -> Machine:
 
 
 def planned_s(text: bytes, machine: Machine) -> float:
-    reader, planner = Interpreter(machine, strict_bounds=False), kit(machine).planner()
+    reader, planner = Interpreter(machine, strict_bounds=False), adapter(machine).planner()
     for at in range(0, len(text), _BLOCK_BYTES):
         for block in reader.push(text[at : at + _BLOCK_BYTES]):
             planner.push(block)

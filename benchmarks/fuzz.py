@@ -1,8 +1,8 @@
 """Damaged print files through interpreter, planner and encoder: nothing but refusals may come out.
 
 Each excerpt of the corpus is damaged, read and planned; then, without the lines that were refused,
-it goes down the whole road, and every line of what is written must find the machine in the state
-that it found it in before. Failures are made small and saved.
+it goes through the whole pipeline, and every line of what is written must find the machine in the
+state that it found it in before. Failures are made small and saved.
 
     python benchmarks/fuzz.py --bytes 10_000_000 --seed 1 [--machine ender3] [--method shaper:mzv]
         [--firmware examples/firmware/marlin.json [--facts '{"variant": "prusa"}']]

@@ -1,6 +1,6 @@
 """Files made to be slow or large, at a size and at twice that size: CPU time and memory.
 
-Each file goes down the whole road in a process of its own that may not take more memory than
+Each file goes through the whole pipeline in a process of its own that may not take more memory than
 ``--limit-mb`` or more processor time than ``--limit-s``; one that only waits is killed after
 ``--wall-s``. What is told is the CPU time of the second size over the first (2 is linear) and the
 peak of resident memory. MISS marks what is more than linear, too large, or ends in anything but a

@@ -2,11 +2,11 @@
 
 Run: python benchmarks/interpreting.py [FILE ...] [--megabytes 64] [--machine ender3]
 
-Every file is read over and over as one long file in pieces of a quarter of a megabyte, as the road
-reads it and with its settings of the allocator, the best of three runs counts, and times are CPU
-times. For comparison: counting newlines,
-and `gcodeparser` from PyPI (MIT; install it to see it), on the file once. Each row is a process of
-its own, so that the largest memory is the row's.
+Every file is read over and over as one long file in pieces of a quarter of a megabyte, as the
+pipeline reads it and with its settings of the allocator, the best of three runs counts, and times
+are CPU times. For comparison: counting newlines, and `gcodeparser` from PyPI (MIT; install it to
+see it), on the file once. Each row is a process of its own, so that the largest memory is the
+row's.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 
 from benchmarks.readback import shared_folder
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.models.store import load_machine
 from stillpath.service.environment import prepare_environment
@@ -109,7 +109,7 @@ def _parsed(parser: type, data: bytes) -> list:  # type: ignore[type-arg]
 def _interpret(data: bytes, repeats: int, machine_name: str, *, planning: bool) -> int:
     machine = load_machine(machine_name)
     interpreter = Interpreter(machine, strict_bounds=False)
-    planner = kit(machine).planner()
+    planner = adapter(machine).planner()
     moves = 0
     for _ in range(repeats):
         for first in range(0, len(data), PIECE):

@@ -5,7 +5,7 @@
 
 Starts a server on loopback for each part, with SQLite and a folder. Of a POST the time counts from
 the last kB of its body to the answer; that is sent when the server has read all before it (Linux
-tells). The yardstick is to write a file of the same size and fsync it, on the same disk: half of
+tells). The measure is to write a file of the same size and fsync it, on the same disk: half of
 these by as many threads as there are clients, the others beside the uploads. Prints quantity, limit
 and what it is; exits with 1 if a limit is missed.
 """

@@ -1,6 +1,6 @@
 """First print and ringing tower of every built-in machine: what is predicted for both halves.
 
-The right half is compensated by the road that any file takes, and both halves are judged on the
+The right half is compensated by the pipeline that any file takes, and both halves are judged on the
 written file. Pieces that are put back would make a right half like the left: they are counted.
 """
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Moves, Phases
@@ -154,7 +154,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     forced : sequence of int
         Rising numbers of moves behind which the machine stops although the file does not say so.
     """
-    reader, planner = Interpreter(machine), kit(machine).planner()
+    reader, planner = Interpreter(machine), adapter(machine).planner()
     parts: list[Phases] = []
     ends: list[Array] = []
     starts: list[Array] = []
@@ -187,7 +187,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     phases, end_mm = join_phases(parts), np.concatenate(ends)
     return Motion(
         phases=phases,
-        asked=intended(phases, np.concatenate(starts), end_mm, kit(machine).step_mm),
+        asked=intended(phases, np.concatenate(starts), end_mm, adapter(machine).step_mm),
         end_mm=end_mm,
         line=np.concatenate(lines),
         stops=np.sort(np.concatenate(stops)),
@@ -357,7 +357,7 @@ class Judge:
         self._nominal = [plant_set(axis, DT_S).nominal for axis in axes]
         sets = [plant_set(axis, _MEMBER_EVERY * DT_S).members for axis in axes]
         self._pairs = list(zip(*sets, strict=False)) if members else []
-        self._step_mm = max(kit(machine).step_mm[:2])
+        self._step_mm = max(adapter(machine).step_mm[:2])
         self._corexy = machine.kinematics == "corexy"
         self.contour, self.tracking, self.bend = Tally(), Tally(), Tally()
         self.members = [Tally() for _ in self._pairs]

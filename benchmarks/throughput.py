@@ -1,4 +1,4 @@
-"""How fast the road is and how much memory it takes, compilation apart.
+"""How fast the pipeline is and how much memory it takes, compilation apart.
 
 Fresh processes: one on a short file, which fills numba's cache, Python's bytecode and the cached
 shaper; some on the file, of which the fastest counts; one on the file made ten times as long (its

@@ -91,7 +91,7 @@ def check_input(source: Path) -> None:
     if not source.exists():
         raise Refused(f"there is no file {source}")
     if not source.is_file():
-        # The road reads a file twice, and opening a pipe waits for somebody to write.
+        # The pipeline reads a file twice, and opening a pipe waits for somebody to write.
         raise Refused(f"{source} is a pipe or a device; save it as a file first")
 
 

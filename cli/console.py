@@ -29,9 +29,9 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
 
     It raises `Interrupted` when the process was asked to stop.
     """
-    from stillpath.service.compiling import compiling_told
+    from stillpath.service.compiling import compiling_reported
 
-    with interruptible() as check, shown(title) as show, compiling_told(show) as told:
+    with interruptible() as check, shown(title) as show, compiling_reported(show) as told:
 
         def tell(progress: Progress) -> None:
             check()

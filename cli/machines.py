@@ -559,9 +559,9 @@ def _told(revision: Revision) -> None:
 
 def _refused(machine: Machine) -> list[str]:
     """Return a line that says why the machine's firmware cannot execute a compensated file."""
-    from stillpath.gcode.firmware.registry import kit
+    from stillpath.gcode.firmware.registry import adapter
 
-    reason = kit(machine).refusal
+    reason = adapter(machine).refusal
     return [] if reason is None else [f"{machine.name} can be simulated, not compensated: {reason}"]
 
 

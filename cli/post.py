@@ -60,10 +60,10 @@ def compensate_in_place(
         chosen = Options(**{key: options[key] for key in options if key != "machine"})
 
         from stillpath.pipeline.compensate import compensate_file
-        from stillpath.service.compiling import compiling_told
+        from stillpath.service.compiling import compiling_reported
 
         tell("starting", None)
-        with compiling_told(told) as progress:
+        with compiling_reported(told) as progress:
             result = compensate_file(path, path, found.machine, chosen, progress=progress)
     except ValidationError as error:
         raise Refused(wrong_option(error)) from None

@@ -82,7 +82,7 @@ def compensate_on_server(
     with interruptible_at_once(), _client(server, key) as client:
         with _progress() as tell:
             made = client.submit(source, machine=machine, options=options, tell=tell)
-            job = client.result_of(made, tell=_teller(tell))
+            job = client.result_of(made, tell=_reports(tell))
             if report is not None:
                 client.save_report(job.id, report)
             client.fetch(job, target, tell=tell)
@@ -138,7 +138,7 @@ def wait(
     with interruptible_at_once(), _client(server, key) as client, _progress() as tell:
         client.result_of(
             Submission(client.job(job), is_new=False),
-            tell=_teller(tell),
+            tell=_reports(tell),
             timeout_s=timeout,
         )
 
@@ -207,7 +207,7 @@ def _progress() -> Iterator[_Tell]:
         yield tell
 
 
-def _teller(tell: _Tell) -> Callable[[JobView], None]:
+def _reports(tell: _Tell) -> Callable[[JobView], None]:
     def told(job: JobView) -> None:
         waits = job.state.value == "queued" and job.queue_position
         stage = f"waiting behind {job.queue_position} jobs" if waits else job.stage

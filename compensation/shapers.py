@@ -1,4 +1,4 @@
-"""Input shapers as the firmware defines them: the yardstick, and compensators of their own.
+"""Input shapers as the firmware defines them: the reference shaper, and compensators of their own.
 
 A shaper replaces the command by a weighted sum of delayed copies of itself; the weights and
 delays make the vibrations of the copies cancel.

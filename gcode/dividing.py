@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
-from stillpath.gcode.pieces import LeftOut, Passage, Piece
+from stillpath.gcode.firmware.registry import adapter
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.timeline import group_rows
 from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
 from stillpath.models.machine import Machine
@@ -81,14 +81,14 @@ def _plan(piece: Piece, start: int, end: int, machine: Machine) -> Phases:
     """Return the plan of some moves of a piece, which begin and end at rest."""
     phases = piece.phases
     bounds = [row for row in (start - 1, end) if 0 <= row < len(phases)]
-    apart = kit(machine).extruder_alone_stops and not np.any(phases.direction[bounds, :3])
+    apart = adapter(machine).extruder_alone_stops and not np.any(phases.direction[bounds, :3])
     if apart:
         return rows_of(phases, slice(start, end))
     rows = rows_of(piece.moves, slice(start, end))
     return plan_moves(rows, piece.limits, machine, rests_apart=True)
 
 
-def _part(piece: Piece, start: int, end: int) -> Passage:
+def _part(piece: Piece, start: int, end: int) -> VerbatimPart:
     """Return the lines of moves start..end - 1 of a part that is compensated, no others."""
     begin = int(piece.moves.byte_start[start]) if start else piece.text_offset
     return _lines(piece, start, end, begin, int(piece.moves.byte_end[end - 1]))
@@ -102,17 +102,17 @@ def _left_out(piece: Piece, start: int, end: int) -> LeftOut:
     if end < len(piece.moves):
         until = int(piece.moves.byte_start[end])
     lines = _lines(piece, start, end, begin, until)
-    return LeftOut(**{f.name: getattr(lines, f.name) for f in fields(Passage)})
+    return LeftOut(**{f.name: getattr(lines, f.name) for f in fields(VerbatimPart)})
 
 
-def _lines(piece: Piece, start: int, end: int, begin: int, until: int) -> Passage:
+def _lines(piece: Piece, start: int, end: int, begin: int, until: int) -> VerbatimPart:
     """Return moves start..end - 1 and the bytes begin..until - 1, both of a piece."""
     moves, events = piece.moves, piece.events
     rows = slice(*np.searchsorted(events.byte_start, [begin, until]).tolist())
     ours = rows_of(events, rows)
     limits_before, modal_before = _state(piece, begin)
     limits_after, modal_after = _state(piece, until)
-    return Passage(
+    return VerbatimPart(
         moves=rows_of(moves, slice(start, end)),
         events=replace(ours, move_index=ours.move_index - start),
         text=piece.text[begin - piece.text_offset : until - piece.text_offset],

@@ -20,7 +20,7 @@ from stillpath.gcode._lex_kernels import PADDING, run
 from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.lexer import Command, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
 from stillpath.gcode.slicers.marks import MarkKind, read_mark
@@ -72,7 +72,7 @@ class Interpreter:
     ) -> None:
         self.machine = machine
         dialect = dialect or dialect_of(machine.firmware)
-        limits = kit(machine).initial_limits()
+        limits = adapter(machine).initial_limits()
         self.state = MachineState(machine, dialect, limits, strict=strict_bounds)
         self._modal: list[ModalState] = []
         self._limits: list[Limits] = []

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import CommandLimits, Machine
@@ -29,7 +29,7 @@ __all__ = [
     "FirstLayer",
     "Pace",
     "move_classes",
-    "quickened",
+    "paced",
     "top_limits",
 ]
 
@@ -109,7 +109,7 @@ def top_limits(machine: Machine) -> CommandLimits:
     )
 
 
-def quickened(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machine) -> Piece:
+def paced(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machine) -> Piece:
     """Return a piece with the moves of each class at their pace, planned anew.
 
     Parameters
@@ -135,7 +135,7 @@ def quickened(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: M
     moves = piece.moves
     limits_id, speed = moves.limits_id.copy(), moves.speed_mm_s.copy()
     limits = list(piece.limits)
-    firmware, most = kit(machine), top_limits(machine)
+    firmware, most = adapter(machine), top_limits(machine)
     for one, pace in paces.items():
         rows = np.flatnonzero(classes == one)
         if len(rows) == 0 or pace == SAME:
@@ -143,7 +143,7 @@ def quickened(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: M
         ratio = pace.speed if one == TRAVEL else 1.0
         speed[rows] = np.minimum(ratio * speed[rows], np.maximum(speed[rows], most.velocity_mm_s))
         for own in np.unique(moves.limits_id[rows]).tolist():
-            made = firmware.quickened(piece.limits[own], pace.accel, ratio, most)
+            made = firmware.paced(piece.limits[own], pace.accel, ratio, most)
             if made == piece.limits[own]:
                 continue
             limits_id[rows[moves.limits_id[rows] == own]] = len(limits)

@@ -1,9 +1,9 @@
-"""Cut an interpreted file into pieces to compensate and passages that leave as they came.
+"""Cut an interpreted file into pieces to compensate and verbatim parts that leave as they came.
 
 A *piece* starts and ends with a move of X or Y, at rest, with X and Y known throughout; nothing in
 it stops the machine but its own retractions and Z hops. It lasts at most a minute and has at most
 so many moves and lines, so that memory does not grow with the file and a fault costs little.
-Everything else is a *passage*.
+Everything else is a *verbatim part*.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.types import (
     KEPT,
     OF_STATE,
@@ -33,7 +33,7 @@ from stillpath.gcode.types import (
 )
 from stillpath.models.machine import Machine
 
-__all__ = ["LeftOut", "Passage", "Piece", "Splitter", "excerpt"]
+__all__ = ["LeftOut", "Piece", "Splitter", "VerbatimPart", "excerpt"]
 
 T = TypeVar("T", Moves, Events, Phases)
 S = TypeVar("S", Moves, Events)
@@ -55,7 +55,7 @@ _SET_EXTRUDER = re.compile(rb"\s*(?:N\d+\s*)?G92\s*E\s*[-+]?(?:\d+\.?\d*|\.\d+)\
 
 
 @dataclass(frozen=True, slots=True)
-class Passage:
+class VerbatimPart:
     """Lines of the file in order, to leave as they came.
 
     Attributes
@@ -96,18 +96,18 @@ class Passage:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece(Passage):
+class Piece(VerbatimPart):
     """Lines to compensate, with the firmware's own plan of their moves, from rest to rest."""
 
     phases: Phases
 
     @classmethod
-    def planned(cls, lines: Passage, phases: Phases) -> Piece:
-        """Return the lines of a passage with the plan of its moves."""
+    def planned(cls, lines: VerbatimPart, phases: Phases) -> Piece:
+        """Return the lines of a verbatim part with the plan of its moves."""
         return cls(**{f.name: getattr(lines, f.name) for f in fields(lines)}, phases=phases)
 
 
-class LeftOut(Passage):
+class LeftOut(VerbatimPart):
     """Lines that could be compensated and leave as they came because somebody chose so."""
 
 
@@ -120,14 +120,14 @@ class Splitter:
     longest_s : float
         No piece lasts longer.
     compensate : bool
-        False makes everything one passage after another (method none).
+        False makes everything one verbatim part after another (method none).
     """
 
     def __init__(
         self, machine: Machine, *, longest_s: float = 60.0, compensate: bool = True
     ) -> None:
         self._machine = machine
-        self._kit = kit(machine)
+        self._adapter = adapter(machine)
         self._longest_s = longest_s
         self._compensate = compensate
         self._moves: Moves | None = None
@@ -142,12 +142,12 @@ class Splitter:
         self._limits_id = 0
         self._modal_id = 0
 
-    def push(self, block: ProgramBlock) -> Iterator[Piece | Passage]:
+    def push(self, block: ProgramBlock) -> Iterator[Piece | VerbatimPart]:
         """Take a block; yield what is complete."""
         self._append(block)
         yield from self._cut(final=False)
 
-    def flush(self) -> Iterator[Piece | Passage]:
+    def flush(self) -> Iterator[Piece | VerbatimPart]:
         """Yield the rest at the end of the file."""
         if self._moves is not None:
             yield from self._cut(final=True)
@@ -215,7 +215,7 @@ class Splitter:
             np.flatnonzero(kind == what) for what in (EventKind.LIMITS, EventKind.MODE)
         )
         others = _changes(
-            self._limits_id, events.limits_id[of_limits], limits, self._kit.stream_limits
+            self._limits_id, events.limits_id[of_limits], limits, self._adapter.stream_limits
         )
         # Where E counts differently from here on, it must be where the file says.
         factors = _changes(
@@ -239,7 +239,7 @@ class Splitter:
         needed = np.where(travel[:, 2] != 0.0, 7, 3)
         raw = xy & (((moves.known & needed) != needed) | ((moves.known & KEPT) != 0))
         raw |= xy & _finds_height(block)
-        raw |= xy & self._kit.too_steep(travel)
+        raw |= xy & self._adapter.too_steep(travel)
         length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
         raw |= xy & (length > self._longest_s * moves.speed_mm_s)
         feed = np.abs(travel[:, 3])
@@ -261,7 +261,7 @@ class Splitter:
             raw = np.repeat(spread, ends - starts) & xy
         return np.asarray(raw | ((moves.known & OF_STATE) != 0))
 
-    def _cut(self, *, final: bool) -> Iterator[Piece | Passage]:
+    def _cut(self, *, final: bool) -> Iterator[Piece | VerbatimPart]:
         while self._moves is not None and self._events is not None:
             moves, events = self._moves, self._events
             count = len(moves)
@@ -302,7 +302,7 @@ class Splitter:
                 yield self._piece(last, phases)
                 continue
             last, natural = _place_to_cut(moves, phases, self._longest_s)
-            if natural and self._kit.extruder_alone_stops:
+            if natural and self._adapter.extruder_alone_stops:
                 phases = rows_of(phases, slice(0, last))
             else:
                 phases = self._plan(rows_of(moves, slice(0, last)))
@@ -334,7 +334,7 @@ class Splitter:
         assert self._moves is not None
         return Piece.planned(self._take(int(self._moves.byte_end[last - 1])), phases)
 
-    def _take(self, until: int | None) -> Passage:
+    def _take(self, until: int | None) -> VerbatimPart:
         """Remove the lines before byte `until` (None: all) from what is held."""
         assert self._moves is not None
         assert self._events is not None
@@ -352,7 +352,7 @@ class Splitter:
             row = (m if last_move > last_event else e) - 1
             self._limits_id, self._modal_id = int(state.limits_id[row]), int(state.modal_id[row])
         text = self._text[: until - self._text_offset]
-        taken = Passage(
+        taken = VerbatimPart(
             moves=rows_of(moves, slice(0, m)),
             events=rows_of(events, slice(0, e)),
             text=text,

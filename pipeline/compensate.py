@@ -1,8 +1,9 @@
-"""The road: a print file in, a compensated and verified file out, in bounded memory.
+"""The pipeline: a print file in, a compensated and verified file out, in bounded memory.
 
-A file is read block by block, cut into pieces and passages, and written in order. Every piece that
-was changed is read back from the bytes as written, planned by the firmware's rules and compared
-with what it should do; a piece that fails leaves as it came. All figures come from that motion.
+A file is read block by block, cut into pieces and verbatim parts, and written in order. Every piece
+that was changed is read back from the bytes as written, planned by the firmware's rules and
+compared with what it should do; a piece that fails is written as sliced. All figures come from that
+motion.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from stillpath.compensation.base import DesignError
 from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended, join_phases, plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import LeftOut, Passage, Piece, Splitter
+from stillpath.gcode.pieces import LeftOut, Piece, Splitter, VerbatimPart
 from stillpath.gcode.sampler import sample_phases, sample_until
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
@@ -48,7 +49,6 @@ from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.pacing.samples import take_samples
-from stillpath.pipeline.pass_through import feeding, plan_passage, switching_s, takes_s
 from stillpath.pipeline.piece_compensator import (
     DT_S,
     CompensatedPiece,
@@ -57,19 +57,20 @@ from stillpath.pipeline.piece_compensator import (
     as_executed,
     deviation,
 )
-from stillpath.pipeline.progress import ProgressCallback, Teller, telling
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import dialect_for, doubts, passed_over
 from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge, narrower
 from stillpath.pipeline.simulate import STANDING_S, plan_file, simulate_file
-from stillpath.pipeline.totals import Sums
+from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.tracing import Trace
+from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
 from stillpath.version import __version__
 
 __all__ = ["compensate_file", "plan_file", "simulate_file"]
 
-T = TypeVar("T", bound=Passage)
+T = TypeVar("T", bound=VerbatimPart)
 
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
@@ -135,7 +136,10 @@ def compensate_file(
             progress=progress,
             layers=layers,
         )
-    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    unpacking, packing = (
+        progress_to(progress, "unpacking", 0.0),
+        progress_to(progress, "packing", 1.0),
+    )
     with (
         contextlib.ExitStack() as files,
         replacing(target) as temporary,
@@ -166,7 +170,7 @@ def compensate_file(
                     spool.truncate()
                     writer = writer.anew() if writer is not None else None
                     continue
-                budget = job.milder
+                budget = job.gentler
                 if budget is None and traced is trace:
                     break
                 if budget is None:
@@ -239,14 +243,14 @@ class _Job:
         self._layers = layers
         self._source, self._target = source, target
         self._machine, self._options = machine, options
-        self._teller = Teller(progress)
+        self._reports = ProgressReports(progress)
         self._clock = StageClock()
         self._changes = options.method != "none"
-        self._kit = kit(machine)
-        self._rounds = max(self._kit.step_mm[:2]) > 0.0
-        if self._changes and self._kit.refusal is not None:
-            raise ModelError(f"{machine.name} cannot execute this file: {self._kit.refusal}")
-        # A method that cannot be designed says so before the yardstick takes its seconds.
+        self._adapter = adapter(machine)
+        self._rounds = max(self._adapter.step_mm[:2]) > 0.0
+        if self._changes and self._adapter.refusal is not None:
+            raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
+        # A method that cannot be designed says so before the reference shaper takes its seconds.
         tuned_first = options.method.startswith("shaper:")
         if self._changes and not tuned_first:
             self._say("designing", 0.0)
@@ -291,10 +295,10 @@ class _Job:
             )
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
-            self._writer = StreamWriter(self._kit, stamp(machine, options))
+            self._writer = StreamWriter(self._adapter, stamp(machine, options))
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum = Sums()
+        self._sum = Totals()
         self._sum.warnings += doubts(source, machine, options.dialect)
         if options.budget_um is not None and not self._changes:
             self._sum.warnings.append("The method none changes nothing: the budget was not used.")
@@ -305,11 +309,11 @@ class _Job:
         return options.budget_um is not None and options.method != "none"
 
     @property
-    def milder(self) -> SpeedBudget | None:
+    def gentler(self) -> SpeedBudget | None:
         """What the file must be written with instead, where it exceeds its budget."""
         if self._budget is None or self._pairs is None:
             return None
-        return self._budget.milder(self._pairs.sums())
+        return self._budget.gentler(self._pairs.sums())
 
     @property
     def same(self) -> SpeedBudget | None:
@@ -318,7 +322,7 @@ class _Job:
 
     @property
     def delay_s(self) -> float:
-        """How much later than the original the written file is where the road has come to."""
+        """How much later than the original the written file is where the pipeline has come to."""
         return self._sum.time_s - self._sum.original_s
 
     def run(self, name: str, facts: SlicerFacts) -> Result:
@@ -332,7 +336,7 @@ class _Job:
             if isinstance(item, Piece):
                 self._piece(item)
             else:
-                self._passage(item)
+                self._verbatim(item)
             self._operation.passed(item.moves)
             self._say("compensating", self._source.tell() / size)
         if self._sum.moves == 0:
@@ -344,7 +348,7 @@ class _Job:
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
-        if self.milder is None:
+        if self.gentler is None:
             self._say("done", 1.0)
         return self._result(name, size, facts)
 
@@ -353,8 +357,8 @@ class _Job:
         if not self._changes:
             self.retiming.copy(self._target, text, self.delay_s)
             return result
-        shortest_mm = 2.0 * self._kit.shortest_move_mm
-        check = LastCheck(text, self._source, self._machine, self._kit.step_mm, shortest_mm)
+        shortest_mm = 2.0 * self._adapter.shortest_move_mm
+        check = LastCheck(text, self._source, self._machine, self._adapter.step_mm, shortest_mm)
         self.retiming.copy(self._target, check, self.delay_s)
         figures = check.finish()
         stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
@@ -374,7 +378,7 @@ class _Job:
                 found, self._machine, self._options, self._shaper, self._caution
             )
 
-    def _selected(self) -> Iterator[Piece | Passage]:
+    def _selected(self) -> Iterator[Piece | VerbatimPart]:
         for item in self._items():
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._timed(self._selection.divide(item, names))
@@ -382,7 +386,7 @@ class _Job:
                 # The file as it came does not stand still where it was divided.
                 self._sum.original_s = before_s + item.phases.duration_s
 
-    def _items(self) -> Iterator[Piece | Passage]:
+    def _items(self) -> Iterator[Piece | VerbatimPart]:
         while True:
             with self._clock.stage("read"):
                 data = self._source.read(_BLOCK_BYTES)
@@ -528,23 +532,23 @@ class _Job:
         self._sum.moves -= len(piece.moves)
         if self._budget is not None:
             self._budget.passed(-seconds)
-        self._passage(piece)
+        self._verbatim(piece)
 
-    def _passage(self, passage: Passage) -> None:
-        text = passage.text
+    def _verbatim(self, verbatim: VerbatimPart) -> None:
+        text = verbatim.text
         if self._changes:
-            text = self._writer.passage(passage, self._checker.extruder_mm)
+            text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
             with self._clock.stage("read back"):
                 blocks = self._checker.push(text)
             # Lines of ours make it stand too, or its own longer than they did.
-            self._wait(switching_s(blocks) - switching_s([passage]))
-        self._emit(text, passage, self.delay_s)
-        self._sum.moves += len(passage.moves)
-        self._sum.newline = passage.text.endswith(b"\n") if passage.text else self._sum.newline
+            self._wait(switching_s(blocks) - switching_s([verbatim]))
+        self._emit(text, verbatim, self.delay_s)
+        self._sum.moves += len(verbatim.moves)
+        self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
         with self._clock.stage("plan"):
-            parts = list(plan_passage(passage, self._machine))
+            parts = list(plan_verbatim(verbatim, self._machine))
         seconds = sum(takes_s(part) for part in parts)
-        self._check_end(passage, seconds)
+        self._check_end(verbatim, seconds)
         if self._budget is not None:
             self._budget.passed(seconds)
         with self._clock.stage("measure"):
@@ -553,16 +557,16 @@ class _Job:
                     self._measurement.jump()
                     self._observe(None)
                 elif isinstance(part, Phases):
-                    self._measure_passage(passage, part)
+                    self._measure_verbatim(verbatim, part)
                 else:
                     self._stand(part)
 
-    def _check_end(self, item: Passage, seconds: float) -> None:
+    def _check_end(self, item: VerbatimPart, seconds: float) -> None:
         lines: Moves | Events = item.moves if len(item.moves) else item.events
         if len(lines):
             self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
 
-    def _measure_passage(self, passage: Passage, phases: Phases) -> None:
+    def _measure_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
         duration = phases.accel_s + phases.cruise_s + phases.decel_s
         motion_s = phases.duration_s
         self._sum.original_s += motion_s
@@ -570,17 +574,17 @@ class _Job:
         feeds = feeding(phases)
         extruding_s = float(np.sum(duration[feeds]))
         self._sum.extruding_s += extruding_s
-        if isinstance(passage, LeftOut):
+        if isinstance(verbatim, LeftOut):
             self._sum.left_out_s += motion_s
             self._sum.left_out_extruding_s += extruding_s
         else:
             self._sum.passed_motion_s += motion_s
-        if np.any(feeds) and not isinstance(passage, LeftOut):
+        if np.any(feeds) and not isinstance(verbatim, LeftOut):
             self._sum.passed_s += extruding_s
             first = phases.move_index[int(np.argmax(feeds))]
-            self._sum.passed_line = self._sum.passed_line or int(passage.moves.line[first])
+            self._sum.passed_line = self._sum.passed_line or int(verbatim.moves.line[first])
         until = np.where(feeds, phases.t_s + duration, -np.inf)
-        asked = self._asked(passage, phases)
+        asked = self._asked(verbatim, phases)
         samples = max(round(motion_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             n = min(_CHUNK, samples - start)
@@ -588,12 +592,12 @@ class _Job:
             path, row, extruding = sample_until(asked, grid, until, axes=3)
             came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
             at = phases.move_index[row]
-            self._measurement.add(self._samples(passage, at, path, came, extruding, came))
+            self._measurement.add(self._samples(verbatim, at, path, came, extruding, came))
             self._observe(path[:2])
 
     def _samples(
         self,
-        item: Piece | Passage,
+        item: Piece | VerbatimPart,
         row: np.ndarray,
         planned: np.ndarray,
         executed: np.ndarray,
@@ -615,8 +619,8 @@ class _Job:
             sliced_mm=sliced if self._rounds else None,
         )
 
-    def _asked(self, item: Piece | Passage, phases: Phases) -> Phases:
-        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._kit.step_mm)
+    def _asked(self, item: Piece | VerbatimPart, phases: Phases) -> Phases:
+        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._adapter.step_mm)
 
     def _stand(self, dwell_s: float) -> None:
         """Let the machine stand where it is."""
@@ -650,13 +654,13 @@ class _Job:
         parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
         if len(parts) == 1:
             return plan_moves(parts[0][0], parts[0][1], self._machine)
-        planner = self._kit.planner()
+        planner = self._adapter.planner()
         phases = [planner.push_moves(moves, limits) for moves, limits in parts]
         phases.append(planner.flush())
         return join_phases(phases)
 
     def _emit(
-        self, text: bytes, item: Passage | None = None, delay_s: float | np.ndarray = 0.0
+        self, text: bytes, item: VerbatimPart | None = None, delay_s: float | np.ndarray = 0.0
     ) -> None:
         self._sum.written += len(text)
         most_mb = self._options.max_mb
@@ -666,7 +670,7 @@ class _Job:
         self.retiming.push(text, item, delay_s)
 
     def _say(self, stage: str, fraction: float) -> None:
-        self._teller.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
+        self._reports.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
 
     def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
         """Yield a warning where the firmware's shaper, without compensation, would do better."""

@@ -6,7 +6,7 @@ from typing import BinaryIO
 
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.firmware.planning import check_print_ends
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import Events, Moves
 from stillpath.models.machine import Machine
@@ -52,7 +52,7 @@ class LengthGuard:
 
     def _look_ahead(self) -> None:
         reader = Interpreter(self._machine, dialect=self._dialect)
-        planner = kit(self._machine).planner()
+        planner = adapter(self._machine).planner()
         line = 1
         self._text.seek(0)
         while True:

@@ -13,10 +13,10 @@ from stillpath.compensation.cautious import Caution
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.scheduled import BLEND_STEP, STEP
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import intended
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import distances, sample_phases, sample_until
 from stillpath.gcode.segments import ErrorFilter, Segments, fit_segments
@@ -134,7 +134,7 @@ class PieceCompensator:
         self.compensator: Compensator = (
             designed(options, design_mode(machine, options), design) if fbf else design(None)
         )
-        firmware = kit(machine)
+        firmware = adapter(machine)
         self.encoder = firmware.encoder()
         self._step_mm = firmware.step_mm
         self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
@@ -374,7 +374,7 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
         command[3, span] = command[3, span.start] + fed_mm
 
 
-def follow_tolerance_mm(firmware: FirmwareKit, tolerance_um: float) -> float:
+def follow_tolerance_mm(firmware: FirmwareAdapter, tolerance_um: float) -> float:
     """Return how far executed motion may be from its command, but for some exceptions.
 
     Where vertices lie on steps, and when steps come, are off by up to a step each. What is shorter

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-__all__ = ["Cancelled", "Progress", "ProgressCallback", "Teller", "telling"]
+__all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "progress_to"]
 
 
 _SURE = 0.02
@@ -46,7 +46,7 @@ ProgressCallback = Callable[[Progress], None]
 """Called now and then; may raise `Cancelled`."""
 
 
-class Teller:
+class ProgressReports:
     """Tells where a job is, and how long it may still take.
 
     Parameters
@@ -67,7 +67,7 @@ class Teller:
         self._callback(Progress(stage, min(fraction, 1.0), print_s, elapsed_s, eta_s))
 
 
-def telling(
+def progress_to(
     callback: ProgressCallback | None, stage: str, fraction: float
 ) -> Callable[[float], None]:
     """Return a callback for a stage before or behind the work that `fraction` counts.

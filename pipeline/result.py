@@ -134,7 +134,7 @@ class LayerView(_Figures):
 
 
 class StageTime(_Figures):
-    """CPU seconds that one stage of the road took."""
+    """CPU seconds that one stage of the pipeline took."""
 
     stage: str
     """Name of the stage."""

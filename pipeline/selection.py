@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.dividing import divided, sections
-from stillpath.gcode.pieces import LeftOut, Passage, Piece
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.slicers.features import Feature, feature_of
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import Options, Where
-from stillpath.pipeline.pass_through import feeding
 from stillpath.pipeline.result import GroupFigures
+from stillpath.pipeline.verbatim import feeding
 
 __all__ = ["Selection", "TooLarge", "narrower"]
 
@@ -57,8 +57,8 @@ class Selection:
         """By number of a feature whether it counts."""
 
     def divide(
-        self, item: Piece | Passage, names: Sequence[str]
-    ) -> Iterator[Piece | Passage | LeftOut]:
+        self, item: Piece | VerbatimPart, names: Sequence[str]
+    ) -> Iterator[Piece | VerbatimPart | LeftOut]:
         """Cut a piece into what is compensated and what is left out; the rest passes through.
 
         Parameters

@@ -17,7 +17,7 @@ from stillpath.gcode.containers.opening import open_text
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import check_moves_end, check_print_ends, intended
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import Sampler, Samples
 from stillpath.gcode.slicers.facts import SlicerFacts
@@ -36,7 +36,7 @@ from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
-from stillpath.pipeline.progress import ProgressCallback, Teller, telling
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from stillpath.pipeline.result import Result, StageTime
 from stillpath.pipeline.shaping import ShapedMotion
@@ -314,9 +314,9 @@ class TextMotion:
         self._shaping = self._read_shaping = shaping
         self._changes: list[tuple[int, Shaping]] = []
         """Moves in front of which the shaper was set, and to what."""
-        self._step_mm = kit(machine).step_mm
+        self._step_mm = adapter(machine).step_mm
         self._sampler, self._path_sampler = Sampler(dt_s), Sampler(dt_s)
-        self._adviser = kit(machine).adviser(dialect)
+        self._adviser = adapter(machine).adviser(dialect)
         self._unmodelled: set[str] = set()
         self.shapers: list[str] = []
         self.time_s = 0.0
@@ -329,7 +329,7 @@ class TextMotion:
 
     def __iter__(self) -> Iterator[MotionPart]:
         file = self._file
-        planner = kit(self._machine).planner()
+        planner = adapter(self._machine).planner()
         moves = 0
         guard = LengthGuard(file, self._machine, self._dialect)
         size = max(file.seek(0, io.SEEK_END), 1)
@@ -473,7 +473,7 @@ class _Motion:
         self._dialect = dialect_for(machine, dialect)
         self._asked = dialect
         self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
-        self._progress, self._teller = progress, Teller(progress)
+        self._progress, self._reports = progress, ProgressReports(progress)
         self.time_s = 0.0
         self.feature_names: list[str] = []
         self.facts = SlicerFacts()
@@ -481,7 +481,7 @@ class _Motion:
         self.shapers: list[str] = []
 
     def __iter__(self) -> Iterator[MotionPart]:
-        unpacking = telling(self._progress, "unpacking", 0.0)
+        unpacking = progress_to(self._progress, "unpacking", 0.0)
         with open_text(self._source, plate=self._plate, told=unpacking) as container:
             self.facts = container.facts()
             doubtful = doubts(container.text, self._machine, self._asked)
@@ -491,7 +491,7 @@ class _Motion:
                 self._dialect,
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,
-                told=partial(self._teller.say, "planning"),
+                told=partial(self._reports.say, "planning"),
             )
             self.feature_names = motion.reader.feature_names
             yield from motion

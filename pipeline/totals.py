@@ -7,17 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from stillpath.gcode.types import Phases
-from stillpath.pipeline.pass_through import last_length_mm
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
+from stillpath.pipeline.verbatim import last_length_mm
 
-__all__ = ["Sums"]
+__all__ = ["Totals"]
 
 _WARN_SHARE = 0.2
 """Of the extruding time, above which it is said that it is not compensated."""
 
 
-class Sums:
+class Totals:
     """What adds up along a file."""
 
     def __init__(self) -> None:

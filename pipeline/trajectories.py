@@ -1,6 +1,6 @@
 """What the nozzle does, sample by sample: commanded and simulated motion as a table.
 
-The road is gone once more, on the file as it came, up to the end of what is asked for.
+The pipeline is gone once more, on the file as it came, up to the end of what is asked for.
 """
 
 from __future__ import annotations

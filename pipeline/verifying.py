@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.measuring.points import MotionSamples
-from stillpath.pipeline.pass_through import last_length_mm
 from stillpath.pipeline.piece_compensator import (
     DT_S,
     CompensatedPiece,
@@ -19,6 +18,7 @@ from stillpath.pipeline.piece_compensator import (
     follow_tolerance_mm,
     strayed,
 )
+from stillpath.pipeline.verbatim import last_length_mm
 from stillpath.simulation.measures import MotionMeter
 from stillpath.simulation.scheduled import MachineStream
 
@@ -46,7 +46,7 @@ class Verifier:
     """
 
     def __init__(self, machine: Machine, tolerance_um: float) -> None:
-        firmware = kit(machine)
+        firmware = adapter(machine)
         self._machine = machine
         self._step_mm = np.array(firmware.step_mm)
         self._tolerance_mm = follow_tolerance_mm(firmware, tolerance_um)

@@ -16,7 +16,7 @@ from numba.core.event import Listener, install_listener
 
 from stillpath.pipeline.progress import Progress, ProgressCallback
 
-__all__ = ["STAGE", "compiling_told"]
+__all__ = ["STAGE", "compiling_reported"]
 
 STAGE = "compiling for this computer (once, some minutes)"
 
@@ -25,7 +25,7 @@ _QUIET_S = 15.0
 
 
 @contextmanager
-def compiling_told(callback: ProgressCallback) -> Iterator[ProgressCallback]:
+def compiling_reported(callback: ProgressCallback) -> Iterator[ProgressCallback]:
     """Yield a progress callback that says when this process compiles instead of working.
 
     Parameters

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["TruthStream", "refined", "truth_response"]
+__all__ = ["ContinuousPlantStream", "continuous_response", "refined"]
 
 Array = NDArray[np.float64]
 
 
-class TruthStream:
+class ContinuousPlantStream:
     """Stream of the true response to a command sampled at `dt_s`.
 
     Parameters
@@ -51,8 +51,8 @@ def refined(u_mm: Array, factor: int) -> Array:
     return np.vstack([np.interp(fine, np.arange(n), row) for row in u_mm])
 
 
-def truth_response(
+def continuous_response(
     specs: Sequence[PlantSpec], u_mm: Array, dt_s: float = 1e-3, factor: int = 10
 ) -> Array:
     """Return the true positions at `dt_s / factor` for a command sampled at `dt_s`."""
-    return TruthStream(specs, dt_s / factor).push(refined(u_mm, factor))
+    return ContinuousPlantStream(specs, dt_s / factor).push(refined(u_mm, factor))

@@ -1,7 +1,7 @@
 """Two halves of one print, left as planned and right compensated, and what becomes of them.
 
 Both halves are mirror images, drawn outwards from the gap between them, so that the same walls are
-reached by the same corners. The right one is compensated by the road itself, as any file is.
+reached by the same corners. The right one is compensated by the pipeline itself, as any file is.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stillpath.applications.proof.program import (
     Program,
     place,
 )
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.machine import Machine
 from stillpath.models.plants import continuous
 from stillpath.pipeline.compensate import compensate_file
@@ -138,7 +138,7 @@ class ProofPrint:
     Attributes
     ----------
     result : Result
-        The road's, measured on the written file.
+        The pipeline's, measured on the written file.
     ringing : dict of str to Ringing
         By region.
     legend : list of str
@@ -208,8 +208,8 @@ def _ringing(result: Result) -> dict[str, Ringing]:
 
 def _warnings(machine: Machine, result: Result) -> list[str]:
     out = list(result.warnings)
-    voice = kit(machine).voice()
-    if voice.shaper_off and voice.shaper_on is None:
+    stream_commands = adapter(machine).stream_commands()
+    if stream_commands.shaper_off and stream_commands.shaper_on is None:
         out.append(
             "the firmware's input shaper is switched off for both halves, and the machine does not "
             "say what it was (firmware.shaper): restart the firmware after the print"

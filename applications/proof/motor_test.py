@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass
 
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
-from stillpath.gcode.firmware.klipper.voice import KlipperVoice
+from stillpath.gcode.firmware.klipper.stream_commands import KlipperStreamCommands
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import CommandLimits, Machine
@@ -60,7 +60,7 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
             "what the motors bear in `command` of the machine's document"
         )
     levels = _levels(firmware, most_accel_mm_s2)
-    voice = KlipperVoice(firmware)
+    stream_commands = KlipperStreamCommands(firmware)
     middle = [0.5 * (machine.travel[a].min_mm + machine.travel[a].max_mm) for a in ("x", "y")]
     room_mm = min(machine.travel[a].max_mm - machine.travel[a].min_mm for a in ("x", "y"))
     home = ["G28 X Y", "M400", "GET_POSITION"]
@@ -68,7 +68,7 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
     lines = ["; STILLPATH_OFF", "; a search for lost steps: nothing is heated, nothing printed"]
     lines += ["G28", "G90", "M83", f"G1 Z{_HEIGHT_MM:g} F600", *home]
     # A shaper would spare the motors what a stream asks of them.
-    lines += voice.shaper_off.decode().splitlines()
+    lines += stream_commands.shaper_off.decode().splitlines()
     for number, level in enumerate(levels, 1):
         accel, step = level.accel_mm_s2, level.speed_step_mm_s
         text = f"level {number}: accel {accel:.0f} mm/s2, step {step:.1f} mm/s"
@@ -76,15 +76,15 @@ def motor_test(machine: Machine, most_accel_mm_s2: float) -> str:
             f"; {text}",
             f"M118 {text}",
             place,
-            voice.limits(_limits(firmware, level)).decode().strip(),
+            stream_commands.limits(_limits(firmware, level)).decode().strip(),
         ]
         for direction in _DIRECTIONS:
             lines += _strokes(
                 middle, direction, min(_LONGEST_MM, _SHARE * room_mm), level, firmware
             )
             lines += _corners(middle, direction, level)
-        lines += [voice.limits(_own(firmware)).decode().strip(), *home]
-    shaper = voice.shaper_on
+        lines += [stream_commands.limits(_own(firmware)).decode().strip(), *home]
+    shaper = stream_commands.shaper_on
     over = "; the shaper stays off until FIRMWARE_RESTART" if shaper is None else shaper.decode()
     return "\n".join([*lines, *over.splitlines(), "M118 the search is over", ""])
 

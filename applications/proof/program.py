@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import FirmwareRetraction
 from stillpath.models.machine import Machine
@@ -114,7 +114,7 @@ class Program:
     """
 
     def __init__(self, machine: Machine, settings: PrintSettings) -> None:
-        self._voice = kit(machine).voice()
+        self._stream_commands = adapter(machine).stream_commands()
         extruder = machine.firmware.hotend
         self._machine, self._settings = machine, settings
         self.width_mm = 1.125 * extruder.nozzle_diameter_mm
@@ -155,7 +155,7 @@ class Program:
             "M221 S100",
             "M107",
             # Planned motion is predicted, and shown, without the firmware's shaper.
-            *self._voice.shaper_off.decode().splitlines(),
+            *self._stream_commands.shaper_off.decode().splitlines(),
         )
         self.limit_accel(self.gentle_mm_s2)
         self.region("purge")
@@ -170,7 +170,7 @@ class Program:
         machine = self._machine
         self._retract()
         self.limit_accel(machine.firmware.largest_accel_mm_s2)
-        self._add(*(self._voice.shaper_on or b"").decode().splitlines())
+        self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
         if self._settings.end_gcode is not None:
             self._add(*self._settings.end_gcode.splitlines())
             return
@@ -210,7 +210,7 @@ class Program:
 
     def limit_accel(self, accel_mm_s2: float) -> None:
         """Set the acceleration of what follows."""
-        self._add(*self._voice.acceleration(accel_mm_s2).decode().splitlines())
+        self._add(*self._stream_commands.acceleration(accel_mm_s2).decode().splitlines())
 
     def stand(self, seconds: float) -> None:
         """Stand still, filament back."""

@@ -18,7 +18,7 @@ import numpy as np
 from stillpath.applications.proof.drive import RingingMode, ringing_mode
 from stillpath.applications.proof.halves import ProofPrint, Ringing, write_proof
 from stillpath.applications.proof.recorders import RingSettings, recorder_for
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.confirmation import plants_digest
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
@@ -81,7 +81,7 @@ class RingTest:
 
     def __init__(self, machine: Machine, settings: RingSettings) -> None:
         self._machine, self._settings = machine, settings
-        self._voice = kit(machine).voice()
+        self._stream_commands = adapter(machine).stream_commands()
         firmware = machine.firmware
         self.accel_mm_s2 = firmware.largest_accel_mm_s2
         self._z_mm_s = min(10.0, firmware.fastest_z_mm_s)
@@ -106,8 +106,8 @@ class RingTest:
         self._add(*(["G28"] if start is None else start.splitlines()))
         self._add("; STILLPATH_OFF", "G90", "M83", "M220 S100")
         # Both halves are predicted, and felt, without the firmware's shaper.
-        self._add(*self._voice.shaper_off.decode().splitlines())
-        self._add(*self._voice.acceleration(self.accel_mm_s2).decode().splitlines())
+        self._add(*self._stream_commands.shaper_off.decode().splitlines())
+        self._add(*self._stream_commands.acceleration(self.accel_mm_s2).decode().splitlines())
         travel = self._machine.travel["z"]
         height_mm = min(max(travel.min_mm, 0.0) + _HEIGHT_MM, self._middle["z"])
         self._add(f"G1 Z{height_mm:.3f} F{60 * self._z_mm_s:.0f}")
@@ -129,7 +129,7 @@ class RingTest:
             self._centre()
             self._add(*recorder.after(seconds))
         self._add(*recorder.last())
-        self._add(*(self._voice.shaper_on or b"").decode().splitlines())
+        self._add(*(self._stream_commands.shaper_on or b"").decode().splitlines())
 
     def _stops(self, half: Literal["off", "on"]) -> float:
         """Write a to and fro of each axis at every speed; return about how long it lasts.

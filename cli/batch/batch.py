@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_COMPLETED, wait
 
 from stillpath.cli.batch.items import Item
 from stillpath.cli.batch.output import Outcome, OutputFolder
-from stillpath.cli.batch.worker_pool import Crew
+from stillpath.cli.batch.worker_pool import WorkerPool
 
 __all__ = ["run_batch"]
 
@@ -15,7 +15,7 @@ _LOOK_S = 0.2
 
 
 def run_batch(
-    crew: Crew,
+    worker_pool: WorkerPool,
     output: OutputFolder,
     items: Sequence[Item],
     *,
@@ -30,7 +30,7 @@ def run_batch(
 
     Parameters
     ----------
-    crew : Crew
+    worker_pool : WorkerPool
     output : OutputFolder
     items : sequence of Item
     tell : callable, optional
@@ -48,7 +48,7 @@ def run_batch(
         return known.state == "done" and known.key == now.key and output.is_there(known)
 
     by_size = sorted(items, key=lambda item: -_size(item))
-    futures = {crew.add(item, settled): item for item in by_size}
+    futures = {worker_pool.add(item, settled): item for item in by_size}
     outcomes: dict[int, Outcome] = {}
     waiting = set(futures)
     while waiting:

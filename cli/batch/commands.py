@@ -16,7 +16,7 @@ from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
     from stillpath.cli.batch.output import Outcome, OutputFolder
-    from stillpath.cli.batch.worker_pool import Crew
+    from stillpath.cli.batch.worker_pool import WorkerPool
 
 __all__ = ["register"]
 
@@ -113,8 +113,8 @@ def batch(
         _line(outcome, f"{len(outcomes)} of {len(items)}")
 
     try:
-        with _at_work(output, options, jobs, server, key) as (crew, folder, check):
-            outcomes = run_batch(crew, folder, items, tell=tell, check=check)
+        with _at_work(output, options, jobs, server, key) as (worker_pool, folder, check):
+            outcomes = run_batch(worker_pool, folder, items, tell=tell, check=check)
             write_summary(outcomes, output)
     except Interrupted as interruption:
         sys.stderr.write(
@@ -178,8 +178,8 @@ def watch(
     group = parse_map(machine, machine_map or [])
     if output.resolve() == folder.resolve():
         raise ModelError(f"--output {output} is the watched folder; name one in it or elsewhere")
-    with _at_work(output, options, jobs, server, key) as (crew, kept, check):
-        watcher = Watcher(folder, group, crew, kept, settle_s=settle_s, tell=_line)
+    with _at_work(output, options, jobs, server, key) as (worker_pool, kept, check):
+        watcher = Watcher(folder, group, worker_pool, kept, settle_s=settle_s, tell=_line)
         sys.stderr.write(f"stillpath: watching {folder}\n")
         try:
             run_watch(watcher, folder, every_s=every_s, check=check)
@@ -190,18 +190,18 @@ def watch(
 @contextmanager
 def _at_work(
     output: Path, options: Any, jobs: int | None, server: str | None, key: str | None
-) -> Iterator[tuple[Crew, OutputFolder, Any]]:
-    """Yield a crew, its output folder, and a check to call now and then."""
+) -> Iterator[tuple[WorkerPool, OutputFolder, Any]]:
+    """Yield a worker pool, its output folder, and a check to call now and then."""
     from stillpath.cli.batch.output import OutputFolder
-    from stillpath.cli.batch.worker_pool import Here, Works, crew
+    from stillpath.cli.batch.worker_pool import LocalPool, Workplace, worker_pool
     from stillpath.cli.machines import open_machines
     from stillpath.service.interruption import interruptible
 
     server = server or os.environ.get("STILLPATH_SERVER")
-    works: Works
+    works: Workplace
     if server is None:
         jobs = jobs or os.cpu_count() or 1
-        works = Here(open_machines(), options, jobs)
+        works = LocalPool(open_machines(), options, jobs)
     else:
         from stillpath.cli.batch.server import There, batch_name
         from stillpath.service.client import Client, ClientError
@@ -216,7 +216,7 @@ def _at_work(
     with (
         interruptible() as check,
         OutputFolder.opened(output) as folder,
-        crew(works, folder, options, jobs) as made,
+        worker_pool(works, folder, options, jobs) as made,
     ):
         yield made, folder, check
 

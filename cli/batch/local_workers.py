@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from stillpath.models.machine import Machine
     from stillpath.pipeline.options import Options
 
-__all__ = ["Failure", "Lane", "Made", "Stopped", "Task", "failure_of"]
+__all__ = ["Failure", "LocalWorker", "Made", "Stopped", "Task", "failure_of"]
 
 _POLL_S = 0.2
 _END_S = 5.0
@@ -62,7 +62,7 @@ class Stopped(Exception):
     """The work was broken off because somebody asked for it."""
 
 
-class Lane:
+class LocalWorker:
     """One process; it is started when it is needed, and again if it dies."""
 
     def __init__(self) -> None:

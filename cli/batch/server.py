@@ -47,7 +47,7 @@ class There:
             raise
 
     def machine(self, name: str) -> Found:
-        """See `Works`. What the server would use depends on approvals; they count as well."""
+        """See `Workplace`. What the server would use depends on approvals; they count as well."""
         try:
             machines = self._client.machines()
         except ClientError as error:
@@ -59,7 +59,7 @@ class There:
         raise Failure(f"{self._client.server} has no machine {name}", "machine")
 
     def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
-        """See `Works`."""
+        """See `Workplace`."""
 
         def tell(*_: object) -> None:
             if stopping.is_set():
@@ -85,7 +85,7 @@ class There:
         return Made(Figures.model_validate(figures), 0.0)
 
     def close(self) -> None:
-        """See `Works`."""
+        """See `Workplace`."""
         self._client.close()
 
 

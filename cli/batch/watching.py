@@ -16,7 +16,7 @@ from pathlib import Path
 
 from stillpath.cli.batch.items import Group, Item, is_print_file, is_stamped
 from stillpath.cli.batch.output import Outcome, OutputFolder
-from stillpath.cli.batch.worker_pool import Crew
+from stillpath.cli.batch.worker_pool import WorkerPool
 from stillpath.pipeline.files import replacing
 
 __all__ = ["Watcher", "run_watch"]
@@ -58,7 +58,7 @@ class Watcher:
     folder : Path
     group : Group
         Machines of every file.
-    crew : Crew
+    worker_pool : WorkerPool
     output : OutputFolder
         May lie in the watched folder.
     settle_s : float
@@ -71,7 +71,7 @@ class Watcher:
         self,
         folder: Path,
         group: Group,
-        crew: Crew,
+        worker_pool: WorkerPool,
         output: OutputFolder,
         *,
         settle_s: float = 2.0,
@@ -79,7 +79,7 @@ class Watcher:
     ) -> None:
         self._folder = folder
         self._group = group
-        self._crew = crew
+        self._pool = worker_pool
         self._output = output
         self._kept_out = output.root.resolve()
         self._settle_s = settle_s
@@ -133,7 +133,7 @@ class Watcher:
             seen.works = {machine: _Work() for machine in machines}
         for machine, work in seen.works.items():
             if work.future is None and not work.is_over and now >= work.next_at:
-                work.future = self._crew.add(Item(path, place, machine), self._settled)
+                work.future = self._pool.add(Item(path, place, machine), self._settled)
         return any(work.future is not None for work in seen.works.values())
 
     def _collect(self, path: Path, seen: _Seen, now: float, *, is_same: bool) -> bool:

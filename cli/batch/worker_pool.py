@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from stillpath.cli.batch.items import Item
-from stillpath.cli.batch.local_workers import Failure, Lane, Made, Stopped, Task, failure_of
+from stillpath.cli.batch.local_workers import Failure, LocalWorker, Made, Stopped, Task, failure_of
 from stillpath.cli.batch.output import Outcome, OutputFolder, Scratch, sha256_of
 from stillpath.version import __version__
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import PinnedMachine, Resolver
     from stillpath.pipeline.options import Options
 
-__all__ = ["Crew", "Found", "Here", "Settled", "Works", "crew"]
+__all__ = ["Found", "IsFinished", "LocalPool", "WorkerPool", "Workplace", "worker_pool"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Found:
     pinned: PinnedMachine | None = None
 
 
-class Works(Protocol):
+class Workplace(Protocol):
     """Where files are compensated."""
 
     @property
@@ -63,7 +63,7 @@ class Works(Protocol):
         """End what was started."""
 
 
-class Here:
+class LocalPool:
     """Works of this computer.
 
     Parameters
@@ -79,50 +79,50 @@ class Here:
     def __init__(self, machines: Resolver, options: Options, jobs: int) -> None:
         self._machines = machines
         self._options = options
-        self._lanes = [Lane() for _ in range(jobs)]
-        self._free: queue.SimpleQueue[Lane] = queue.SimpleQueue()
-        for lane in self._lanes:
-            self._free.put(lane)
+        self._workers = [LocalWorker() for _ in range(jobs)]
+        self._free: queue.SimpleQueue[LocalWorker] = queue.SimpleQueue()
+        for worker in self._workers:
+            self._free.put(worker)
 
     def machine(self, name: str) -> Found:
-        """See `Works`."""
+        """See `Workplace`."""
         found = self._machines.for_job(name, files=True)
         return Found(found.machine.name, found.machine.revision, found)
 
     def do(self, source: Path, scratch: Scratch, machine: Found, stopping: threading.Event) -> Made:
-        """See `Works`."""
+        """See `Workplace`."""
         pinned = machine.pinned
         assert pinned is not None
         task = Task(
             source, scratch.result, scratch.report, pinned.machine, self._options, pinned.warnings
         )
-        lane = self._free.get()
+        worker = self._free.get()
         try:
-            return lane.do(task, stopping)
+            return worker.do(task, stopping)
         finally:
-            self._free.put(lane)
+            self._free.put(worker)
 
     def close(self) -> None:
-        """See `Works`."""
-        for lane in self._lanes:
-            lane.end()
+        """See `Workplace`."""
+        for worker in self._workers:
+            worker.end()
 
 
-Settled = Callable[[Item, Outcome, Outcome], bool]
+IsFinished = Callable[[Item, Outcome, Outcome], bool]
 """Whether a recorded outcome (second) settles an item, given what it would be now (first)."""
 
 
-class Crew:
+class WorkerPool:
     """Does items in threads; each waits for a process of this computer or for a server."""
 
-    def __init__(self, works: Works, output: OutputFolder, options: Options, jobs: int) -> None:
+    def __init__(self, works: Workplace, output: OutputFolder, options: Options, jobs: int) -> None:
         self._works = works
         self._output = output
         self._options = options.model_dump_json()
         self._stopping = threading.Event()
         self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="farm")
 
-    def add(self, item: Item, settled: Settled) -> Future[Outcome]:
+    def add(self, item: Item, settled: IsFinished) -> Future[Outcome]:
         """Do an item when its turn comes; the future raises `Stopped` at most."""
         return self._threads.submit(self._do, item, settled)
 
@@ -132,7 +132,7 @@ class Crew:
         self._threads.shutdown(cancel_futures=True)
         self._works.close()
 
-    def _do(self, item: Item, settled: Settled) -> Outcome:
+    def _do(self, item: Item, settled: IsFinished) -> Outcome:
         if self._stopping.is_set():
             raise Stopped
         began = time.monotonic()
@@ -207,9 +207,11 @@ class Crew:
 
 
 @contextmanager
-def crew(works: Works, output: OutputFolder, options: Options, jobs: int) -> Iterator[Crew]:
-    """Yield a crew that is quiet when the block ends."""
-    made = Crew(works, output, options, jobs)
+def worker_pool(
+    works: Workplace, output: OutputFolder, options: Options, jobs: int
+) -> Iterator[WorkerPool]:
+    """Yield a worker pool that is quiet when the block ends."""
+    made = WorkerPool(works, output, options, jobs)
     try:
         yield made
     finally:

@@ -1,7 +1,8 @@
-"""What one firmware offers to the road: how it plans, and how it is made to execute a stream.
+"""What one firmware offers to the pipeline: how it plans, and how it is made to execute a stream.
 
-`FirmwareKit` is the seam. The road asks `gcode.firmware.registry.kit` for the kit of a machine and
-knows no firmware by name; whatever differs between firmwares is behind these protocols.
+`FirmwareAdapter` is the seam. The pipeline asks `gcode.firmware.registry.adapter` for the adapter
+of a machine and knows no firmware by name; whatever differs between firmwares is behind these
+protocols.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Adviser",
     "Encoder",
-    "FirmwareKit",
+    "FirmwareAdapter",
     "Planner",
-    "Voice",
+    "StreamCommands",
     "corner_step_mm_s",
     "scaled",
     "square_corner_mm_s",
@@ -93,7 +94,7 @@ class Encoder(Protocol):
         """
 
 
-class Voice(Protocol):
+class StreamCommands(Protocol):
     """The words of one firmware that the writer of the stream needs."""
 
     @property
@@ -211,7 +212,7 @@ class Adviser(Protocol):
         """Return what a line of a file leaves in force."""
 
 
-class FirmwareKit(Protocol):
+class FirmwareAdapter(Protocol):
     """What one firmware offers for one machine."""
 
     @property
@@ -243,7 +244,7 @@ class FirmwareKit(Protocol):
         where these limits change.
         """
 
-    def quickened(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> Limits:
+    def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> Limits:
         """Return limits under which X and Y are quicker (or slower) than under `own`.
 
         Parameters
@@ -274,7 +275,7 @@ class FirmwareKit(Protocol):
     def encoder(self) -> Encoder:
         """Return an encoder of the stream."""
 
-    def voice(self) -> Voice:
+    def stream_commands(self) -> StreamCommands:
         """Return the words of the firmware."""
 
     def adviser(self, dialect: Dialect) -> Adviser:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.types import EventKind, Events, Limits, Moves, Phases, ProgramBlock
 from stillpath.models.machine import Machine
 
@@ -58,14 +58,14 @@ def plan_moves(
         The table of `Moves.limits_id`.
     machine : Machine
     rests_apart : bool
-        See `FirmwareKit.planner`.
+        See `FirmwareAdapter.planner`.
 
     Raises
     ------
     GcodeError
         For a move that the firmware refuses, or that takes more than 20 minutes.
     """
-    planner = kit(machine).planner(rests_apart=rests_apart)
+    planner = adapter(machine).planner(rests_apart=rests_apart)
     planner.queue_moves(moves, limits)
     phases = planner.flush()
     check_moves_end(phases, lambda index: int(moves.line[index]))

@@ -1,16 +1,16 @@
-"""The kit of a machine's firmware."""
+"""The adapter of a machine's firmware."""
 
 from __future__ import annotations
 
-from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 
-__all__ = ["kit"]
+__all__ = ["adapter"]
 
 
-def kit(machine: Machine) -> FirmwareKit:
+def adapter(machine: Machine) -> FirmwareAdapter:
     """Return what the machine's firmware offers.
 
     Raises
@@ -19,15 +19,15 @@ def kit(machine: Machine) -> FirmwareKit:
         The firmware can be described but there is no planner for it.
     """
     if isinstance(machine.firmware, Klipper):
-        from stillpath.gcode.firmware.klipper.kit import KlipperKit
+        from stillpath.gcode.firmware.klipper.adapter import KlipperAdapter
 
-        return KlipperKit(machine, machine.firmware)
+        return KlipperAdapter(machine, machine.firmware)
     if isinstance(machine.firmware, RepRapFirmware):
-        from stillpath.gcode.firmware.reprapfirmware.kit import RepRapKit
+        from stillpath.gcode.firmware.reprapfirmware.adapter import RepRapAdapter
 
-        return RepRapKit(machine, machine.firmware)
+        return RepRapAdapter(machine, machine.firmware)
     if isinstance(machine.firmware, Marlin):
-        from stillpath.gcode.firmware.marlin.kit import MarlinKit
+        from stillpath.gcode.firmware.marlin.adapter import MarlinAdapter
 
-        return MarlinKit(machine, machine.firmware)
+        return MarlinAdapter(machine, machine.firmware)
     raise ModelError(f"{machine.name}: there is no planner for {machine.firmware.kind}")

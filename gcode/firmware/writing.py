@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
-from stillpath.gcode.firmware.base import FirmwareKit
+from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
 from stillpath.gcode.firmware.planning import stops
-from stillpath.gcode.pieces import LeftOut, Passage, Piece
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
 
 __all__ = ["StreamWriter"]
@@ -57,18 +57,18 @@ class _Modes:
 
 
 class StreamWriter:
-    """Write passages and pieces in order.
+    """Write verbatim parts and pieces in order.
 
     Parameters
     ----------
-    firmware : FirmwareKit
+    firmware : FirmwareAdapter
     stamp : str
         Says who processed the file; one line in header and footer.
     """
 
-    def __init__(self, firmware: FirmwareKit, stamp: str) -> None:
-        self._voice = firmware.voice()
-        self._e_word = _E_WORD_FOLDED if self._voice.folds_case else _E_WORD
+    def __init__(self, firmware: FirmwareAdapter, stamp: str) -> None:
+        self._stream_commands = firmware.stream_commands()
+        self._e_word = _E_WORD_FOLDED if self._stream_commands.folds_case else _E_WORD
         self._extruder_alone_stops = firmware.extruder_alone_stops
         self._limits_now: Limits | None = None
         """What the printer plans with, while streaming."""
@@ -112,12 +112,12 @@ class StreamWriter:
         """Lines that a piece that comes now begins with to switch the shaper off; often none."""
         if self._streaming or self._shaper_off:
             return b""
-        off = self._voice.shaper_off
-        return off or (self._voice.file_shaper_off if self._shaper_lines else b"")
+        off = self._stream_commands.shaper_off
+        return off or (self._stream_commands.file_shaper_off if self._shaper_lines else b"")
 
     def header(self) -> bytes:
         """Lines that say who processed the file, and what to mind."""
-        notes = "".join(f"; stillpath: {note}\n" for note in self._voice.notes)
+        notes = "".join(f"; stillpath: {note}\n" for note in self._stream_commands.notes)
         return self.footer() + notes.encode()
 
     def footer(self) -> bytes:
@@ -129,12 +129,12 @@ class StreamWriter:
         text = self._end(extruder_mm)
         return text if ends_with_newline or not text else b"\n" + text
 
-    def passage(self, passage: Passage, extruder_mm: float) -> bytes:
+    def verbatim(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Text of lines that leave as they came.
 
         Parameters
         ----------
-        passage : Passage
+        verbatim : VerbatimPart
         extruder_mm : float
             What the printer takes for E behind all that was written before.
 
@@ -143,13 +143,13 @@ class StreamWriter:
         GcodeError
             For a line that must not stand in a file with a stream.
         """
-        moves, events = passage.moves, passage.events
-        lead = self._off(passage, extruder_mm)
+        moves, events = verbatim.moves, verbatim.events
+        lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
-            self._marked = passage.limits_after
+            self._marked = verbatim.limits_after
         for row in np.flatnonzero(np.isin(events.kind, _SHAPED)):
-            line = passage.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
-            conflict = self._voice.conflict(line)
+            line = verbatim.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
+            conflict = self._stream_commands.conflict(line)
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
             if events.kind[row] != EventKind.SHAPER or self._is_move(line.split(b";", 1)[0]):
@@ -163,13 +163,13 @@ class StreamWriter:
         if len(moves):
             last_stop = events.move_index[stops(events)]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
-            self._at_rest = stands or self._rests(passage, len(moves) - 1)
+            self._at_rest = stands or self._rests(verbatim, len(moves) - 1)
         elif np.any(stops(events)):
             self._at_rest = True
-        return lead + passage.text
+        return lead + verbatim.text
 
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
-        """Text of a compensated piece; `extruder_mm` is that of `passage`."""
+        """Text of a compensated piece; `extruder_mm` is that of `verbatim`."""
         self._reads(extruder_mm)
         parts = [self._on(piece, encoded.limits)]
         rows, events = encoded.row, piece.events
@@ -281,7 +281,7 @@ class StreamWriter:
         # Only what the line itself says changes: our own modes differ from the file's.
         if _POSITIONING.match(code):
             self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
-            if self._voice.positioning_sets_extruder:
+            if self._stream_commands.positioning_sets_extruder:
                 self._modal = replace(self._modal, absolute_e=state.absolute_e)
         elif _EXTRUSION.match(code):
             self._modal = replace(self._modal, absolute_e=state.absolute_e)
@@ -294,7 +294,7 @@ class StreamWriter:
         state = piece.modal[int(moves.modal_id[row])]
         # The file's own moves run under its own limits.
         own = piece.limits[int(moves.limits_id[row])]
-        lead = self._limits_to(self._voice.in_stream(own))
+        lead = self._limits_to(self._stream_commands.in_stream(own))
         lead += self._file_modes(state)
         moves_on = self._is_move(code)
         # Not G10 and G11, whatever words they have: what E reads does not see them.
@@ -307,21 +307,21 @@ class StreamWriter:
             fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
             self._reads(self._far_mm + fed / state.extrude_factor)
         if moves_on and not _FEED.search(code):
-            alone = self._voice.factors_need_axes and not _AXES.search(code)
+            alone = self._stream_commands.factors_need_axes and not _AXES.search(code)
             factor = 1.0 if alone else state.speed_factor
             lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
 
     def _is_move(self, code: bytes) -> bool:
         """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
-        further = not self._voice.one_command and _FURTHER_MOVE.search(code)
+        further = not self._stream_commands.one_command and _FURTHER_MOVE.search(code)
         return bool(_MOVE.match(code) or further)
 
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:
             return b""
         self._limits_now = limits
-        return self._voice.limits(limits)
+        return self._stream_commands.limits(limits)
 
     def _ours(self, limits: Limits, ours: ModalState) -> bytes:
         """Lines after which ours run under the stream's limits and in their modes."""
@@ -335,7 +335,7 @@ class StreamWriter:
 
     def _reads(self, extruder_mm: float) -> None:
         """Take note of what the printer's E reads."""
-        far = self._voice.coarse_extruder and abs(extruder_mm) > _FAR_MM
+        far = self._stream_commands.coarse_extruder and abs(extruder_mm) > _FAR_MM
         self._far_mm = extruder_mm if far else None
 
     def _set_again(self, line: bytes, ahead_mm: float) -> bytes:
@@ -373,7 +373,7 @@ class StreamWriter:
         absolute_e = now.absolute_e
         if now.absolute_xyz != state.absolute_xyz:
             text += b"G90\n" if state.absolute_xyz else b"G91\n"
-            if self._voice.positioning_sets_extruder:
+            if self._stream_commands.positioning_sets_extruder:
                 absolute_e = state.absolute_xyz
         if absolute_e != state.absolute_e:
             text += b"M82\n" if state.absolute_e else b"M83\n"
@@ -394,30 +394,32 @@ class StreamWriter:
         """Lines before the first segment of a piece."""
         parts: list[bytes] = []
         if not self._at_rest:
-            parts.append(self._voice.stand_still)
+            parts.append(self._stream_commands.stand_still)
         if not self._streaming:
             parts.append(b"; stillpath: stream on\n")
             parts.append(self.switching_off)
             self._shaper_off = self._shaper_off or bool(self.switching_off)
             self._marked = None
-            parts.append(self._voice.limits(limits))
+            parts.append(self._stream_commands.limits(limits))
             self._limits_now = limits
             self._streaming = True
         if self._modal is None:
             self._modal = piece.modal_before
         return b"".join(parts)
 
-    def _off(self, passage: Passage, extruder_mm: float) -> bytes:
+    def _off(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         """Lines that give the printer back to the file."""
-        shaper = self._shaper_before(passage)
+        shaper = self._shaper_before(verbatim)
         if not self._streaming:
             return self._unmarked() + shaper
-        stop = b"" if self._at_rest or self._rests(passage, 0) else self._voice.stand_still
-        limits = passage.limits_before
+        stop = (
+            b"" if self._at_rest or self._rests(verbatim, 0) else self._stream_commands.stand_still
+        )
+        limits = verbatim.limits_before
         if self._shaper_off and self._shaper_is_known:
-            self._marked, limits = limits, self._voice.in_stream(limits)
-        behind = b", line %d of the original" % passage.first_line
-        text = stop + self._stream_off(limits, passage.modal_before, extruder_mm, behind)
+            self._marked, limits = limits, self._stream_commands.in_stream(limits)
+        behind = b", line %d of the original" % verbatim.first_line
+        text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, behind)
         return text + shaper
 
     def _unmarked(self) -> bytes:
@@ -425,11 +427,11 @@ class StreamWriter:
         if self._marked is None or self._shaper_off:
             return b""
         limits, self._marked = self._marked, None
-        return self._voice.limits(limits)
+        return self._stream_commands.limits(limits)
 
-    def _rests(self, passage: Passage, row: int) -> bool:
-        """Whether the machine stands at a move of the passage by itself, before and after it."""
-        moves, events = passage.moves, passage.events
+    def _rests(self, verbatim: VerbatimPart, row: int) -> bool:
+        """Whether the machine stands still by itself before and after a move."""
+        moves, events = verbatim.moves, verbatim.events
         rests = stops(events)
         if len(moves) == 0:
             return bool(np.any(rests))
@@ -442,7 +444,7 @@ class StreamWriter:
         """Lines that give the printer back at the end of the file."""
         text = b""
         if self._streaming and self._behind is not None:
-            text = b"" if self._at_rest else self._voice.stand_still
+            text = b"" if self._at_rest else self._stream_commands.stand_still
             text += self._stream_off(*self._behind, extruder_mm, b"")
         shaper = self._shaper_on(self._behind[0]) if self._behind is not None else b""
         return text + self._unmarked() + shaper
@@ -451,41 +453,41 @@ class StreamWriter:
         self, limits: Limits, state: ModalState, extruder_mm: float, behind: bytes
     ) -> bytes:
         self._streaming = False
-        text = self._voice.limits(limits) + self._file_modes(state)
+        text = self._stream_commands.limits(limits) + self._file_modes(state)
         text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
         mark = b"; stillpath: stream off" + behind + b"\n"
         return text + _feed_line(self._file_feed_mm_min) + mark
 
-    def _shaper_before(self, passage: Passage) -> bytes:
+    def _shaper_before(self, verbatim: VerbatimPart) -> bytes:
         """Set the firmware's shaper again before lines that print on their own.
 
         Firmwares stand still for it. Travel between two streams, as behind an object mark, is not
         worth that: the next stream takes care of its vibration.
         """
-        travel = passage.moves.end_mm - passage.moves.start_mm
+        travel = verbatim.moves.end_mm - verbatim.moves.start_mm
         prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
         # A line that sets a part of the shaper finds the other parts as they were.
-        foreign = bool(np.any(np.isin(passage.events.kind, _SHAPED)))
-        aside = isinstance(passage, LeftOut)  # between streams again and again
+        foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
+        aside = isinstance(verbatim, LeftOut)  # between streams again and again
         on = (prints and not aside) or foreign
-        return self._shaper_on(passage.limits_before) if on else b""
+        return self._shaper_on(verbatim.limits_before) if on else b""
 
     @property
     def _shaper_is_known(self) -> bool:
-        return self._voice.shaper_on is not None or bool(self._shaper_lines)
+        return self._stream_commands.shaper_on is not None or bool(self._shaper_lines)
 
     def _shaper_on(self, limits: Limits) -> bytes:
         if not self._shaper_off:
             return b""
         self._shaper_off = False
-        stated = self._voice.shaper_on
+        stated = self._stream_commands.shaper_on
         if not self._shaper_is_known:
             self.shaper_unknown = True
             self._shaper_off = True
             return b""
         lines = (stated or b"") + b"".join(self._shaper_lines.values())
-        advance = self._voice.advance(limits)
+        advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, BinaryIO, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stillpath.gcode.pieces import Passage
+from stillpath.gcode.pieces import VerbatimPart
 from stillpath.gcode.slicers.marks import MarkKind, read_mark
 from stillpath.gcode.slicers.times import TimeField, TimeKind, may_tell_time, read_times
 
@@ -63,13 +63,13 @@ class Retiming:
         self._layer_delay_s: float | None = None
         """Delay where the second layer begins."""
 
-    def push(self, text: bytes, item: Passage | None = None, delay_s: ArrayLike = 0.0) -> None:
+    def push(self, text: bytes, item: VerbatimPart | None = None, delay_s: ArrayLike = 0.0) -> None:
         """Take the next part of the written text.
 
         Parameters
         ----------
         text : bytes
-        item : Passage, optional
+        item : VerbatimPart, optional
             The lines that came, whose times are looked for in the text.
         delay_s : float or array_like, shape (n + 1,)
             How much later than in the original each move of the item begins, and the item ends.
@@ -122,7 +122,7 @@ class Retiming:
             done = offset + length
         return written + _copy(source, target, self._size - done)
 
-    def _note(self, text: bytes, item: Passage, delay_s: NDArray[np.float64]) -> None:
+    def _note(self, text: bytes, item: VerbatimPart, delay_s: NDArray[np.float64]) -> None:
         if self._layer_delay_s is None:
             second = np.flatnonzero(item.moves.layer >= 1)
             if len(second):
@@ -237,7 +237,7 @@ def _what_it_tells(line: bytes) -> Literal["time", "stop"] | None:
     return "stop" if mark is not None and mark.kind in _STOPS else None
 
 
-def _candidates(item: Passage) -> NDArray[np.int64]:
+def _candidates(item: VerbatimPart) -> NDArray[np.int64]:
     """Rows of the events whose lines may be worth reading."""
     events = item.events
     if len(events) == 0 or not item.text:

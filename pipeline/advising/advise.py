@@ -18,7 +18,7 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from stillpath.gcode.containers.opening import open_text, rewriting
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.facts import SlicerFacts
@@ -47,7 +47,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.samples import take_samples
 from stillpath.pipeline.piece_compensator import DT_S
-from stillpath.pipeline.progress import ProgressCallback, Teller, telling
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import dialect_for, doubts
 from stillpath.pipeline.result import (
     AdviceFigures,
@@ -91,7 +91,10 @@ def advise_file(
     Parameters and errors are those of `pipeline.compensate.compensate_file`. The slicer's times
     in the file stay as they are, whatever `options.times` says: only lines of our own are added.
     """
-    unpacking, packing = telling(progress, "unpacking", 0.0), telling(progress, "packing", 1.0)
+    unpacking, packing = (
+        progress_to(progress, "unpacking", 0.0),
+        progress_to(progress, "packing", 1.0),
+    )
     with (
         contextlib.ExitStack() as files,
         replacing(target) as temporary,
@@ -131,11 +134,11 @@ class _Job:
     ) -> None:
         self._source, self._spool = source, spool
         self._machine, self._options = machine, options
-        self._say = Teller(progress).say
+        self._say = ProgressReports(progress).say
         self._clock = StageClock()
-        self._kit = kit(machine)
+        self._adapter = adapter(machine)
         self._dialect = dialect_for(machine, options.dialect)
-        self._adviser = self._kit.adviser(self._dialect)
+        self._adviser = self._adapter.adviser(self._dialect)
         stated = self._adviser.stated or OFF
         self._before, self._unmodelled = stated.modelled, stated.unknown_types
         self._doubts = doubts(source, machine, options.dialect)
@@ -265,7 +268,7 @@ class _Job:
             self._adviser,
             choice.advice(first_layer),
             reader.feature_names,
-            self._kit.initial_limits(),
+            self._adapter.initial_limits(),
             stamp(self._machine, self._options),
         )
         write_advised(self._source, self._spool, reader, writer)

@@ -21,7 +21,7 @@ from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
 from stillpath.pipeline.measuring.line_ends import RINGING_S, LineEnds
 from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.measuring.responses import Answered, Answers
+from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
 from stillpath.pipeline.measuring.spectra import ErrorSpectra
 from stillpath.pipeline.result import (
     AxisSpectrum,
@@ -53,7 +53,7 @@ class Measurement:
     machine : Machine
     dt_s : float
     shaper : BestShaper
-        The yardstick.
+        The reference shaper.
     compensated : bool
         Whether there is a channel `after` beside `before` and `shaper`. If not, `before` is the
         executed motion: the firmware's own shaper may be in it.
@@ -98,7 +98,7 @@ class Measurement:
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
         self._ends = LineEnds(dt_s, len(self._names))
-        self._answers = Answers(machine, dt_s, shaper, self._names, compensated=compensated)
+        self._answers = Responses(machine, dt_s, shaper, self._names, compensated=compensated)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
         self._spectra = ErrorSpectra(machine, dt_s, self._names)
@@ -166,7 +166,7 @@ class Measurement:
         self._ends.finish()
         self._tiles.finish()
 
-    def _measure(self, found: Answered | None) -> None:
+    def _measure(self, found: ResponseSamples | None) -> None:
         if found is None:
             return
         path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding

@@ -177,7 +177,7 @@ def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> Best
 
 @cache
 def _shipped() -> dict[str, BestShaper]:
-    """Return what `benchmarks/yardsticks.py` has found for the built-in machines, by revision."""
+    """Return the shapers of built-in machines, by revision (`benchmarks/reference_shapers.py`)."""
     found = json.loads(_SHIPPED.read_text(encoding="utf-8"))
     if found["version"] != _VERSION:
         return {}

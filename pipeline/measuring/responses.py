@@ -18,7 +18,7 @@ from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.simulation.scheduled import MachineStream
 
-__all__ = ["Answered", "Answers"]
+__all__ = ["ResponseSamples", "Responses"]
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ _LEAST_SAMPLES = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class ResponseSamples:
     """Motion with what the machine does with the command of every channel.
 
     Attributes
@@ -43,7 +43,7 @@ class Answered:
     answer_mm: Array
 
 
-class Answers:
+class Responses:
     """Answers of the nominal plants to the commands of some channels.
 
     Parameters
@@ -92,7 +92,7 @@ class Answers:
         for stream in self._streams.values():
             stream.operate_at(point)
 
-    def push(self, samples: MotionSamples) -> Answered | None:
+    def push(self, samples: MotionSamples) -> ResponseSamples | None:
         """Return answers to what was pushed so far, all but the last few samples."""
         fresh = samples.path_mm
         if samples.sliced_mm is not None:
@@ -108,7 +108,7 @@ class Answers:
         ready = len(self._extruding) - self._reach
         return self._release(ready) if ready >= self._least else None
 
-    def flush(self) -> Answered | None:
+    def flush(self) -> ResponseSamples | None:
         """Return what is held, as if the machine stood still from now on."""
         if self._planned.shape[1] == 0:
             return None
@@ -128,7 +128,7 @@ class Answers:
                 if name != "shaper" or not self._shapes_answer
             }
 
-    def _release(self, ready: int) -> Answered:
+    def _release(self, ready: int) -> ResponseSamples:
         # What is planned begins `reach` samples before what is held, and ends as many behind it.
         span = slice(self._reach, self._reach + ready)
         sliced = self._planned[-2:]
@@ -150,7 +150,7 @@ class Answers:
                 came = name == "before" and self._compensated
                 command = sliced[:, span] if came else executed
                 self._streams[name].push(command, path, answer[:, span])
-        out = Answered(path, executed, self._extruding[:ready], answers[:, :, span])
+        out = ResponseSamples(path, executed, self._extruding[:ready], answers[:, :, span])
         self._planned, self._answer = self._planned[:, ready:], self._answer[:, ready:].copy()
         self._executed, self._extruding = self._executed[:, ready:], self._extruding[ready:]
         return out

@@ -21,7 +21,7 @@ from stillpath.gcode.pacing import (
     TRAVEL,
     FirstLayer,
     move_classes,
-    quickened,
+    paced,
     top_limits,
 )
 from stillpath.gcode.pieces import Piece
@@ -135,11 +135,11 @@ class SpeedBudget:
         """
         classes = self.classes(piece.moves)
         if self.shaper_paces.reached:
-            slow = quickened(piece, classes, paces(self.shaper_paces.factors), self.machine)
+            slow = paced(piece, classes, paces(self.shaper_paces.factors), self.machine)
             self._shaper_s += slow.phases.duration_s
         for share in _GENTLER:
             factors = {one: factor**share for one, factor in self._factors.items()}
-            quick = quickened(piece, classes, paces(factors), self.machine)
+            quick = paced(piece, classes, paces(factors), self.machine)
             if quick is piece:
                 break
             yield quick
@@ -179,7 +179,7 @@ class SpeedBudget:
         for one in [TRAVEL] if travel_first else [*self._factors]:
             self._factors[one] = max(1.0, _SLOWER * self._factors[one])
 
-    def milder(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
+    def gentler(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
         """Return what the file is to be written with once more; None where it may stay."""
         kept = [one for one in self._factors if one in sums and self._keeps_budget(one)]
         over = {one: self._used(one, sums[one]) for one in kept}

@@ -12,8 +12,8 @@ from stillpath.compensation.cautious import Caution
 from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended
-from stillpath.gcode.firmware.registry import kit
-from stillpath.gcode.pacing import AS_SLICED, Pace, quickened
+from stillpath.gcode.firmware.registry import adapter
+from stillpath.gcode.pacing import AS_SLICED, Pace, paced
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import sample_phases
 from stillpath.models.machine import Machine
@@ -113,7 +113,7 @@ class PaceTrials:
     def _measure(self, sample: Sample, factors: Factors) -> _Measured:
         seconds = sample.piece.phases.duration_s
         try:
-            piece = quickened(sample.piece, sample.classes, paces(factors), self._machine)
+            piece = paced(sample.piece, sample.classes, paces(factors), self._machine)
             seconds = piece.phases.duration_s
             path, command, extruding, classes = self._motion(sample, piece)
         except (Unfit, GcodeError):
@@ -141,7 +141,7 @@ def compensated(
         The method cannot be designed for this machine.
     """
     work = PieceCompensator(machine, options, shaper, caution)
-    step_mm = kit(machine).step_mm
+    step_mm = adapter(machine).step_mm
 
     def motion(sample: Sample, piece: Piece) -> Motion:
         work.compensator.reset(piece.phases.start_mm[0, :2])

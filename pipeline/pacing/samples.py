@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer, move_classes
-from stillpath.gcode.pieces import Passage, Piece, Splitter, excerpt
+from stillpath.gcode.pieces import Piece, Splitter, VerbatimPart, excerpt
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
@@ -114,7 +114,7 @@ def take_samples(
 
 def _items(
     source: BinaryIO, machine: Machine, dialect: Dialect, told: Callable[[float], None] | None
-) -> Iterator[Piece | Passage]:
+) -> Iterator[Piece | VerbatimPart]:
     reader, splitter = Interpreter(machine, dialect=dialect), Splitter(machine)
     while data := source.read(_BLOCK_BYTES):
         for block in reader.push(data):

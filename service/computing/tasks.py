@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from stillpath.pipeline.progress import Progress, ProgressCallback, telling
+from stillpath.pipeline.progress import Progress, ProgressCallback, progress_to
 from stillpath.service.jobs.state import JobKind
 from stillpath.service.jobs.task import Task
 
@@ -63,7 +63,7 @@ def _design(task: Task, progress: ProgressCallback) -> None:
     """Write the report of the design of one axis; options: `axis`, `basis`, `robust`."""
     from stillpath.applications.design.design import design_report
 
-    telling(progress, "designing", 0.0)(0.0)
+    progress_to(progress, "designing", 0.0)(0.0)
     asked = task.options
     report = design_report(
         task.pinned().machine, asked["axis"], basis=asked["basis"], robust=asked["robust"]
@@ -80,7 +80,7 @@ def _design_controller(task: Task, progress: ProgressCallback) -> None:
     from stillpath.applications.controllers.options import read_options, resolved
     from stillpath.applications.controllers.page import render_controller
 
-    telling(progress, "designing", 0.0)(0.0)
+    progress_to(progress, "designing", 0.0)(0.0)
     options = read_options(task.options)
     made = design_controller(resolved(task.machine, options), options)
     _write(
@@ -97,7 +97,7 @@ def _list_loops(task: Task, progress: ProgressCallback) -> None:
     """Write the built-in closed-loop machines and the methods that fit each."""
     from stillpath.applications.controllers.design import loop_figures
 
-    telling(progress, "designing", 0.0)(0.0)
+    progress_to(progress, "designing", 0.0)(0.0)
     _write(task, [figures.model_dump(mode="json") for figures in loop_figures()])
 
 

@@ -334,10 +334,10 @@ def _in_force(machine: Machine, asked: Asked) -> Iterator[Finding]:
 
 def _commands(machine: Machine, asked: Asked) -> Iterator[Finding]:
     """Find macros that stand in the way of what a stream sets."""
-    from stillpath.gcode.firmware.registry import kit  # heavy
+    from stillpath.gcode.firmware.registry import adapter  # heavy
 
     own = {section.lower() for section in asked.sections}
-    limits = kit(machine).stream_limits(kit(machine).initial_limits())
+    limits = adapter(machine).stream_limits(adapter(machine).initial_limits())
     needed = float(getattr(limits, "accel_mm_s2", 0.0))
     configured = asked.settings["printer"].get("max_accel", 0.0)
     if "gcode_macro set_velocity_limit" in own and configured < needed:

@@ -226,7 +226,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The input cannot be processed, a limit was reached, or the road broke."""
+    """The input cannot be processed, a limit was reached, or the pipeline broke."""
 
     attempt: int
     at: float

@@ -1,6 +1,6 @@
 """Watches one attempt from a thread of its own: says that it lives, and ends it when it must.
 
-The road learns of it in its progress callback. If it never asks, the process is ended; the one
+The pipeline learns of it in its progress callback. If it never asks, the process is ended; the one
 that looks after the workers starts another.
 """
 
@@ -158,7 +158,7 @@ class Watch:
         return self._verdict
 
     def tell(self, progress: Progress) -> None:
-        """Take the road's progress.
+        """Take the pipeline's progress.
 
         Raises
         ------

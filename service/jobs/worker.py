@@ -154,10 +154,10 @@ def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]
     from stillpath.pipeline.compensate import compensate_file
     from stillpath.pipeline.options import Options
     from stillpath.reports import write_report
-    from stillpath.service.compiling import compiling_told
+    from stillpath.service.compiling import compiling_reported
 
     pinned = task.pinned()
-    with compiling_told(progress) as told:
+    with compiling_reported(progress) as told:
         result = compensate_file(
             task.source,
             task.target,

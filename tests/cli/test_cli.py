@@ -1,4 +1,4 @@
-"""The command line with a pretended road: options, messages, exit codes, what is left behind."""
+"""The command line with a pretended pipeline: options, messages, exit codes, what is left."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TEXT = b"G28\nG1 X10 Y10 F6000\n"
 
 @pytest.fixture
 def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
-    """Put a road in place that does what `road.behave` says."""
+    """Put a pipeline in place that does what `pipeline.behave` says."""
     seen = types.SimpleNamespace(behave=lambda: None, options=None, machine=None, rate_hz=None)
 
     def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None, **_):

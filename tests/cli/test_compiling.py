@@ -7,7 +7,7 @@ import pytest
 
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.service import compiling
-from stillpath.service.compiling import STAGE, compiling_told
+from stillpath.service.compiling import STAGE, compiling_reported
 
 HALF = Progress("compensating", 0.5, 30.0, 60.0, 60.0)
 
@@ -20,14 +20,14 @@ def compile_something() -> None:
 
 def test_nothing_changes_where_nothing_is_compiled():
     told: list[Progress] = []
-    with compiling_told(told.append) as tell:
+    with compiling_reported(told.append) as tell:
         tell(HALF)
     assert told == [HALF]
 
 
 def test_compiling_is_a_stage_and_its_time_says_nothing_of_the_time_left(monkeypatch):
     told: list[Progress] = []
-    with compiling_told(told.append) as tell:
+    with compiling_reported(told.append) as tell:
         tell(HALF)
         compile_something()
         tell(HALF)
@@ -48,7 +48,7 @@ def test_who_stops_in_the_middle_of_a_compiler_is_heard_behind_it():
         if progress.stage == STAGE:
             raise Cancelled
 
-    with compiling_told(stop) as tell:
+    with compiling_reported(stop) as tell:
         compile_something()
         with pytest.raises(Cancelled):
             tell(HALF)

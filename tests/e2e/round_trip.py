@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stillpath.gcode.containers.opening import open_text
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.machine import AxisTravel, Machine
 from tests.gcode.plain_reader import is_motion, read
 from tests.gcode.states import timeless
@@ -71,7 +71,7 @@ def made_to_fit(machine: Machine, data: bytes) -> Machine:
 def flaws(data: bytes, written: bytes, machine: Machine) -> list[str]:
     """Say what is not as it was, beside what the documents say."""
     before, after = (read(text, machine.firmware.kind) for text in (data, written))
-    step_mm = np.array(kit(machine).step_mm)
+    step_mm = np.array(adapter(machine).step_mm)
     found = _line_flaws(data, written)
     for tool in {*before.extruded_mm, *after.extruded_mm}:
         gap = after.extruded_mm[tool] - before.extruded_mm[tool]

@@ -1,6 +1,6 @@
-"""What must hold for any bytes: what one file may do to the interpreter, the planner and the road.
+"""What must hold for any bytes: what one file may do to interpreter, planner and pipeline.
 
-Nothing but a `GcodeError` may come out, and what comes out of the road holds every line of the
+Nothing but a `GcodeError` may come out, and what comes out of the pipeline holds every line of the
 file, with the machine in the same state at each of them.
 """
 
@@ -20,13 +20,13 @@ from stillpath.gcode.types import Moves, Phases, ProgramBlock
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.pass_through import plan_passage
+from stillpath.pipeline.verbatim import plan_verbatim
 from tests.gcode.states import differences, has_code
 
 __all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_road", "walk"]
 
 _LONGEST_S = 300.0
-"""Lines whose moves last longer are taken out before the road: every second of print costs."""
+"""Lines whose moves last longer are taken out before the pipeline: every second of print costs."""
 
 _REPEATED = re.compile(rb"SET_INPUT_SHAPER|M572|M593|M900", re.IGNORECASE)
 _TICKS_MM_S = 0.02
@@ -80,8 +80,8 @@ def read_through(data: bytes, machine: Machine) -> GcodeError | None:
     splitter = Splitter(machine, compensate=False)
     try:
         for block in blocks:
-            for passage in splitter.push(block):
-                for part in plan_passage(passage, machine):
+            for verbatim in splitter.push(block):
+                for part in plan_verbatim(verbatim, machine):
                     if isinstance(part, Phases):
                         check_phases(part)
     except GcodeError as caught:

@@ -1,7 +1,7 @@
 """Files made to be slow, large or wrong, as streams of bytes of any size.
 
 Each generator takes a size and yields the file in pieces, so that a file of hundreds of megabytes
-costs no memory to make. `SIZES` are the sizes at which the road must still be quick and small.
+costs no memory to make. `SIZES` are the sizes at which the pipeline must still be quick and small.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import pytest
 
 from stillpath.gcode.detection import detect
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import facts_in
 from tests.fuzz.checks import read_through, through_the_road, walk
@@ -209,7 +209,7 @@ def test_damaged_files_down_the_road(
     files = [gzip.decompress(path.read_bytes()) for path in found]
     written = 0
     methods = ("shaper:mzv", "fbf", "none")
-    if kit(machine).refusal is not None:
+    if adapter(machine).refusal is not None:
         methods = ("none",) * 3
     for number, data in enumerate(excerpts(files, 60_000, random.Random(7), size=4000)):
         folder = tmp_path / f"{number}"

@@ -1,4 +1,4 @@
-"""From text to pieces and passages, for tests."""
+"""From text to pieces and verbatim parts, for tests."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Passage, Piece, Splitter
+from stillpath.gcode.pieces import Piece, Splitter, VerbatimPart
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.options import Options
@@ -27,11 +27,11 @@ def cut(
     chunk: int = 1 << 17,
     longest_s: float = 60.0,
     compensate: bool = True,
-) -> list[Piece | Passage]:
+) -> list[Piece | VerbatimPart]:
     """Cut a file that arrives in chunks."""
     reader = Interpreter(machine)
     splitter = Splitter(machine, longest_s=longest_s, compensate=compensate)
-    items: list[Piece | Passage] = []
+    items: list[Piece | VerbatimPart] = []
     for start in range(0, len(data), chunk):
         for block in reader.push(data[start : start + chunk]):
             items += splitter.push(block)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, Limits, ModalState
 from stillpath.models.machine import Machine
@@ -136,14 +136,14 @@ def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:
     comments, wanted = [timeless(s) for s in comments], [timeless(s) for s in wanted]
     problems = [] if comments == wanted else [_first_difference(wanted, comments)]
     # A firmware that counts steps has the same place within one.
-    place_mm = POSITION_MM + np.array(kit(machine).step_mm[:3])
+    place_mm = POSITION_MM + np.array(adapter(machine).step_mm[:3])
     seen: list[int] = []
     for state in after:
         tag = _tag(state.text)
         if tag is None:
             continue
         seen.append(tag)
-        found = _compare(before[tag], state, place_mm, kit(machine).shortest_move_mm > 0.0)
+        found = _compare(before[tag], state, place_mm, adapter(machine).shortest_move_mm > 0.0)
         problems += [f"#{tag} {before[tag].text!r}: {p}" for p in found]
     if sorted(seen) != seen or len(set(seen)) != len(seen):
         problems.append("lines are out of order, or twice")

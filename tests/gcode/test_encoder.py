@@ -13,7 +13,7 @@ from stillpath.gcode.firmware._encoding_kernels import lay_out
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.klipper import encoder as encoder_module
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import ErrorFilter, fit_segments
@@ -108,7 +108,7 @@ def test_law_of_losses_is_klippers(
 def test_rest_durations_are_klippers(machine: Machine) -> None:
     """A retraction of .8 mm at 35 mm/s and 5000 mm/s2 takes .8 / 35 + 35 / 5000 s."""
     piece = pieces_of(HEAD + BODIES["retraction"], machine)[1]
-    encoder = kit(machine).encoder()
+    encoder = adapter(machine).encoder()
     groups = group_rows(piece.phases)
     rest_s = encoder.rest_durations(piece, groups)
     accel = machine.firmware.extruder.max_extrude_only_accel_mm_s2
@@ -118,7 +118,7 @@ def test_rest_durations_are_klippers(machine: Machine) -> None:
 def test_plain_path_survives(machine: Machine) -> None:
     """Without compensation the encoded motion is the plan, within the fit's tolerance."""
     piece = pieces_of(HEAD + BODIES["hop and retraction"], machine)[1]
-    encoder = kit(machine).encoder()
+    encoder = adapter(machine).encoder()
     groups = group_rows(piece.phases)
     timeline = build_timeline(piece.phases, groups, encoder.rest_durations(piece, groups), 1e-3)
     plants = [plant_set(machine.axes[a], 1e-3).nominal for a in ("x", "y")]
@@ -264,7 +264,7 @@ def test_numbers_are_written_as_python_does(top: int) -> None:
 
 
 def test_stream_limits_are_the_machines(machine: Machine) -> None:
-    firmware = kit(machine)
+    firmware = adapter(machine)
     stream = firmware.stream_limits(firmware.initial_limits())
     diagonal = pytest.approx(2**0.5 * machine.command.velocity_mm_s)
     # 27 mm/s at a small angle, of the 45 that a motor's speed may step by within a ms.

@@ -1,6 +1,7 @@
 """What a file feeds stays the same from line to line, whatever it counts E from, and how.
 
-Little prints with all that changes E among their moves go down the whole road of each firmware.
+Little prints with all that changes E among their moves go through the whole pipeline of each
+firmware.
 """
 
 from __future__ import annotations

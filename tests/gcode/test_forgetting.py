@@ -10,9 +10,9 @@ import pytest
 
 from stillpath.gcode import state
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.types import Phases, ProgramBlock
 from stillpath.models.machine import Machine
 from tests.fuzz.machines import machine_of
@@ -77,7 +77,7 @@ def test_pieces_are_the_same(machine: Machine, monkeypatch: pytest.MonkeyPatch, 
         assert one.text == other.text
         assert around(one) == around(other)
         assert same(one.phases, other.phases)
-    # Where passages are cut depends on how the file arrives.
+    # Where verbatim parts are cut depends on how the file arrives.
     assert along(found) == along(wanted)
 
 
@@ -88,17 +88,17 @@ def test_plans_are_the_same(machine: Machine, monkeypatch: pytest.MonkeyPatch, s
     plans = []
     for most_rows in (MOST_ROWS, 0):
         monkeypatch.setattr(state, "_MOST_ROWS", most_rows)
-        planner = kit(machine).planner()
+        planner = adapter(machine).planner()
         parts = [planner.push(block) for block in blocks_of(data, machine, 700)]
         plans.append(join_phases([*parts, planner.flush()]))
     assert same(*plans)
 
 
-def around(item: Passage) -> tuple[object, ...]:
+def around(item: VerbatimPart) -> tuple[object, ...]:
     return item.limits_before, item.limits_after, item.modal_before, item.modal_after
 
 
-def along(items: list[Piece | Passage]) -> list[tuple[object, ...]]:
+def along(items: list[Piece | VerbatimPart]) -> list[tuple[object, ...]]:
     """Return line, limits and modes of every row."""
     found = [
         (int(line), item.limits[a], item.modal[b])

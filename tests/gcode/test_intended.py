@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stillpath.gcode.firmware.planning import intended
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
@@ -32,7 +32,9 @@ MACHINES = {kind: machine_with(kind) for kind in ("marlin", "reprapfirmware")}
 
 
 def asked_for(piece: Piece, machine: Machine) -> Phases:
-    return intended(piece.phases, piece.moves.start_mm, piece.moves.end_mm, kit(machine).step_mm)
+    return intended(
+        piece.phases, piece.moves.start_mm, piece.moves.end_mm, adapter(machine).step_mm
+    )
 
 
 def ends_mm(phases: Phases) -> np.ndarray:

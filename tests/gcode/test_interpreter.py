@@ -307,7 +307,7 @@ def test_bom_and_line_ends(golden_machine: Machine) -> None:
 
 
 def test_a_snapshot_is_gone_with_its_last_user(golden_machine: Machine) -> None:
-    """Each has buffers; a file is read with one a line in tests, and one a piece on the road."""
+    """Each has buffers; a file is read with one a line in tests, one a piece otherwise."""
     reader = Interpreter(golden_machine)
     reader.push(b"G28\nG1 X1 F600\n")
     other = reader.snapshot()

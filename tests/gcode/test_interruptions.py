@@ -9,7 +9,7 @@ import pytest
 
 from stillpath.gcode.firmware.encoding import as_moves, limits_in_force
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Limits, Moves, rows_of
@@ -105,7 +105,7 @@ def test_a_stream_that_is_begun_at_a_layers_line(kind: str, most: float) -> None
     machine = ender3_with(kind)
     moves, _ = written(*compensated(HEAD + BODY, machine), 1.0)
     own = replace(moves, limits_id=np.zeros_like(moves.limits_id))
-    limits = [kit(machine).initial_limits()]
+    limits = [adapter(machine).initial_limits()]
     parts = (slice(k, k + _AROUND) for k in range(5, len(own), 7))
     worst = max(velocity_step(rows_of(own, part), limits, machine) for part in parts)
     assert worst <= most < machine.command.speed_step_mm_s

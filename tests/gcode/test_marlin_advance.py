@@ -14,7 +14,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import spread_advance
 from stillpath.gcode.firmware.marlin.encoder import stream_limits
 from stillpath.gcode.firmware.marlin.limits import advance_speed_mm_s, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
-from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
 from stillpath.gcode.sampler import sample_phases
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, PerAxis
@@ -190,18 +190,20 @@ def test_where_nobody_says_that_there_is_advance_nothing_is_slower_for_it() -> N
 
 def test_advance_is_off_in_a_stream_and_in_its_rests() -> None:
     firmware = Marlin(linear_advance=True, linear_advance_k_s=K_S)
-    own, voice = initial_limits(firmware), MarlinVoice(firmware)
+    own, stream_commands = initial_limits(firmware), MarlinStreamCommands(firmware)
     stream = stream_limits(own, CommandLimits())
-    assert voice.limits(own).splitlines()[-1] == b"M900 K0.05"
-    assert voice.limits(stream).splitlines()[-1] == b"M900 K0"
-    assert voice.limits(voice.in_stream(own)).splitlines()[-1] == b"M900 K0"
+    assert stream_commands.limits(own).splitlines()[-1] == b"M900 K0.05"
+    assert stream_commands.limits(stream).splitlines()[-1] == b"M900 K0"
+    assert stream_commands.limits(stream_commands.in_stream(own)).splitlines()[-1] == b"M900 K0"
     # The extruder must be free for twice the feed and the advance.
     assert stream.feedrate_e_mm_s > 2.0 * own.feedrate_e_mm_s + advance_speed_mm_s(
         own, classic_jerk=False
     )
     for none in (Marlin(linear_advance=True), Marlin(linear_advance=False)):
         limits = initial_limits(none)
-        assert b"M900" not in MarlinVoice(none).limits(stream_limits(limits, CommandLimits()))
+        assert b"M900" not in MarlinStreamCommands(none).limits(
+            stream_limits(limits, CommandLimits())
+        )
 
 
 def test_a_stream_is_not_slowed_down_by_advance() -> None:

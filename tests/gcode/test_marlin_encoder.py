@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.firmware.marlin._encoder_kernels import assign_rates, bend_reversals, thin
+from stillpath.gcode.firmware.marlin.adapter import MarlinAdapter
 from stillpath.gcode.firmware.marlin.encoder import stream_limits
-from stillpath.gcode.firmware.marlin.kit import MarlinKit
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
-from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import MarlinPlanner, MarlinShaper, PerAxis
@@ -138,7 +138,7 @@ def test_limits_of_a_stream() -> None:
     assert stream.min_segment_time_us == 0.0
     assert stream.retract_accel_mm_s2 == own.retract_accel_mm_s2
     assert stream.advance_in_filament == 0.0
-    lines = MarlinVoice(FIRMWARE).limits(stream).decode().splitlines()
+    lines = MarlinStreamCommands(FIRMWARE).limits(stream).decode().splitlines()
     assert lines == [
         "M201 X20000 Y20000 Z200 E300000",
         "M203 X525 Y525 Z20 E200",
@@ -146,19 +146,22 @@ def test_limits_of_a_stream() -> None:
         "M205 B0 S0 T0 J0.01",
     ]
     assert all(len(line) < 96 for line in lines)
-    classic = MarlinVoice(Marlin(junction="classic_jerk")).limits(stream).decode()
+    classic = MarlinStreamCommands(Marlin(junction="classic_jerk")).limits(stream).decode()
     assert classic.splitlines()[3] == "M205 B0 S0 T0 X19.09 Y19.09 Z0.3 E100"
 
 
 def test_the_shaper_of_the_firmware() -> None:
     shaper = MarlinShaper(freq_x_hz=40.0, freq_y_hz=35.5)
-    voice = MarlinVoice(Marlin(shaper=shaper))
-    assert voice.shaper_off == b"M593 F0\n"
-    assert voice.shaper_on == b"M593 X F40 D0.15\nM593 Y F35.5 D0.15\n"
+    stream_commands = MarlinStreamCommands(Marlin(shaper=shaper))
+    assert stream_commands.shaper_off == b"M593 F0\n"
+    assert stream_commands.shaper_on == b"M593 X F40 D0.15\nM593 Y F35.5 D0.15\n"
     for none in (Marlin(variant="2.0"), Marlin(shaper=MarlinShaper())):
-        assert (MarlinVoice(none).shaper_off, MarlinVoice(none).shaper_on) == (b"", b"")
-    # Nobody says whether there is one: off it goes, and the road warns.
-    unknown = MarlinVoice(Marlin())
+        assert (MarlinStreamCommands(none).shaper_off, MarlinStreamCommands(none).shaper_on) == (
+            b"",
+            b"",
+        )
+    # Nobody says whether there is one: off it goes, and the pipeline warns.
+    unknown = MarlinStreamCommands(Marlin())
     assert (unknown.shaper_off, unknown.shaper_on) == (b"M593 F0\n", None)
 
 
@@ -176,7 +179,7 @@ def test_the_shaper_of_the_firmware() -> None:
 )
 def test_what_cannot_be_executed_is_refused(facts: dict[str, Any], says: str) -> None:
     firmware = FIRMWARE.model_copy(update=facts)
-    refusal = MarlinKit(with_firmware(firmware), firmware).refusal
+    refusal = MarlinAdapter(with_firmware(firmware), firmware).refusal
     assert refusal is not None
     assert says in refusal
     assert "--method advise" in refusal
@@ -190,10 +193,10 @@ def test_a_stock_machine_can(per_mm: float) -> None:
     stock = FIRMWARE.model_copy(update=facts)
     curved = stock.model_copy(update={"s_curve": True})
     for firmware in (FIRMWARE, stock, curved):
-        assert MarlinKit(with_firmware(firmware), firmware).refusal is None
+        assert MarlinAdapter(with_firmware(firmware), firmware).refusal is None
 
 
-# The road
+# The pipeline
 
 
 PRINT = HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2100\nG28 X\n"
@@ -297,7 +300,7 @@ def test_limits_are_written_as_marlin_reads_them(value: float) -> None:
     """Seen by fuzzing: Marlin reads `1e-09` as 1."""
     own = replace(initial_limits(FIRMWARE), feedrate_x_mm_s=value)
     reader = Interpreter(with_firmware())
-    (block,) = reader.push(MarlinVoice(FIRMWARE).limits(own) + b"G28\n") + reader.flush()
+    (block,) = reader.push(MarlinStreamCommands(FIRMWARE).limits(own) + b"G28\n") + reader.flush()
     found = block.limits[-1]
     assert isinstance(found, MarlinLimits)
     assert found.feedrate_x_mm_s == value

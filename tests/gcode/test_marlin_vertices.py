@@ -280,7 +280,7 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
     assert np.max(excess) < 0.3
 
 
-# The road
+# The pipeline
 
 
 @pytest.mark.slow

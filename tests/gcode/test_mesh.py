@@ -7,7 +7,7 @@ import pytest
 
 from stillpath.gcode.firmware.encoding import UNITS_PER_MM, as_moves, limits_in_force
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.types import Phases
 from stillpath.models.errors import ModelError
@@ -69,8 +69,8 @@ def test_a_tilted_plane_keeps_the_times(slope: float, kind: str) -> None:
 def test_stream_limits_are_what_z_leaves() -> None:
     machine = crooked(SLOPE)
     planner = machine.firmware.planner
-    own = kit(machine).initial_limits()
-    stream = kit(machine).stream_limits(own)
+    own = adapter(machine).initial_limits()
+    stream = adapter(machine).stream_limits(own)
     assert planner.max_z_accel_mm_s2 / SLOPE > machine.command.accel_mm_s2
     assert stream.accel_mm_s2 == machine.command.accel_mm_s2
     assert stream.velocity_mm_s == pytest.approx(
@@ -92,6 +92,6 @@ def test_climbing_along_the_mesh_counts_as_climbing() -> None:
     machine = crooked(SLOPE)
     least = machine.firmware.planner.max_z_accel_mm_s2 / machine.command.accel_mm_s2
     travel = np.array([[10.0, 0.0, 9.9 * (least - SLOPE), 0.0], [10.0, 0.0, 9.9 * least, 0.0]])
-    assert kit(machine).too_steep(travel).tolist() == [False, True]
-    level = kit(machine.model_copy(update={"mesh_slope": 0.0}))
+    assert adapter(machine).too_steep(travel).tolist() == [False, True]
+    level = adapter(machine.model_copy(update={"mesh_slope": 0.0}))
     assert level.too_steep(travel).tolist() == [False, False]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import plan_moves
-from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.types import EventKind
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.store import load_machine
@@ -27,11 +27,11 @@ def machine() -> Machine:
     return load_machine("ender3")
 
 
-def text_of(items: list[Piece | Passage]) -> bytes:
+def text_of(items: list[Piece | VerbatimPart]) -> bytes:
     return b"".join(item.text for item in items)
 
 
-def check(items: list[Piece | Passage], data: bytes) -> None:
+def check(items: list[Piece | VerbatimPart], data: bytes) -> None:
     assert text_of(items) == data
     offset = 0
     for item in items:
@@ -276,7 +276,7 @@ def test_moves_that_hardly_end(
 
 
 def test_moves_that_last_leave_as_they_came(machine: Machine) -> None:
-    """A move of two minutes under a low limit is a passage; the pieces beside it stay."""
+    """A move of two minutes under a low limit is a verbatim part; the pieces beside it stay."""
     slow = "SET_VELOCITY_LIMIT VELOCITY=.5\nG1 X60 Y110 E1\nSET_VELOCITY_LIMIT VELOCITY=300\n"
     text = HEAD + "G1 X90 E1 F6000\nG1 X60 E1\n" + slow + "G1 X90 E1\nG1 X60 E1\n"
     items = cut(text.encode(), machine)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import (
     AS_SLICED,
@@ -17,7 +17,7 @@ from stillpath.gcode.pacing import (
     FirstLayer,
     Pace,
     move_classes,
-    quickened,
+    paced,
     top_limits,
 )
 from stillpath.gcode.pieces import Piece, Splitter, excerpt
@@ -96,8 +96,8 @@ def test_pace_one_is_the_piece_itself(firmware: str) -> None:
     piece = whole(MACHINES[firmware])
     classes = move_classes(piece.moves)
     paces = {int(one): Pace() for one in np.unique(classes)}
-    assert quickened(piece, classes, paces, MACHINES[firmware]) is piece
-    assert quickened(piece, classes, {}, MACHINES[firmware]) is piece
+    assert paced(piece, classes, paces, MACHINES[firmware]) is piece
+    assert paced(piece, classes, {}, MACHINES[firmware]) is piece
 
 
 @pytest.mark.parametrize("firmware", MACHINES)
@@ -109,7 +109,7 @@ def test_limits_and_geometry(firmware: str, travel: float, wall: float, infill: 
     names = sorted(set(classes[classes >= 0].tolist()))
     ratios = {TRAVEL: travel, names[0]: wall, names[1]: infill}
     paces = {one: Pace(ratio, max(ratio, 1.0)) for one, ratio in ratios.items()}
-    made = quickened(piece, classes, paces, machine)
+    made = paced(piece, classes, paces, machine)
     for column in fields(piece.moves):
         if column.name not in ("limits_id", "speed_mm_s"):
             before, after = getattr(piece.moves, column.name), getattr(made.moves, column.name)
@@ -140,14 +140,14 @@ def test_limits_and_geometry(firmware: str, travel: float, wall: float, infill: 
 @pytest.mark.parametrize("firmware", MACHINES)
 def test_limits_of_other_axes_stay(firmware: str) -> None:
     machine = MACHINES[firmware]
-    own = kit(machine).initial_limits()
-    made = kit(machine).quickened(own, 3.0, 2.0, top_limits(machine))
-    assert kit(machine).quickened(own, 1.0, 1.0, top_limits(machine)) == own
+    own = adapter(machine).initial_limits()
+    made = adapter(machine).paced(own, 3.0, 2.0, top_limits(machine))
+    assert adapter(machine).paced(own, 1.0, 1.0, top_limits(machine)) == own
     changed = [f.name for f in fields(own) if getattr(own, f.name) != getattr(made, f.name)]
     assert changed
     assert not any("_z_" in name or "_e_" in name or "retract" in name for name in changed)
     high = replace(made, **{changed[0]: 1e6})
-    again = kit(machine).quickened(high, 5.0, 5.0, top_limits(machine))
+    again = adapter(machine).paced(high, 5.0, 5.0, top_limits(machine))
     assert getattr(again, changed[0]) == 1e6
 
 

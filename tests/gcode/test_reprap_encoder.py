@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import as_moves
 from stillpath.gcode.firmware.planning import join_phases, plan_moves
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
 from stillpath.gcode.firmware.reprapfirmware.encoder import stream_limits
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
-from stillpath.gcode.firmware.reprapfirmware.voice import RepRapVoice
+from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import EventKind
@@ -215,20 +215,20 @@ def test_a_dense_stream_is_thinned_out_for_a_short_queue() -> None:
 def test_moves_that_climb_too_much_stay_as_they_are(climb: float, steep: bool) -> None:
     machine = machine_of(firmware())
     way = np.array([[8.0, 6.0, climb, 0.1]])
-    assert kit(machine).too_steep(way).tolist() == [steep]
+    assert adapter(machine).too_steep(way).tolist() == [steep]
     # For a bed mesh Z's limits are raised beside that.
     tilted = machine.model_copy(update={"mesh_slope": 0.05})
-    assert kit(tilted).too_steep(way).tolist() == [steep]
+    assert adapter(tilted).too_steep(way).tolist() == [steep]
 
 
 def test_words_set_the_limits_that_they_name() -> None:
     own = replace(
         RepRapLimits.of(firmware(), 0.0), jerk_x_mm_s=4.0, jerk_policy=1.0, min_speed_mm_s=0.3
     )
-    voice = RepRapVoice(firmware(), ADVANCE_S)
+    stream_commands = RepRapStreamCommands(firmware(), ADVANCE_S)
     for limits in (own, stream_limits(firmware(), CommandLimits())):
         reader = Interpreter(machine_of(firmware(), advance_s=0.03))
-        blocks = [*reader.push(voice.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
+        blocks = [*reader.push(stream_commands.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
         row = blocks[0].limits[blocks[0].moves.limits_id[0]].as_row()
         expected = replace(limits, pressure_advance_s=0.03).as_row()
         assert row == pytest.approx(expected, abs=1e-6)
@@ -236,17 +236,17 @@ def test_words_set_the_limits_that_they_name() -> None:
 
 def test_words_around_the_firmwares_own_shaper() -> None:
     shaper = RepRapShaper(type="zvd", freq_hz=40.5, damping=0.12)
-    voice = RepRapVoice(firmware(shaper=shaper), ADVANCE_S)
-    assert voice.shaper_off == b'M593 P"none"\nM572 S0\n'
-    assert voice.shaper_on == b'M593 P"zvd" F40.5 S0.12\nM572 S0.04\n'
-    assert RepRapVoice(firmware(), 0.0).shaper_on == b'M593 P"none"\nM572 S0\n'
-    assert voice.acceleration(1500.0) == b"G1\nM201 X1500 Y1500\nM204 P1500 T1500\n"
+    stream_commands = RepRapStreamCommands(firmware(shaper=shaper), ADVANCE_S)
+    assert stream_commands.shaper_off == b'M593 P"none"\nM572 S0\n'
+    assert stream_commands.shaper_on == b'M593 P"zvd" F40.5 S0.12\nM572 S0.04\n'
+    assert RepRapStreamCommands(firmware(), 0.0).shaper_on == b'M593 P"none"\nM572 S0\n'
+    assert stream_commands.acceleration(1500.0) == b"G1\nM201 X1500 Y1500\nM204 P1500 T1500\n"
 
 
 def test_limits_wait_until_the_move_before_them_is_planned() -> None:
     """Behind a G1 without words, which is no move and stops none."""
-    voice, machine = RepRapVoice(firmware(), 0.0), machine_of(firmware())
-    raised = voice.limits(stream_limits(firmware(), CommandLimits()))
+    stream_commands, machine = RepRapStreamCommands(firmware(), 0.0), machine_of(firmware())
+    raised = stream_commands.limits(stream_limits(firmware(), CommandLimits()))
     assert raised.startswith(b"G1\nM201 X")
     blocks = Interpreter(machine).push(b"G1 X1 F600\n" + raised + b"G1 X2\n")
     assert [len(block.moves) for block in blocks] == [2]
@@ -361,9 +361,9 @@ def test_plan_moves_takes_the_kit() -> None:
     moves = as_moves(
         np.zeros((1, 4)), np.array([[10.0, 0.0, 0.0, 0.0]]), np.array([50.0]), np.zeros(1, np.int32)
     )
-    phases = plan_moves(moves, [kit(machine).initial_limits()], machine)
+    phases = plan_moves(moves, [adapter(machine).initial_limits()], machine)
     # 50 mm/s at 5000 mm/s2: 10 ms and .25 mm at both ends.
     assert phases.cruise_s[0] == pytest.approx(9.5 / 50.0, abs=2e-6)
-    broken = replace(kit(machine).initial_limits(), accel_x_mm_s2=0.0)
+    broken = replace(adapter(machine).initial_limits(), accel_x_mm_s2=0.0)
     with pytest.raises(GcodeError, match="above 0"):
         plan_moves(moves, [broken], machine)

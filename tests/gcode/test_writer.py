@@ -1,6 +1,6 @@
 """The written file, read as the machine reads it: every original line finds its own state.
 
-Files go down the whole road here: what counts is the text that reaches the printer.
+Files go through the whole pipeline here: what counts is the text that reaches the printer.
 """
 
 from __future__ import annotations

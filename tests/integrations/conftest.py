@@ -21,7 +21,7 @@ _ODD_SERVER = Path(__file__).with_name("odd_server.py")
 
 @pytest.fixture(scope="session")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """The server with the pretended road, a process of its own."""
+    """The server with the pretended pipeline, a process of its own."""
     data = tmp_path_factory.mktemp("server")
     with server([sys.executable, str(_ODD_SERVER)], data) as (client, _):
         yield Running(client, data)

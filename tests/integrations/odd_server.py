@@ -1,4 +1,4 @@
-"""The real server, with a pretended road and something odd before it: `odd_server.py DATA_DIR`.
+"""The real server, with a pretended pipeline and something odd before it: `odd_server.py DATA_DIR`.
 
 What is odd is told by the beginning of the path: /key wants the key "secret", with /short results
 break off, with /lost a part of the upload gets lost, /moved is somewhere else. All other paths are

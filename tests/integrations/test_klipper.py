@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stillpath.gcode.firmware.klipper.kit import KlipperKit
-from stillpath.gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
+from stillpath.gcode.firmware.klipper.adapter import KlipperAdapter
+from stillpath.gcode.firmware.klipper.stream_commands import IN_STREAM_MARK_MM_S
 from stillpath.models.store import load_machine
 from tests.integrations.klipper import SETTINGS, CommandError, ConfigError, Klipper, macros_of
 
@@ -52,10 +52,10 @@ def in_stretch(*files: Path | str, **more) -> Klipper:
     """A printer in the middle of a compensated stretch, by our encoder's own lines."""
     printer = Klipper(macros_of(*files), **more)
     machine = load_machine("voron-v24-250")
-    firmware = KlipperKit(machine, machine.firmware)
-    voice = firmware.voice()
-    printer.run(voice.limits(firmware.stream_limits(firmware.initial_limits())).decode())
-    printer.run(voice.shaper_off.decode())
+    firmware = KlipperAdapter(machine, machine.firmware)
+    stream_commands = firmware.stream_commands()
+    printer.run(stream_commands.limits(firmware.stream_limits(firmware.initial_limits())).decode())
+    printer.run(stream_commands.shaper_off.decode())
     assert printer.toolhead["max_accel"] == 20_000
     printer.state = "printing"
     printer.sent.clear()
@@ -115,10 +115,12 @@ def test_a_pause_among_the_files_own_moves_of_a_stretch():
     """There the file's limits are in force, marked, and the shaper is off."""
     printer = Klipper(macros_of(OURS))
     machine = load_machine("voron-v24-250")
-    firmware = KlipperKit(machine, machine.firmware)
-    voice = firmware.voice()
-    printer.run(voice.limits(voice.in_stream(firmware.initial_limits())).decode())
-    printer.run(voice.shaper_off.decode())
+    firmware = KlipperAdapter(machine, machine.firmware)
+    stream_commands = firmware.stream_commands()
+    printer.run(
+        stream_commands.limits(stream_commands.in_stream(firmware.initial_limits())).decode()
+    )
+    printer.run(stream_commands.shaper_off.decode())
     before = limits(printer)
     printer.run("PAUSE")
     assert printer.shaper["shaper_freq_x"] == 57.8

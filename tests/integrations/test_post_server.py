@@ -1,5 +1,5 @@
 """The program for slicers with a server: the real one, in a process of its own, mostly with a
-pretended road."""
+pretended pipeline."""
 
 from __future__ import annotations
 

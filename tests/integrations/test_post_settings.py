@@ -227,7 +227,7 @@ def test_the_line_for_windows_survives_its_quoting(tmp_path: Path, monkeypatch, 
     monkeypatch.setattr(sys, "argv", [program])
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(Path, "absolute", lambda self: self)
-    stillpath_post._set_up(settings(tmp_path), stillpath_post.Voice())
+    stillpath_post._set_up(settings(tmp_path), stillpath_post.StreamCommands())
     line = capsys.readouterr().out.splitlines()[-1].strip()
     assert windows_split(line) == [f"{program}.exe"]
 

@@ -1,4 +1,4 @@
-"""Whole ways: PrusaSlicer and CuraEngine slice, the real road compensates."""
+"""Whole ways: PrusaSlicer and CuraEngine slice, the real pipeline compensates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of advice among any lines, and the shaper that they set: by themselves, without a road."""
+"""Lines of advice among any lines, and the shaper that they set: without a pipeline."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import EventKind, Limits, Moves
 from stillpath.models.firmware import Klipper, Marlin, RepRapFirmware
@@ -63,7 +63,7 @@ def klipper() -> Machine:
 
 
 def written(data: bytes, machine: Machine, advice: Advice) -> bytes:
-    reader, firmware = Interpreter(machine), kit(machine)
+    reader, firmware = Interpreter(machine), adapter(machine)
     adviser = firmware.adviser(reader.dialect)
     writer = AdviceWriter(adviser, advice, reader.feature_names, firmware.initial_limits(), "test")
     out = io.BytesIO()
@@ -74,7 +74,7 @@ def written(data: bytes, machine: Machine, advice: Advice) -> bytes:
 def printed(data: bytes, machine: Machine) -> list[tuple[str, int, Limits, Shaping]]:
     """Feature, layer, limits and shaper of every move that prints, as the firmware reads it."""
     reader = Interpreter(machine)
-    adviser = kit(machine).adviser(reader.dialect)
+    adviser = adapter(machine).adviser(reader.dialect)
     shaping, found = Shaping(), []
     for block in [*reader.push(data), *reader.flush()]:
         rows: list[tuple[int, bool, int]] = []
@@ -124,8 +124,8 @@ def test_every_firmwares_words_are_read_as_they_are_written() -> None:
     found = {}
     for firmware in (Klipper(), Marlin(ft_motion=True), Marlin(), RepRapFirmware()):
         machine = base.model_copy(update={"firmware": firmware})
-        firmware_kit = kit(machine)
-        adviser = firmware_kit.adviser(Interpreter(machine).dialect)
+        firmware_adapter = adapter(machine)
+        adviser = firmware_adapter.adviser(Interpreter(machine).dialect)
         for kind in adviser.shapers:
             x = AxisShaper(kind, 41.5)
             wanted = Shaping(x, x if adviser.same_for_both else AxisShaper(kind, 30.2, 0.05))
@@ -135,7 +135,7 @@ def test_every_firmwares_words_are_read_as_they_are_written() -> None:
             assert read == wanted
         lines = adviser.accel_lines(2345.0)
         assert any(adviser.sets_accel(line.decode()) for line in lines)
-        limits = firmware_kit.initial_limits()
+        limits = firmware_adapter.initial_limits()
         block = Interpreter(machine).push(b"\n".join([*lines, b"G1 X10 F600", b""]))[-1]
         now = block.limits[block.moves.limits_id[-1]]
         assert now == adviser.with_accel(limits, 2345.0)
@@ -188,7 +188,7 @@ def motion(path: np.ndarray) -> MotionSamples:
 )
 def test_a_shaper_that_nobody_can_put_back(own: str, left: bool) -> None:
     machine = klipper()
-    reader, firmware = Interpreter(machine), kit(machine)
+    reader, firmware = Interpreter(machine), adapter(machine)
     adviser, names = firmware.adviser(reader.dialect), reader.feature_names
     writer = AdviceWriter(adviser, ADVICE, names, firmware.initial_limits(), "test")
     for block in reader.push(f"M83\n{own}\nG1 X5 E1 F600\n".encode()):
@@ -212,7 +212,7 @@ def test_nothing_is_quicker_where_the_file_says_off() -> None:
 
 def test_an_object_may_be_left_out_with_all_its_lines() -> None:
     machine = klipper().model_copy(update={"firmware": Marlin(variant="bambu")})
-    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
     head = "M83\nM204 P900\n;LAYER_CHANGE\n;LAYER_CHANGE\n;TYPE:Outer wall\n"
     data = head + "".join(f"M624 {k}\nG1 X{k} E1 F600\nM625\n" for k in (1, 2, 3))
     out = written(data.encode(), machine, Advice({0: Bound(2400.0, 2400.0)})).decode()
@@ -238,7 +238,7 @@ def test_lines_with_several_commands() -> None:
     out = written(data, machine, Advice({0: Bound(2400.0, 2400.0)}, [(-1, ours)]))
     moves = printed(out, machine)
     assert len(moves) == 1 + len(lines)
-    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
     assert {adviser.accel_mm_s2(limits) for _, _, limits, _ in moves} == {2400.0}
     # Of what the file sets only the shaper comes back, no move and no pressure advance.
     behind = [x for x in out.splitlines() if b"own shaper" in x]
@@ -304,7 +304,7 @@ def test_nothing_of_ours_is_stored_for_good(fixed_time: bool) -> None:
     out = written(data.encode(), machine, Advice({0: Bound(2400.0, 2400.0)}, [(-1, OURS)])).decode()
     assert out.count("M500") == 1
     before, behind = out.split("N3 M500*33\n")
-    adviser = kit(machine).adviser(Interpreter(machine).dialect)
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
     shaping = adviser.stated or OFF
     for line in before.splitlines():
         shaping = adviser.read_shaper(line, shaping)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive
 from stillpath.models.machine import AxisTravel, CommandLimits, Machine
@@ -38,7 +38,9 @@ def test_a_diagonal_near_the_command_s_speed() -> None:
     made = PieceCompensator(machine, Options()).compensate(piece)
     speed = made.encoded.phases.cruise_mm_s
     assert speed.max() > 150.0
-    assert speed.max() < kit(machine).stream_limits(kit(machine).initial_limits()).as_row()[0]
+    assert (
+        speed.max() < adapter(machine).stream_limits(adapter(machine).initial_limits()).as_row()[0]
+    )
     end_s = made.segments.end_s[-1]
     assert made.encoded.phases.duration_s == pytest.approx(end_s, abs=2e-3)
 

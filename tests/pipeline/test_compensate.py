@@ -1,4 +1,4 @@
-"""The whole road: a file in, a compensated and verified file out, with figures that hold."""
+"""The whole pipeline: a file in, a compensated and verified file out, with figures that hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Binary and packed files on the whole road: in, compensated, and back in kind."""
+"""Binary and packed files on the whole pipeline: in, compensated, and back in kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small files that would print for months: refused on every road, before anything is computed."""
+"""Small files that would print for months: refused before anything is computed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole road for machines that run something else than Klipper."""
+"""The whole pipeline for machines that run something else than Klipper."""
 
 from __future__ import annotations
 

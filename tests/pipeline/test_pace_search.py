@@ -129,16 +129,16 @@ def test_paces_follow_the_errors_both_ways() -> None:
 def test_a_file_above_its_budget_is_written_anew() -> None:
     first = budget(wall=4.0, travel=2.0)
     over = {WALL: sums(12.0, 90.0), TRAVEL: sums(3.0, 90.0)}
-    assert first.milder({WALL: sums(9.9, 90.0)}) is None
-    second = first.milder(over)
+    assert first.gentler({WALL: sums(9.9, 90.0)}) is None
+    second = first.gentler(over)
     assert second is not None
     assert 1.0 < factors(second, over)["Perimeter"] < 4.0
-    third = second.milder(over)
+    third = second.gentler(over)
     assert third is not None
     assert 1.0 < factors(third, over)["travel"] < 2.0
-    last = third.milder(over)
+    last = third.gentler(over)
     assert last is not None
     assert set(factors(last, over).values()) == {1.0}
-    assert last.milder(over) is None
+    assert last.gentler(over) is None
     # What is as it was sliced cannot be milder.
-    assert budget(wall=1.0, travel=1.0).milder(over) is None
+    assert budget(wall=1.0, travel=1.0).gentler(over) is None

@@ -13,7 +13,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
-from stillpath.pipeline.measuring.responses import Answered, Answers
+from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
 from stillpath.simulation.scheduled import MachineStream
 
 DT_S = 1e-3
@@ -32,7 +32,9 @@ def walk(seed: int, count: int) -> np.ndarray:
     return 100.0 + np.cumsum(np.cumsum(speed, axis=1) * 1e-4, axis=1)
 
 
-def pushed(answers: Answers, path: np.ndarray, executed: np.ndarray) -> Iterator[Answered | None]:
+def pushed(
+    answers: Responses, path: np.ndarray, executed: np.ndarray
+) -> Iterator[ResponseSamples | None]:
     moves = interpret_bytes(b"G28\nG1 X1\n", load_machine("ender3"))[0].moves
     count = path.shape[1]
     for part in np.split(np.arange(count), [7, 300, 5000, 9100, 9101]):
@@ -47,7 +49,7 @@ def pushed(answers: Answers, path: np.ndarray, executed: np.ndarray) -> Iterator
 @pytest.mark.parametrize("compensated", [True, False])
 def test_parts(ender: Machine, compensated: bool) -> None:
     names = NAMES if compensated else ("before", "shaper")
-    answers = Answers(ender, DT_S, SHAPER, names, compensated=compensated)
+    answers = Responses(ender, DT_S, SHAPER, names, compensated=compensated)
     pulses = [shaper_pulses("mzv", f_hz, 0.1) for f_hz in (SHAPER.fx_hz, SHAPER.fy_hz)]
     for seed in (1, 2):  # the machine comes to stand in between
         path, executed = walk(seed, 12_000), walk(seed + 10, 12_000)

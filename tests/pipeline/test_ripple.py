@@ -1,4 +1,4 @@
-"""Ripple through the whole road: a file in, a verified file out, measured with the ripple."""
+"""Ripple through the whole pipeline: a file in, a verified file out, measured with the ripple."""
 
 from __future__ import annotations
 

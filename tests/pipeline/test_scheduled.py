@@ -1,4 +1,4 @@
-"""The road along a schedule: what lies on the bed, the written file, figures and notes."""
+"""The pipeline along a schedule: what lies on the bed, the written file, figures and notes."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ HEAD = "G28\nG90\nM83\nM204 S1500\n"
 
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the yardstick of the plain machine is known."""
+    """Where the reference shaper of the plain machine is known."""
     folder = tmp_path_factory.mktemp("cache")
     cached_shaper(bedslinger(None), folder)
     return folder
 
 
-def with_yardstick(machine: Machine, cache: Path) -> Machine:
-    """Spare a machine the tuning of its own: its yardstick is the plain machine's."""
+def with_reference_shaper(machine: Machine, cache: Path) -> Machine:
+    """Spare a machine the tuning of its own: its reference shaper is the plain machine's."""
     plain = bedslinger(None).revision
     for known in cache.glob(f"*{plain}*"):
         (cache / known.name.replace(plain, machine.revision)).write_bytes(known.read_bytes())
@@ -119,7 +119,7 @@ def compensated(
 ) -> tuple[Result, list[bytes]]:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_text(text)
-    with_yardstick(machine, cache)
+    with_reference_shaper(machine, cache)
     result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
     return result, target.read_bytes().splitlines()
 
@@ -159,7 +159,7 @@ def test_follows_the_print(tmp_path: Path, cache: Path) -> None:
 def test_prediction_follows_too(tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_text(block(16))
-    heavy = with_yardstick(bedslinger(0.05, density=12.4), cache)
+    heavy = with_reference_shaper(bedslinger(0.05, density=12.4), cache)
     result, plain = (simulate_file(source, m, cache_dir=cache) for m in (heavy, bedslinger(None)))
     assert "kg at the end" in result.notes[0]
     both = zip(result.layers, plain.layers, strict=True)

@@ -1,4 +1,4 @@
-"""Times in a compensated file, on the whole road."""
+"""Times in a compensated file, on the whole pipeline."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def test_every_field_is_described_with_its_unit() -> None:
 
 def test_reports_follow_it() -> None:
     document: dict[str, Any] = json.loads(make_result().model_dump_json())
-    document["track"]["contour_rms_um"]["before"][50] = 0.0  # no road writes a gap
+    document["track"]["contour_rms_um"]["before"][50] = 0.0  # no pipeline writes a gap
     schema = report_schema()
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)

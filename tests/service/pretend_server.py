@@ -1,4 +1,4 @@
-"""The real server with a pretended road: `python pretend_server.py DATA_DIR [RUNNER]`."""
+"""The real server with a pretended pipeline: `python pretend_server.py DATA_DIR [RUNNER]`."""
 
 import sys
 from pathlib import Path

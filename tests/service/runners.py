@@ -1,4 +1,4 @@
-"""Stand-ins for the road in the worker process; importable by name from a new process.
+"""Stand-ins for the pipeline in the worker process; importable by name from a new process.
 
 What a runner does is told by the first word of the uploaded file. With `stamp` in its first line
 the result says that it was compensated, as real ones do.

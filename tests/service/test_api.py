@@ -1,4 +1,4 @@
-"""The API with a pretended road: uploads, states, problems, cancel, deletion, restarts."""
+"""The API with a pretended pipeline: uploads, states, problems, cancel, deletion, restarts."""
 
 from __future__ import annotations
 

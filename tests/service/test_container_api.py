@@ -1,4 +1,4 @@
-"""Binary and packed files over HTTP, through the real road."""
+"""Binary and packed files over HTTP, through the real pipeline."""
 
 from __future__ import annotations
 

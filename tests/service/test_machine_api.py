@@ -230,7 +230,7 @@ def test_a_job_keeps_the_machine_it_was_accepted_with(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
-    """With the real road, but a method that changes nothing."""
+    """With the real pipeline, but a method that changes nothing."""
     store = MachineStore(tmp_path / "machines")
     old = make_plants(50.0, on=date(2020, 1, 31))
     store.add_revision("mine", make_machine(axes={"x": old, "y": make_plants()}), author="anna")

@@ -1,4 +1,4 @@
-"""A server process of its own on a free port: streaming, kills and restarts, the real road."""
+"""A server process of its own on a free port: streaming, kills and restarts, the real pipeline."""
 
 from __future__ import annotations
 

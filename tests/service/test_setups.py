@@ -1,6 +1,6 @@
 """The same suite on one computer, and on several: PostgreSQL, S3, Dask's scheduler and workers.
 
-With the real road and real processes; only S3 and the network are pretended.
+With the real pipeline and real processes; only S3 and the network are pretended.
 """
 
 from __future__ import annotations
@@ -205,4 +205,4 @@ def test_machines_have_revisions(http: httpx2.Client, part: Path):
     assert http.put("/v1/machines/mine", json=document, headers=stale).status_code == 412
     job = http.post("/v1/jobs?machine=mine&method=none", content=part.read_bytes()).json()
     assert job["machine"] == "mine"
-    http.post(f"/v1/jobs/{job['id']}/cancel")  # its own yardstick would have to be tuned
+    http.post(f"/v1/jobs/{job['id']}/cancel")  # its own reference shaper would have to be tuned

@@ -22,7 +22,7 @@ from stillpath.models.plants import (
     discretise,
 )
 from stillpath.models.store import builtin_machines, load_machine
-from stillpath.simulation.evaluation import TruthStream, refined, truth_response
+from stillpath.simulation.evaluation import ContinuousPlantStream, continuous_response, refined
 from stillpath.simulation.response import PlantStream, response
 
 PAIRS = PairsSpec(
@@ -97,12 +97,12 @@ def test_truth_is_the_continuous_plant() -> None:
     reference = control.forced_response(
         control.tf(num, den), np.arange(391) * 1e-4, fine[0] - u[0, 0]
     )
-    y = truth_response([PAIRS], u)
+    y = continuous_response([PAIRS], u)
     np.testing.assert_allclose(y[0], np.asarray(reference.outputs) + u[0, 0], atol=1e-8)
     # A command linear between milliseconds is answered alike on both grids.
     coarse = response([discretise(PAIRS, 1e-3)], u)
     np.testing.assert_allclose(y[:, ::10], coarse, atol=1e-9)
-    stream = TruthStream([PAIRS])
+    stream = ContinuousPlantStream([PAIRS])
     parts = [stream.push(fine[:, :100]), stream.push(fine[:, 100:])]
     np.testing.assert_allclose(np.hstack(parts), y, atol=1e-12)
 

@@ -28,7 +28,7 @@ from stillpath.gcode.firmware.klipper._encoder_kernels import assign_speeds, exp
 from stillpath.gcode.firmware.klipper._motion_kernels import move_limits
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.firmware.klipper.planner import Planner
-from stillpath.gcode.firmware.klipper.voice import IN_STREAM_MARK_MM_S
+from stillpath.gcode.firmware.klipper.stream_commands import IN_STREAM_MARK_MM_S
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline

@@ -18,7 +18,7 @@ _NAMES = {"mzv": "mzv", "2hump_ei": "ei2", "3hump_ei": "ei3"}
 """Our names to M593 P's. ZVD, ZVDD and ZVDDD have no model here."""
 _MODELLED = {theirs: ours for ours, theirs in _NAMES.items()}
 _FENCE = b"G1"
-"""Limits hold as soon as they are read: see `gcode.firmware.reprapfirmware.voice`."""
+"""Limits hold as soon as they are read: see `gcode.firmware.reprapfirmware.stream_commands`."""
 
 
 class RepRapAdviser:

@@ -10,18 +10,18 @@ from stillpath.cli.batch.local_workers import Failure, Made, Stopped, Task, fail
 from stillpath.cli.batch.output import Figures
 from stillpath.gcode.errors import GcodeError
 
-__all__ = ["PretendedLane"]
+__all__ = ["PretendedWorker"]
 
 DELAY_S = float(os.environ.get("PRETENDED_DELAY_S", "0"))
 
 
-class PretendedLane:
+class PretendedWorker:
     """Does files in this process."""
 
     tries = 0
 
     def do(self, task: Task, stopping: threading.Event) -> Made:
-        PretendedLane.tries += 1
+        PretendedWorker.tries += 1
         word = task.source.read_text().split()[0]
         deadline = time.monotonic() + (600 if word == "slow" else DELAY_S)
         while time.monotonic() < deadline:

@@ -15,13 +15,13 @@ import pytest
 
 from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.main import run
-from tests.cli.batch.pretending import PretendedLane
+from tests.cli.batch.pretending import PretendedWorker
 from tests.service.machines import make_machine, with_accel
 
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch, tmp_path):
-    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedLane)
+    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedWorker)
     monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.chdir(tmp_path)
 

@@ -1,4 +1,4 @@
-"""Batches through a server: the real one, with a pretended road."""
+"""Batches through a server: the real one, with a pretended pipeline."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.batch.items import Group
 from stillpath.cli.batch.output import Outcome, OutputFolder
 from stillpath.cli.batch.watching import Watcher
-from stillpath.cli.batch.worker_pool import Here, crew
+from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
 from stillpath.pipeline.options import Options
-from tests.cli.batch.pretending import PretendedLane
+from tests.cli.batch.pretending import PretendedWorker
 from tests.service.machines import make_machine, with_accel
 
 ROOT = Path(__file__).parents[3]
@@ -52,7 +52,7 @@ class Watching:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedLane)
+    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedWorker)
     (tmp_path / "in").mkdir()
     return tmp_path / "in"
 
@@ -66,7 +66,7 @@ def watching(
     options = Options()
     with (
         OutputFolder.opened(output or folder.parent / "out") as kept,
-        crew(Here(machines, options, 2), kept, options, 2) as made,
+        worker_pool(LocalPool(machines, options, 2), kept, options, 2) as made,
     ):
         group = Group(tuple(machine.split(",")))
         yield Watching(Watcher(folder, group, made, kept, settle_s=2.0, tell=told.append), told)
@@ -120,10 +120,10 @@ def test_the_reason_stands_beside_the_file(folder):
         assert "X1e400 is too large" in reason.read_text()
         watch.look(1000)
         assert watch.until_quiet() == []
-    tries = PretendedLane.tries
+    tries = PretendedWorker.tries
     with watching(folder) as watch:  # nor is it tried again by the next one
         assert len(watch.until_quiet()) == 1
-        assert PretendedLane.tries == tries
+        assert PretendedWorker.tries == tries
         (folder / "a.gcode").write_text("G28")
         assert [o.state for o in watch.until_quiet()] == ["done"]
         assert not reason.exists()
@@ -193,8 +193,8 @@ def test_killed_again_and_again(tmp_path):
     folder.mkdir()
     program = (
         "import stillpath.cli.batch.worker_pool as crew, sys\n"
-        "from tests.cli.batch.pretending import PretendedLane\n"
-        "crew.Lane = PretendedLane\n"
+        "from tests.cli.batch.pretending import PretendedWorker\n"
+        "crew.Lane = PretendedWorker\n"
         "from stillpath.cli.main import run\n"
         f"sys.exit(run(['watch', {str(folder)!r}, '-m', 'ender3', '-o', {str(out)!r},"
         " '--settle-s', '0.2', '--every-s', '0.5', '--jobs', '2']))\n"

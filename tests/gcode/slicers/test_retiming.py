@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Passage, Splitter
+from stillpath.gcode.pieces import Splitter, VerbatimPart
 from stillpath.gcode.slicers.retiming import Retiming, retimed
 from stillpath.models.machine import Machine
 
@@ -39,7 +39,7 @@ M73 P100 R0
 """
 
 
-def passages_of(text: bytes, machine: Machine) -> list[Passage]:
+def verbatim_parts_of(text: bytes, machine: Machine) -> list[VerbatimPart]:
     reader, splitter = Interpreter(machine), Splitter(machine, compensate=False)
     blocks = [*reader.push(text), *reader.flush()]
     items = [item for block in blocks for item in splitter.push(block)]
@@ -49,7 +49,7 @@ def passages_of(text: bytes, machine: Machine) -> list[Passage]:
 def rewritten(text: bytes, machine: Machine, delay_s: list[float], **options: bool) -> bytes:
     retiming = Retiming(b"; head\n", b"; tail\n", **options)
     done = 0
-    for item in passages_of(text, machine):
+    for item in verbatim_parts_of(text, machine):
         retiming.push(item.text, item, delay_s[done : done + len(item.moves) + 1])
         done += len(item.moves)
     target = io.BytesIO()
@@ -146,7 +146,9 @@ def test_comments_may_be_longer_than_the_first_part() -> None:
 
 
 def test_lines_are_found_among_ours(golden_machine: Machine) -> None:
-    (item,) = passages_of(b"G1 X1 F600\nM73 P1 R1\nM73 P1 R1\nG1 X2\n;TIME:60\n", golden_machine)
+    (item,) = verbatim_parts_of(
+        b"G1 X1 F600\nM73 P1 R1\nM73 P1 R1\nG1 X2\n;TIME:60\n", golden_machine
+    )
     ours = b"G1 X1 F6000\n; not M73 P1 R1\nM73 P1 R1\nG1 X1.5\nM73 P1 R1\nG1 X2\n;TIME:60\n"
     retiming = Retiming()
     retiming.push(ours, item, np.array([0.0, 0.0, 120.0]))

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from stillpath.cli.main import run
-from stillpath.gcode.firmware.registry import kit
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
-from stillpath.gcode.pieces import Passage
+from stillpath.gcode.pieces import VerbatimPart
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
@@ -86,7 +86,7 @@ def make(
 def check(
     original: bytes, written: bytes, machine: Machine, part: int = 1 << 20
 ) -> LastCheckFigures:
-    firmware = kit(machine)
+    firmware = adapter(machine)
     checked = LastCheck(
         io.BytesIO(),
         io.BytesIO(original),
@@ -287,10 +287,10 @@ def test_a_file_with_a_fault_is_not_delivered(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A fault of the writer that nothing else would see: it loses a line of the file."""
-    whole = StreamWriter.passage
+    whole = StreamWriter.verbatim
 
-    def faulty(self: StreamWriter, passage: Passage, extruder_mm: float) -> bytes:
-        return whole(self, passage, extruder_mm).replace(b"M140 S0\n", b"")
+    def faulty(self: StreamWriter, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
+        return whole(self, verbatim, extruder_mm).replace(b"M140 S0\n", b"")
 
     monkeypatch.setattr(StreamWriter, "passage", faulty)
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"

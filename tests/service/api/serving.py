@@ -1,4 +1,4 @@
-"""The application in this process, with a pretended road that is quick."""
+"""The application in this process, with a pretended pipeline that is quick."""
 
 from __future__ import annotations
 

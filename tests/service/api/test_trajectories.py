@@ -1,4 +1,4 @@
-"""Trajectories over HTTP, of a job that went the real road."""
+"""Trajectories over HTTP, of a job that went the real pipeline."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import RepRapFirmware
 
-__all__ = ["RepRapVoice"]
+__all__ = ["RepRapStreamCommands"]
 
 _AXES = ("x", "y", "z", "e")
 _FENCE = "G1"
@@ -18,8 +18,8 @@ itself (RepRapFirmware src/GCodes/GCodes2.cpp, cases 1, 201, 203, 204 and 566; G
 DoStraightMove; 3.5)."""
 
 
-class RepRapVoice:
-    """Lines that RepRapFirmware understands; see `gcode.firmware.base.Voice`.
+class RepRapStreamCommands:
+    """Lines that RepRapFirmware understands; see `gcode.firmware.base.StreamCommands`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What Klipper offers to the road."""
+"""What Klipper offers to the pipeline."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from stillpath.gcode.firmware.klipper.advice import KlipperAdviser
 from stillpath.gcode.firmware.klipper.encoder import KlipperEncoder, stream_limits
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.firmware.klipper.planner import Planner
-from stillpath.gcode.firmware.klipper.voice import KlipperVoice
+from stillpath.gcode.firmware.klipper.stream_commands import KlipperStreamCommands
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import CommandLimits, Machine
 
-__all__ = ["KlipperKit"]
+__all__ = ["KlipperAdapter"]
 
 
-class KlipperKit:
-    """Kit of a Klipper machine; see `gcode.firmware.base.FirmwareKit`."""
+class KlipperAdapter:
+    """Kit of a Klipper machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     step_mm = (0.0, 0.0, 0.0, 0.0)
     shortest_move_mm = 0.0
@@ -66,9 +66,7 @@ class KlipperKit:
         """Return the raised limits; nothing of the file's is kept."""
         return self._stream
 
-    def quickened(
-        self, own: Limits, accel: float, speed: float, most: CommandLimits
-    ) -> KlipperLimits:
+    def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> KlipperLimits:
         """Return limits under which X and Y are quicker."""
         mine = cast(KlipperLimits, own)
         raised = scaled(mine.accel_mm_s2, accel, most.accel_mm_s2)
@@ -88,9 +86,9 @@ class KlipperKit:
         """Return an encoder of the stream."""
         return KlipperEncoder(self._firmware, self._stream)
 
-    def voice(self) -> KlipperVoice:
+    def stream_commands(self) -> KlipperStreamCommands:
         """Return Klipper's words."""
-        return KlipperVoice(self._firmware)
+        return KlipperStreamCommands(self._firmware)
 
     def adviser(self, dialect: Dialect) -> KlipperAdviser:
         """Return its words for shaper and acceleration."""

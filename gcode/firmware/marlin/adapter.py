@@ -1,4 +1,4 @@
-"""What Marlin offers to the road."""
+"""What Marlin offers to the pipeline."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from stillpath.gcode.firmware.marlin.encoder import (
 )
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner
-from stillpath.gcode.firmware.marlin.voice import MarlinVoice
+from stillpath.gcode.firmware.marlin.stream_commands import MarlinStreamCommands
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 from stillpath.models.machine import CommandLimits, Machine
 
-__all__ = ["LONGEST_LEAST_MM", "MarlinKit"]
+__all__ = ["LONGEST_LEAST_MM", "MarlinAdapter"]
 
 STEEPEST_MESH = 0.1
 """Z is driven with the stream's acceleration times the slope."""
@@ -42,8 +42,8 @@ _ALTERNATIVE = (
 )
 
 
-class MarlinKit:
-    """Kit of a Marlin machine; see `gcode.firmware.base.FirmwareKit`."""
+class MarlinAdapter:
+    """Kit of a Marlin machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     extruder_alone_stops = False
 
@@ -124,9 +124,7 @@ class MarlinKit:
         """Return what a stream runs under where the file has set `own`."""
         return stream_limits(cast(MarlinLimits, own), self._command, self._mesh_slope)
 
-    def quickened(
-        self, own: Limits, accel: float, speed: float, most: CommandLimits
-    ) -> MarlinLimits:
+    def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> MarlinLimits:
         """Return limits under which X and Y are quicker; junctions keep their deviation."""
         mine = cast(MarlinLimits, own)
         raised = {
@@ -156,9 +154,9 @@ class MarlinKit:
             travel_mm=self._travel_mm,
         )
 
-    def voice(self) -> MarlinVoice:
+    def stream_commands(self) -> MarlinStreamCommands:
         """Return Marlin's words."""
-        return MarlinVoice(self._firmware)
+        return MarlinStreamCommands(self._firmware)
 
     def adviser(self, dialect: Dialect) -> MarlinAdviser:
         """Return its words for shaper and acceleration."""

@@ -10,7 +10,7 @@ from stillpath.gcode.firmware.marlin.limits import MarlinLimits, without_advance
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Marlin
 
-__all__ = ["MarlinVoice"]
+__all__ = ["MarlinStreamCommands"]
 
 _NOTES = (
     "between 'stream on' and 'stream off' the limits of M201, M203, M204 and M205",
@@ -22,8 +22,8 @@ _FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*[A-Z]", re.IGNORECASE)
 _FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0*(?![\d.])", re.IGNORECASE)
 
 
-class MarlinVoice:
-    """Lines that Marlin understands; see `gcode.firmware.base.Voice`.
+class MarlinStreamCommands:
+    """Lines that Marlin understands; see `gcode.firmware.base.StreamCommands`.
 
     Sources: Marlin/src/gcode/config/M200-M205.cpp, gcode/feature/input_shaping/M593.cpp,
     gcode/geometry/G92.cpp, feature/advance/M900.cpp and parser.cpp, release 2.1.2 (2023-01).

@@ -1,4 +1,4 @@
-"""What RepRapFirmware offers to the road."""
+"""What RepRapFirmware offers to the pipeline."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from stillpath.gcode.firmware.reprapfirmware.advice import RepRapAdviser
 from stillpath.gcode.firmware.reprapfirmware.encoder import STEEPEST, RepRapEncoder, stream_limits
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from stillpath.gcode.firmware.reprapfirmware.voice import RepRapVoice
+from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.machine import CommandLimits, Machine
 
-__all__ = ["RepRapKit"]
+__all__ = ["RepRapAdapter"]
 
 STEEPEST_MESH = 0.1
 """Z is driven with the stream's acceleration times the slope."""
@@ -31,8 +31,8 @@ _SPEEDS = ("speed_x_mm_s", "speed_y_mm_s")
 _JERKS = ("jerk_x_mm_s", "jerk_y_mm_s", "max_jerk_x_mm_s", "max_jerk_y_mm_s")
 
 
-class RepRapKit:
-    """Kit of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareKit`."""
+class RepRapAdapter:
+    """Kit of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     extruder_alone_stops = False
     shortest_move_mm = 0.0
@@ -66,9 +66,7 @@ class RepRapKit:
         """Return the raised limits; nothing of the file's is kept."""
         return self._stream
 
-    def quickened(
-        self, own: Limits, accel: float, speed: float, most: CommandLimits
-    ) -> RepRapLimits:
+    def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> RepRapLimits:
         """Return limits under which X and Y are quicker."""
         mine = cast(RepRapLimits, own)
         raised = {
@@ -88,9 +86,9 @@ class RepRapKit:
         machine = self._machine
         return RepRapEncoder(self._firmware, machine.kinematics, self._stream)
 
-    def voice(self) -> RepRapVoice:
+    def stream_commands(self) -> RepRapStreamCommands:
         """Return RepRapFirmware's words."""
-        return RepRapVoice(self._firmware, self._machine.pressure_advance_s)
+        return RepRapStreamCommands(self._firmware, self._machine.pressure_advance_s)
 
     def adviser(self, dialect: Dialect) -> RepRapAdviser:
         """Return its words for shaper and acceleration."""

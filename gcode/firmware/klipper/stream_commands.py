@@ -9,15 +9,15 @@ from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Klipper
 
-__all__ = ["IN_STREAM_MARK_MM_S", "KlipperVoice"]
+__all__ = ["IN_STREAM_MARK_MM_S", "KlipperStreamCommands"]
 
 IN_STREAM_MARK_MM_S = 5e-7
 """Added to the square corner velocity of a stream, and of the file's own moves inside one: it tells
 stillpath.cfg that a PAUSE here is in mid stream, with the shaper off."""
 
 
-class KlipperVoice:
-    """Lines that Klipper understands; see `gcode.firmware.base.Voice`."""
+class KlipperStreamCommands:
+    """Lines that Klipper understands; see `gcode.firmware.base.StreamCommands`."""
 
     notes = (
         "between 'stream on' and 'stream off' limits are the machine's own and",

@@ -1,4 +1,4 @@
-"""Passages, which leave as they came: their moves as the firmware plans them, from stop to stop."""
+"""Verbatim parts: lines that are not changed, and their moves as the firmware plans them."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.planning import plan_moves, stops
-from stillpath.gcode.pieces import Passage, Piece
+from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["feeding", "last_length_mm", "plan_passage", "switching_s", "takes_s"]
+__all__ = ["feeding", "last_length_mm", "plan_verbatim", "switching_s", "takes_s"]
 
 
-def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float | None]:
-    """Plan the moves of a passage between its stops.
+def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases | float | None]:
+    """Plan the moves of a verbatim part between its stops.
 
     Yields
     ------
     Phases
-        Motion from rest to rest, from time 0 on; `move_index` counts within the passage.
+        Motion from rest to rest, from time 0 on; `move_index` counts within the verbatim part.
     float
         Seconds of standing.
     None
         The position becomes unknown here.
     """
-    if isinstance(passage, Piece):
-        yield passage.phases
+    if isinstance(verbatim, Piece):
+        yield verbatim.phases
         return
-    events = passage.events
+    events = verbatim.events
     done = 0
     for k in [*np.flatnonzero(stops(events)).tolist(), None]:
-        end = len(passage.moves) if k is None else int(events.move_index[k])
+        end = len(verbatim.moves) if k is None else int(events.move_index[k])
         if end > done:
-            rows = rows_of(passage.moves, slice(done, end))
-            phases = plan_moves(rows, passage.limits, machine)
+            rows = rows_of(verbatim.moves, slice(done, end))
+            phases = plan_moves(rows, verbatim.limits, machine)
             if len(phases):
                 numbers = phases.move_index - phases.move_index[0] + done
                 yield replace(phases, move_index=numbers)
@@ -49,11 +49,11 @@ def plan_passage(passage: Passage, machine: Machine) -> Iterator[Phases | float 
 
 
 def takes_s(part: Phases | float | None) -> float:
-    """Return how long a part of a passage takes."""
+    """Return how long a part of a verbatim part takes."""
     return part.duration_s if isinstance(part, Phases) else part or 0.0
 
 
-def switching_s(parts: Iterable[Passage | ProgramBlock]) -> float:
+def switching_s(parts: Iterable[VerbatimPart | ProgramBlock]) -> float:
     """Return how long the machine stands still because its shaper is switched."""
     return sum(float(np.sum(p.events.dwell_s[p.events.kind == EventKind.SHAPER])) for p in parts)
 
