@@ -62,7 +62,7 @@ def here(
     from stillpath.cli.batch.batch import run_batch
     from stillpath.cli.batch.items import Group, items_of
     from stillpath.cli.batch.output import OutputFolder
-    from stillpath.cli.batch.worker_pool import Here, crew
+    from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
     from stillpath.cli.machines import open_machines
     from stillpath.pipeline.options import Options
 
@@ -71,8 +71,8 @@ def here(
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began, busy_s = time.monotonic(), []
     with OutputFolder.opened(output) as kept:
-        works = Here(open_machines(), options, workers)
-        with crew(works, kept, options, workers) as made:
+        works = LocalPool(open_machines(), options, workers)
+        with worker_pool(works, kept, options, workers) as made:
             outcomes = run_batch(made, kept, items, tell=lambda o: busy_s.append(o.took_s))
             wall_s = time.monotonic() - began
     # Its time counts when it has ended; the next run begins with one of its own.

@@ -21,7 +21,7 @@ from tests.service.machines import make_machine, with_accel
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch, tmp_path):
-    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedWorker)
+    monkeypatch.setattr("stillpath.cli.batch.worker_pool.LocalWorker", PretendedWorker)
     monkeypatch.setenv("STILLPATH_DATA_DIR", str(tmp_path / "data"))
     monkeypatch.chdir(tmp_path)
 

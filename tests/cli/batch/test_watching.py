@@ -52,7 +52,7 @@ class Watching:
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setattr("stillpath.cli.batch.worker_pool.Lane", PretendedWorker)
+    monkeypatch.setattr("stillpath.cli.batch.worker_pool.LocalWorker", PretendedWorker)
     (tmp_path / "in").mkdir()
     return tmp_path / "in"
 
@@ -192,9 +192,9 @@ def test_killed_again_and_again(tmp_path):
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     program = (
-        "import stillpath.cli.batch.worker_pool as crew, sys\n"
+        "import stillpath.cli.batch.worker_pool as pool, sys\n"
         "from tests.cli.batch.pretending import PretendedWorker\n"
-        "crew.Lane = PretendedWorker\n"
+        "pool.LocalWorker = PretendedWorker\n"
         "from stillpath.cli.main import run\n"
         f"sys.exit(run(['watch', {str(folder)!r}, '-m', 'ender3', '-o', {str(out)!r},"
         " '--settle-s', '0.2', '--every-s', '0.5', '--jobs', '2']))\n"

@@ -292,7 +292,7 @@ def test_a_file_with_a_fault_is_not_delivered(
     def faulty(self: StreamWriter, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
         return whole(self, verbatim, extruder_mm).replace(b"M140 S0\n", b"")
 
-    monkeypatch.setattr(StreamWriter, "passage", faulty)
+    monkeypatch.setattr(StreamWriter, "verbatim", faulty)
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(PRINT.encode())
     target.write_bytes(b"kept")
