@@ -26,9 +26,9 @@ from firmwares import machine_with, without_macros
 from readback import find_input, plain_copy, shared_folder
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Limits, Moves, rows_of
 from stillpath.models.machine import Machine

@@ -15,7 +15,8 @@ from readback import find_input, plain_copy, shared_folder
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer, Pace, move_classes, paced
-from stillpath.gcode.pieces import Piece, Splitter
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.splitter import Splitter
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 

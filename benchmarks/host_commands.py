@@ -26,8 +26,8 @@ from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.last_check import _reader_kernels as at
 from stillpath.pipeline.last_check.reader import Reader, code_of
 from stillpath.pipeline.last_check.rules import rules_of
+from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.tracing import Trace
 from tests.fuzz.machines import KINDS, machine_of
 
 _ASKS = re.compile(rb"(?:M105|M117|M73|M106|M107|M104|M140)(?!\d)")

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.timeline import group_rows
 from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
 from stillpath.models.machine import Machine

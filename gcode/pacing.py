@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import CommandLimits, Machine
 

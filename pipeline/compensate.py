@@ -23,14 +23,16 @@ import numpy as np
 from stillpath.compensation.base import DesignError
 from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import intended, join_phases, plan_moves
+from stillpath.gcode.firmware.planning import intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import LeftOut, Piece, Splitter, VerbatimPart
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases, sample_until
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
+from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import EventKind, Events, Moves, Phases
 from stillpath.models.confirmation import confirmation_text
 from stillpath.models.errors import ModelError
@@ -44,6 +46,7 @@ from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
 from stillpath.pipeline.measuring.measure import Measurement, channel_names
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.budget import SpeedBudget
@@ -63,7 +66,6 @@ from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge, narrower
 from stillpath.pipeline.simulate import STANDING_S, plan_file, simulate_file
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.tracing import Trace
 from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
 from stillpath.version import __version__

@@ -34,13 +34,13 @@ from stillpath.pipeline.measuring.layer_files import written_layers
 from stillpath.pipeline.measuring.measure import Measurement, channel_names
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
 from stillpath.pipeline.result import Result, StageTime
 from stillpath.pipeline.shaping import ShapedMotion
-from stillpath.pipeline.tracing import Trace
 from stillpath.version import __version__
 
 __all__ = [

@@ -17,12 +17,12 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.columns import Table, csv_table, npz_table
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.simulate import simulate_file
-from stillpath.pipeline.tracing import Trace
 
 __all__ = ["TrajectoryFormat", "write_trajectories"]
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.firmware.planning import plan_moves, stops
+from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
 from stillpath.models.machine import Machine
 

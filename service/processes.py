@@ -20,7 +20,7 @@ __all__ = ["METHOD", "OF_THE_SERVICE", "limit_memory", "loaded_context", "quiet_
 OF_THE_SERVICE = (
     "distributed",
     "stillpath.service.jobs.worker",
-    "stillpath.service.computing.preloaded",
+    "stillpath.service.jobs.computations_preloaded",
 )
 """Modules for the processes of a service; all of them are copies of the same one."""
 

@@ -9,6 +9,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from stillpath.applications.machines.frequency import ModelCurve
 from stillpath.models.provenance import MeasuredMode, SourceFile
 
 __all__ = [
@@ -24,14 +25,6 @@ __all__ = [
 
 class _Figures(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class ModelCurve(_Figures):
-    """A model over frequency: modulus, and phase in degrees."""
-
-    f_hz: tuple[float, ...]
-    magnitude: tuple[float, ...]
-    phase_deg: tuple[float, ...]
 
 
 class ResponseFigures(_Figures):

@@ -8,18 +8,27 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from stillpath.applications.identification.figures import ModelCurve
 from stillpath.applications.machines.resonances import resonances
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, PlantSpec, frequency_response
 from stillpath.models.provenance import MeasuredMode
 
-__all__ = ["AxisResponse", "axis_responses"]
+__all__ = ["AxisResponse", "ModelCurve", "axis_responses"]
 
 _POINTS = 320
 _MEMBERS_SHOWN = 15
 _DIGITS = 5
 _FIRST_HZ, _LEAST_HZ, _BEYOND = 1.0, 100.0, 1.25
+
+
+class ModelCurve(BaseModel):
+    """A model over frequency: modulus, and phase in degrees."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    f_hz: tuple[float, ...]
+    magnitude: tuple[float, ...]
+    phase_deg: tuple[float, ...]
 
 
 class AxisResponse(BaseModel):

@@ -1,4 +1,4 @@
-"""What all planners share, and the plan of moves from rest to rest for any firmware."""
+"""What all planners share."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.types import EventKind, Events, Limits, Moves, Phases, ProgramBlock
-from stillpath.models.machine import Machine
+from stillpath.gcode.types import EventKind, Events, Phases, ProgramBlock
 
 __all__ = [
     "STOPPING",
@@ -22,7 +20,6 @@ __all__ = [
     "empty_phases",
     "intended",
     "join_phases",
-    "plan_moves",
     "stops",
 ]
 
@@ -44,32 +41,6 @@ _STOPS = np.array([kind in STOPPING for kind in EventKind])
 def stops(events: Events) -> NDArray[np.bool_]:
     """Mark events at which the motion comes to rest."""
     return np.asarray(_STOPS[events.kind])
-
-
-def plan_moves(
-    moves: Moves, limits: Sequence[Limits], machine: Machine, *, rests_apart: bool = False
-) -> Phases:
-    """Plan moves from rest to rest.
-
-    Parameters
-    ----------
-    moves : Moves
-    limits : sequence of Limits
-        The table of `Moves.limits_id`.
-    machine : Machine
-    rests_apart : bool
-        See `FirmwareAdapter.planner`.
-
-    Raises
-    ------
-    GcodeError
-        For a move that the firmware refuses, or that takes more than 20 minutes.
-    """
-    planner = adapter(machine).planner(rests_apart=rests_apart)
-    planner.queue_moves(moves, limits)
-    phases = planner.flush()
-    check_moves_end(phases, lambda index: int(moves.line[index]))
-    return phases
 
 
 def intended(

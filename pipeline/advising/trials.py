@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.base import Adviser
-from stillpath.gcode.firmware.planning import plan_moves
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine

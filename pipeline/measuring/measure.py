@@ -23,6 +23,7 @@ from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
 from stillpath.pipeline.measuring.spectra import ErrorSpectra
+from stillpath.pipeline.measuring.tracing import Trace, Tracer
 from stillpath.pipeline.result import (
     AxisSpectrum,
     Channel,
@@ -31,7 +32,6 @@ from stillpath.pipeline.result import (
     LayerView,
     Track,
 )
-from stillpath.pipeline.tracing import Trace, Tracer
 from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 
 __all__ = ["STRIDE", "Measurement", "channel_names"]

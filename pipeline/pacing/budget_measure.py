@@ -19,8 +19,8 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.set_errors import ErrorSum, SetErrors
+from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.result import Channel, GroupFigures
-from stillpath.pipeline.tracing import Trace
 
 __all__ = ["BudgetMeasurement"]
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import AS_SLICED, FirstLayer, move_classes
-from stillpath.gcode.pieces import Piece, Splitter, VerbatimPart, excerpt
+from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.splitter import Splitter, excerpt
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint

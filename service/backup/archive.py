@@ -30,7 +30,6 @@ from stillpath.version import __version__
 __all__ = ["BackupError", "Manifest", "back_up", "restore"]
 
 DATABASE = "stillpath.sqlite3"
-_OLD_DATABASE = "jobs.sqlite3"
 _MANIFEST = "backup.json"
 _RESTORING = ".restoring"
 _LOCK = "service.lock"
@@ -79,8 +78,6 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
         raise BackupError(f"{target} lies in the data directory; name a file elsewhere")
     if (data_dir / _RESTORING).exists():
         raise BackupError(f"{data_dir}: a restore was broken off there; finish it first")
-    if (data_dir / _OLD_DATABASE).exists():
-        raise BackupError(f"{data_dir} is of an earlier version; run `stillpath migrate` first")
     with (
         replacing(target) as temporary,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".backup-") as work,
@@ -227,7 +224,7 @@ def _add_job(
 def _add_rest(archive: _Archive, data_dir: Path) -> None:
     """Add machines, identifications, and whatever else is kept: files that are never changed."""
     for top in sorted(data_dir.iterdir()):
-        if top.name in _PASSING or top.name.startswith((".", DATABASE, _OLD_DATABASE)):
+        if top.name in _PASSING or top.name.startswith((".", DATABASE)):
             continue
         for path in sorted(_below(top) if top.is_dir() else {top}):
             if path.is_symlink() or path.name.endswith(".part"):

@@ -116,8 +116,6 @@ def open_database(settings: Settings, *, pooled: bool = True) -> Engine:
     engine = make_engine(url, pooled=pooled)
     try:
         migrate(engine)
-        if settings.database_url is None:
-            _take_over_old_jobs(Path(settings.data_dir), engine)
     except DBAPIError as error:
         engine.dispose()
         raise StoreError(
@@ -358,13 +356,6 @@ def _plainly(engine: Engine) -> Iterator[None]:
             f"the database {_shown(engine)} does not answer: {_reason(error)}; see whether it runs "
             "and has space left"
         ) from error
-
-
-def _take_over_old_jobs(data_dir: Path, engine: Engine) -> None:
-    if (data_dir / "jobs.sqlite3").exists():
-        from stillpath.service.database.old_jobs import take_over
-
-        take_over(data_dir, engine)
 
 
 def _prepare_sqlite(connection: Any, _: Any) -> None:

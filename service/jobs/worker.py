@@ -25,9 +25,9 @@ from typing import Any, TypeVar
 import structlog
 
 from stillpath.pipeline.progress import Cancelled, Progress
-from stillpath.service.computing.tasks import answer
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
+from stillpath.service.jobs.computations import answer
 from stillpath.service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
 from stillpath.service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
 from stillpath.service.jobs.store import JobStore

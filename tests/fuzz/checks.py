@@ -15,7 +15,7 @@ import numpy as np
 from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Splitter
+from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import Moves, Phases, ProgramBlock
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.pipeline.compensate import compensate_file

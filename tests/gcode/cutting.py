@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Piece, Splitter, VerbatimPart
+from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.splitter import Splitter
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.options import Options

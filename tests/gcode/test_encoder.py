@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from stillpath.gcode.firmware._encoding_kernels import lay_out
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.klipper import encoder as encoder_module
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.gcode.pieces import Piece
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.segments import ErrorFilter, fit_segments
 from stillpath.gcode.timeline import build_timeline, group_rows
 from stillpath.models.machine import Machine

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.firmware.encoding import as_moves, limits_in_force
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Limits, Moves, rows_of
 from stillpath.models.machine import Machine

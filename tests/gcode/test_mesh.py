@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.firmware.encoding import UNITS_PER_MM, as_moves, limits_in_force
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import Piece
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Phases
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine

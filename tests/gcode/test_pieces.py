@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import plan_moves
 from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.store import load_machine

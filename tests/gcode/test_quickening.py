@@ -20,7 +20,8 @@ from stillpath.gcode.pacing import (
     paced,
     top_limits,
 )
-from stillpath.gcode.pieces import Piece, Splitter, excerpt
+from stillpath.gcode.pieces import Piece
+from stillpath.gcode.splitter import Splitter, excerpt
 from stillpath.models.firmware import Marlin, RepRapFirmware
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import as_moves
-from stillpath.gcode.firmware.planning import join_phases, plan_moves
+from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
 from stillpath.gcode.firmware.reprapfirmware.encoder import stream_limits
@@ -20,6 +20,7 @@ from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
 from stillpath.gcode.firmware.reprapfirmware.stream_commands import RepRapStreamCommands
 from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import EventKind
 from stillpath.models.firmware import RepRapFirmware

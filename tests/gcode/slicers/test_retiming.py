@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import Splitter, VerbatimPart
+from stillpath.gcode.pieces import VerbatimPart
 from stillpath.gcode.slicers.retiming import Retiming, retimed
+from stillpath.gcode.splitter import Splitter
 from stillpath.models.machine import Machine
 
 PRINT = b"""\

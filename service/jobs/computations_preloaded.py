@@ -1,4 +1,4 @@
-"""What `service.computing.tasks` imports: loaded once, so that no computation begins with it."""
+"""What `service.jobs.computations` imports: loaded once, so that no computation begins with it."""
 
 from __future__ import annotations
 

@@ -1,0 +1,438 @@
+"""Cut an interpreted file into pieces to compensate and verbatim parts that are not changed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import fields, replace
+from functools import lru_cache
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.registry import adapter
+from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
+from stillpath.gcode.types import (
+    KEPT,
+    OF_STATE,
+    EventKind,
+    Events,
+    Limits,
+    ModalState,
+    Moves,
+    Phases,
+    ProgramBlock,
+    rows_of,
+)
+from stillpath.models.machine import Machine
+
+__all__ = ["Splitter", "excerpt"]
+
+T = TypeVar("T", Moves, Events, Phases)
+S = TypeVar("S", Moves, Events)
+R = TypeVar("R")
+
+WILD_FEED_MM, WILD_RATIO = 10.0, 5.0
+"""A move that feeds more filament than the first, and per mm of its way more than the second, is
+one of the extruder: X and Y creep, and would be cut into thousands of segments."""
+
+_AHEAD = 1.25
+"""How much more than a piece may last is planned before it is cut."""
+_MOST_MOVES, _MOST_EVENTS, _MOST_BYTES = 1 << 15, 1 << 16, 1 << 23
+"""What a piece may hold. A minute of ordinary prints has 15 thousand moves at the very most; of
+moves of a micrometre it would have millions."""
+
+_SET_POSITION = re.compile(rb"G\s*0*92(?!\d)")
+_SET_EXTRUDER = re.compile(rb"\s*(?:N\d+\s*)?G92\s*E\s*[-+]?(?:\d+\.?\d*|\.\d+)\s*(?:\*\d+\s*)?")
+"""What every firmware reads alike; odder spellings end a piece."""
+
+
+class Splitter:
+    """Cut a stream of program blocks.
+
+    Parameters
+    ----------
+    machine : Machine
+    longest_s : float
+        No piece lasts longer.
+    compensate : bool
+        False makes everything one verbatim part after another (method none).
+    """
+
+    def __init__(
+        self, machine: Machine, *, longest_s: float = 60.0, compensate: bool = True
+    ) -> None:
+        self._machine = machine
+        self._adapter = adapter(machine)
+        self._longest_s = longest_s
+        self._compensate = compensate
+        self._moves: Moves | None = None
+        self._events: Events | None = None
+        self._raw = np.zeros(0, dtype=bool)
+        self._text = b""
+        self._text_offset = 0
+        self._after_mark = False
+        self._tables: tuple[list[Limits], list[ModalState]] = ([], [])
+        self._theirs: list[Limits] | None = None
+        self._front: tuple[list[Limits], list[ModalState]] = ([], [])
+        self._limits_id = 0
+        self._modal_id = 0
+
+    def push(self, block: ProgramBlock) -> Iterator[Piece | VerbatimPart]:
+        """Take a block; yield what is complete."""
+        self._append(block)
+        yield from self._cut(final=False)
+
+    def flush(self) -> Iterator[Piece | VerbatimPart]:
+        """Yield the rest at the end of the file."""
+        if self._moves is not None:
+            yield from self._cut(final=True)
+
+    def _append(self, block: ProgramBlock) -> None:
+        if block.limits is not self._theirs:
+            self._front = self._rows_in_use()
+            self._theirs = block.limits
+        moves, events = block.moves, block.events
+        self._tables = block.limits, block.modal
+        limits, modal = self._front
+        if limits:
+            # What is held keeps its rows, and those of the interpreter's new tables follow.
+            self._tables = limits + block.limits, modal + block.modal
+            moves = _renumbered(moves, len(limits), len(modal))
+            events = _renumbered(events, len(limits), len(modal))
+        local = _shifted(events, -block.first_move)
+        raw = self._raw_moves(block, local)
+        if self._moves is None or self._events is None:
+            self._moves, self._events, self._raw = moves, local, raw
+            self._text, self._text_offset = block.text, block.text_offset
+            return
+        local = _shifted(local, len(self._moves))
+        self._moves = _joined(self._moves, moves)
+        self._events = _joined(self._events, local)
+        self._raw = np.concatenate([self._raw, raw])
+        # A block's text covers its lines and may begin before the end of what we hold.
+        held = self._text_offset + len(self._text)
+        self._text += block.text[held - block.text_offset :]
+
+    def _rows_in_use(self) -> tuple[list[Limits], list[ModalState]]:
+        """Return the rows of the tables that what is held needs, and number it by them."""
+        moves, events = self._moves, self._events
+        if self._theirs is None:
+            return [], []
+        limits_ids, modal_ids = (
+            [np.array([self._limits_id], np.int32)],
+            [np.array([self._modal_id], np.int32)],
+        )
+        if moves is not None and events is not None:
+            limits_ids += [moves.limits_id, events.limits_id]
+            modal_ids += [moves.modal_id, events.modal_id]
+        limits, limits_id = _numbered(np.concatenate(limits_ids))
+        modal, modal_id = _numbered(np.concatenate(modal_ids))
+        self._limits_id, self._modal_id = int(limits_id[0]), int(modal_id[0])
+        if moves is not None and events is not None:
+            n = 1 + len(moves)
+            self._moves = replace(moves, limits_id=limits_id[1:n], modal_id=modal_id[1:n])
+            self._events = replace(events, limits_id=limits_id[n:], modal_id=modal_id[n:])
+        return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
+
+    def _first_barrier(self, events: Events, most: int) -> int | None:
+        """Return the first of `most` moves behind which a piece cannot go on; None: there is none.
+
+        A stop ends a piece, G92 unless it is of one plain E, M221, or a stream's other limits. What
+        lies before the first move does not.
+        """
+        limits, modal = self._tables
+        count = int(np.searchsorted(events.move_index, most, "right"))
+        behind_move = events.move_index[:count] > 0
+        found = np.flatnonzero((events.kind[:count] >= EventKind.STOP) & behind_move)
+        end = int(found[0]) if len(found) else count
+        kind = events.kind[:end]
+        of_limits, of_mode = (
+            np.flatnonzero(kind == what) for what in (EventKind.LIMITS, EventKind.MODE)
+        )
+        others = _changes(
+            self._limits_id, events.limits_id[of_limits], limits, self._adapter.stream_limits
+        )
+        # Where E counts differently from here on, it must be where the file says.
+        factors = _changes(
+            self._modal_id, events.modal_id[of_mode], modal, lambda state: state.extrude_factor
+        )
+        for rows in (of_limits[others], of_mode[factors]):
+            end = min([end, *rows[behind_move[rows]][:1].tolist()])
+        for row in of_mode[behind_move[of_mode] & (of_mode < end)].tolist():
+            start, stop = events.byte_start[row], events.byte_end[row]
+            if _shifts_origin(self._text[start - self._text_offset : stop - self._text_offset]):
+                end = row
+                break
+        return int(events.move_index[end]) if end < count else None
+
+    def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
+        """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
+        moves = block.moves
+        travel = moves.end_mm - moves.start_mm
+        xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+        # Our lines name places; where Z is not known, a line that moves it cannot be one of them.
+        needed = np.where(travel[:, 2] != 0.0, 7, 3)
+        raw = xy & (((moves.known & needed) != needed) | ((moves.known & KEPT) != 0))
+        raw |= xy & _finds_height(block)
+        raw |= xy & self._adapter.too_steep(travel)
+        length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
+        raw |= xy & (length > self._longest_s * moves.speed_mm_s)
+        feed = np.abs(travel[:, 3])
+        raw |= xy & (feed > WILD_FEED_MM) & (feed > WILD_RATIO * length)
+        # Behind an object mark the firmware may jump: that travel runs as the slicer wrote it.
+        marks = events.move_index[events.kind == EventKind.OBJECT]
+        if self._after_mark:
+            marks = np.concatenate([[0], marks])
+        xy_rows = np.flatnonzero(xy)
+        following = np.searchsorted(xy_rows, marks)
+        self._after_mark = bool(np.any(following == len(xy_rows)))
+        raw[xy_rows[following[following < len(xy_rows)]]] = True
+        if len(moves):
+            # All pieces of an arc share one line and one fate.
+            starts = np.flatnonzero(np.append(True, np.diff(moves.line) != 0))
+            ends = np.append(starts[1:], len(raw))
+            # A piece cannot begin or end within a line, nor where X and Y rest.
+            spread = np.maximum.reduceat(raw, starts) | ~xy[starts] | ~xy[ends - 1]
+            raw = np.repeat(spread, ends - starts) & xy
+        return np.asarray(raw | ((moves.known & OF_STATE) != 0))
+
+    def _cut(self, *, final: bool) -> Iterator[Piece | VerbatimPart]:
+        while self._moves is not None and self._events is not None:
+            moves, events = self._moves, self._events
+            count = len(moves)
+            travel = moves.end_mm - moves.start_mm
+            xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+            ours = np.flatnonzero(xy & ~self._raw) if self._compensate else np.zeros(0, np.int64)
+            if len(ours) == 0:
+                yield self._take(None)
+                return
+            head = int(ours[0])
+            if head > 0 or (len(events) and events.byte_start[0] < moves.byte_start[0]):
+                yield self._take(int(moves.byte_start[head]))
+                continue
+            kept = np.flatnonzero(self._raw)
+            lasting_s = np.cumsum(_shortest_s(moves))
+            most = min(self._most_moves(moves, events), self._enough(moves, lasting_s))
+            barrier = self._first_barrier(events, most)
+            closed = final or barrier is not None or len(kept) > 0 or most < count
+            end = min(count if barrier is None else barrier, most, *kept[:1].tolist())
+            if not closed and lasting_s[-1] < self._longest_s:
+                return
+            last = int(np.flatnonzero(xy[:end])[-1]) + 1
+            phases = self._plan(rows_of(moves, slice(0, last)))
+            if len(phases) != last or not np.all(np.any(travel[:last] != 0.0, axis=1)):
+                # A move of no length has no plan; leave its neighbourhood as it is.
+                self._raw[:last] |= xy[:last]
+                continue
+            slow = phases.accel_s + phases.cruise_s + phases.decel_s > self._longest_s
+            if np.any(slow & xy[:last]):
+                # Slower under the limits in force than their F says.
+                lines = moves.line[:last]
+                self._raw[:last] |= xy[:last] & np.isin(lines, lines[slow])
+                continue
+            total = _end_s(phases)
+            if total <= self._longest_s:
+                if not closed:
+                    return
+                yield self._piece(last, phases)
+                continue
+            last, natural = _place_to_cut(moves, phases, self._longest_s)
+            if natural and self._adapter.extruder_alone_stops:
+                phases = rows_of(phases, slice(0, last))
+            else:
+                phases = self._plan(rows_of(moves, slice(0, last)))
+            yield self._piece(last, phases)
+
+    def _plan(self, moves: Moves) -> Phases:
+        return plan_moves(moves, self._tables[0], self._machine, rests_apart=True)
+
+    def _enough(self, moves: Moves, lasting_s: NDArray[np.float64]) -> int:
+        """Return how many of the moves are worth planning: they last longer than a piece may.
+
+        All pieces of an arc, and some more moves: the plan's end makes those before it slower.
+        """
+        rows = int(np.searchsorted(lasting_s, _AHEAD * self._longest_s)) + 1
+        if rows >= len(moves):
+            return len(moves)
+        return int(np.searchsorted(moves.line, moves.line[rows - 1], "right"))
+
+    def _most_moves(self, moves: Moves, events: Events) -> int:
+        """Return how many of the moves a piece may have: all, or less where too much is held."""
+        count, until = len(moves), self._text_offset + _MOST_BYTES
+        if len(events) > _MOST_EVENTS:
+            until = min(until, int(events.byte_start[_MOST_EVENTS]))
+        if count > _MOST_MOVES:
+            until = min(until, int(moves.byte_end[_MOST_MOVES - 1]))
+        return int(np.searchsorted(moves.byte_start, until))
+
+    def _piece(self, last: int, phases: Phases) -> Piece:
+        assert self._moves is not None
+        return Piece.planned(self._take(int(self._moves.byte_end[last - 1])), phases)
+
+    def _take(self, until: int | None) -> VerbatimPart:
+        """Remove the lines before byte `until` (None: all) from what is held."""
+        assert self._moves is not None
+        assert self._events is not None
+        moves, events = self._moves, self._events
+        if until is None:
+            until = self._text_offset + len(self._text)
+        m = int(np.searchsorted(moves.byte_start, until))
+        e = int(np.searchsorted(events.byte_start, until))
+        limits, modal = self._tables
+        limits_before, modal_before = limits[self._limits_id], modal[self._modal_id]
+        last_move = int(moves.byte_start[m - 1]) if m else -1
+        last_event = int(events.byte_start[e - 1]) if e else -1
+        if max(last_move, last_event) >= 0:
+            state: Moves | Events = moves if last_move > last_event else events
+            row = (m if last_move > last_event else e) - 1
+            self._limits_id, self._modal_id = int(state.limits_id[row]), int(state.modal_id[row])
+        text = self._text[: until - self._text_offset]
+        taken = VerbatimPart(
+            moves=rows_of(moves, slice(0, m)),
+            events=rows_of(events, slice(0, e)),
+            text=text,
+            text_offset=self._text_offset,
+            limits=limits,
+            modal=modal,
+            limits_before=limits_before,
+            modal_before=modal_before,
+            limits_after=limits[self._limits_id],
+            modal_after=modal[self._modal_id],
+        )
+        self._text = self._text[len(text) :]
+        self._text_offset = until
+        self._raw = self._raw[m:]
+        if m == len(moves) and e == len(events):
+            self._moves = self._events = None
+        else:
+            self._moves = rows_of(moves, slice(m, None))
+            self._events = _shifted(rows_of(events, slice(e, None)), -m)
+        return taken
+
+
+def excerpt(piece: Piece, first: int, last: int, machine: Machine) -> Piece:
+    """Return moves first..last - 1 of a piece as one of its own, from rest to rest.
+
+    It has no text and holds no memory of the piece. Its first and last move must be of X or Y.
+    """
+    moves = replace(
+        piece.moves,
+        **{f.name: getattr(piece.moves, f.name)[first:last].copy() for f in fields(piece.moves)},
+    )
+    return replace(
+        piece,
+        moves=moves,
+        events=rows_of(piece.events, slice(0, 0)),
+        text=b"",
+        phases=plan_moves(moves, piece.limits, machine, rests_apart=True),
+    )
+
+
+def _changes(
+    before: int,
+    after: NDArray[np.int32],
+    table: list[R],
+    seen: Callable[[R], Hashable],
+) -> NDArray[np.bool_]:
+    """Tell after which of a row of events something seen of their rows of a table is another."""
+    used, place = np.unique(np.append(before, after), return_inverse=True)
+    numbers: dict[Hashable, int] = {}
+    number = [numbers.setdefault(seen(table[row]), len(numbers)) for row in used.tolist()]
+    return np.asarray(np.diff(np.array(number)[place]) != 0)
+
+
+@lru_cache(maxsize=64)
+def _shifts_origin(line: bytes) -> bool:
+    """Whether a line is a G92 of more than a plain E; files repeat such lines by thousands."""
+    code = line.split(b";", 1)[0].upper()
+    return bool(_SET_POSITION.search(code)) and not _SET_EXTRUDER.fullmatch(code)
+
+
+def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
+    """Mark moves whose lines name Z where it is only guessed: they may well climb."""
+    moves = block.moves
+    known = (moves.known & 4) != 0
+    found = ~known & np.append(known[1:], False)
+    if len(known) and not known[-1]:
+        first, end = (
+            moves.byte_start[-1] - block.text_offset,
+            moves.byte_end[-1] - block.text_offset,
+        )
+        found[-1] = b"Z" in block.text[first:end].split(b";", 1)[0].upper()
+    return np.asarray(found)
+
+
+def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, bool]:
+    """Row behind which to end a piece, and whether the plan stops there by itself.
+
+    The best place is a rest before filament is fed again (nothing oozes there), then any
+    extruder-only move, then a Z move, then the slowest corner of the last ten seconds.
+    """
+    direction = phases.direction
+    xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    only_e = ~xy & (direction[:, 2] == 0.0)
+    end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    inside = end_s <= longest_s
+    follows = np.zeros(len(xy), dtype=bool)
+    follows[:-1] = xy[:-1] & ~xy[1:]
+    after_e = np.append(only_e[1:], False)
+    feeds = np.append(direction[1:, 3] > 0.0, False)
+    late = inside & follows & (end_s > 0.5 * longest_s)
+    for wanted in (late & after_e & feeds, late & after_e, inside & follows & after_e):
+        rows = np.flatnonzero(wanted)
+        if len(rows):
+            return int(rows[-1]) + 1, True
+    rows = np.flatnonzero(late)
+    if len(rows):
+        return int(rows[-1]) + 1, False
+    line = moves.line[: len(phases)]
+    boundary = np.append(line[1:] != line[:-1], False)
+    rows = np.flatnonzero(boundary & xy & inside & (end_s > longest_s - 10.0))
+    if len(rows) == 0:
+        rows = np.flatnonzero(boundary & xy & inside)
+    if len(rows) == 0:
+        rows = np.flatnonzero(boundary & xy)[:1]
+    if len(rows) == 0:
+        return len(phases), False
+    return int(rows[np.argmin(phases.end_mm_s[rows])]) + 1, False
+
+
+def _shortest_s(moves: Moves) -> NDArray[np.float64]:
+    """Lower bound of the time that each of the moves takes."""
+    travel = moves.end_mm - moves.start_mm
+    length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
+    length = np.where(length > 0.0, length, np.abs(travel[:, 3]))
+    return np.asarray(length / moves.speed_mm_s)
+
+
+def _end_s(phases: Phases) -> float:
+    last = rows_of(phases, slice(-1, None))
+    return float((last.t_s + last.accel_s + last.cruise_s + last.decel_s)[0])
+
+
+def _joined(first: T, second: T) -> T:
+    return type(first)(
+        **{
+            f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+            for f in fields(first)
+        }
+    )
+
+
+def _numbered(ids: NDArray[np.int32]) -> tuple[list[int], NDArray[np.int32]]:
+    """Return the different ids, and for each of `ids` its place among them."""
+    different, place = np.unique(ids, return_inverse=True)
+    return different.tolist(), place.astype(np.int32)
+
+
+def _renumbered(table: S, limits: int, modal: int) -> S:
+    return replace(table, limits_id=table.limits_id + limits, modal_id=table.modal_id + modal)
+
+
+def _shifted(events: Events, by: int) -> Events:
+    columns = {f.name: getattr(events, f.name) for f in fields(events)}
+    columns["move_index"] = columns["move_index"] + by
+    return Events(**columns)
