@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -30,14 +32,44 @@ def test_what_is_public_is_there_and_told() -> None:
         stillpath.compensator  # noqa: B018
 
 
-def test_nothing_of_ours_takes_a_name_of_others() -> None:
-    """Folders of the checkout are reached below `stillpath` only."""
-    files = [path for room in (ROOT / "src" / "stillpath").iterdir() for path in room.rglob("*.py")]
+def test_rooms_are_imported_below_stillpath_only() -> None:
+    package = ROOT / "src" / "stillpath"
+    rooms = [path.name for path in package.iterdir() if path.is_dir() and path.name[0] != "_"]
+    files = [path for room in rooms for path in (package / room).rglob("*.py")]
     assert len(files) > 300
-    rooms = "|".join(path.name for path in (ROOT / "src" / "stillpath").iterdir() if path.is_dir())
-    other = re.compile(rf"^\s*(?:from|import) (?:{rooms})\b", re.MULTILINE)
+    other = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(rooms)})\b", re.MULTILINE)
     assert [path for path in files if other.search(path.read_text(encoding="utf-8"))] == []
-    assert importlib.util.find_spec("stillpath") is not None
+
+
+@pytest.mark.slow
+def test_it_is_installed_beside_modules_of_the_same_names(tmp_path: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
+    build = ["wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(ROOT)]
+    subprocess.run([*pip, *build], check=True)
+    (wheel,) = tmp_path.glob("stillpath-*.whl")
+    site = tmp_path / "site"
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True)
+    for name in ("models", "service", "gcode", "pipeline"):
+        (site / f"{name}.py").write_text("WHOSE = 'another project'\n")
+    code = (
+        "import models, service, gcode, pipeline, stillpath; "
+        "print(models.WHOSE, service.WHOSE, stillpath.load_machine('ender3').name, "
+        "stillpath.__file__)"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(site)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert told.stdout.startswith(f"another project another project ender3 {site}")
+    assert sorted(path.name for path in site.glob("stillpath*")) == [
+        "stillpath",
+        f"stillpath-{stillpath.__version__}.dist-info",
+        "stillpath_post.py",
+    ]
 
 
 @pytest.mark.slow
