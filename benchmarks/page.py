@@ -194,7 +194,7 @@ def readme_figures(results: Sequence[Result]) -> str:
     def goal(row: int) -> str:
         return f"{chain.rows[row][chain.column('goal')]}"
 
-    mean_head, worst_head = "geometric mean, of the shaper's error", "worst, of the shaper's error"
+    mean_head, worst_head = "geometric mean, × shaper", "worst, × shaper"
     beaten = (
         f"Geometric mean of the {len(ratios)} ratios: {mean:.2f}. In {len(worse)} of them the "
         f"shaper is better by more than 1 %, by {100 * (max(ratios) - 1):.0f} % at most."
@@ -203,7 +203,7 @@ def readme_figures(results: Sequence[Result]) -> str:
         "**On virtual printers** (motors, belts, dry friction, frames; measured, identified, "
         "compensated, printed),\nagainst the shaper that Klipper's rules recommend: from resonance "
         f"tables {said(0, mean_head)} of its error\n(geometric mean; worst {said(0, worst_head)}) "
-        f"and at most {said(0, 'worst, of no compensation')} of the error without compensation; "
+        f"and at most {said(0, 'worst, × none')} of the error without compensation; "
         f"from raw logs\nof four other printers {said(2, mean_head)} of the shaper's (worst "
         f"{said(2, worst_head)}). The goals for the mean were {goal(0)} and {goal(1)}:\n"
         "[what falls short, and why](docs/benchmarks.md#the-closed-chain)."
