@@ -87,7 +87,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
             console.print(_advice_line(result.advice), markup=False)
     if any(channel.name == "after" for channel in result.channels) and result.advice is None:
         console.print(
-            f"put back as it came: {len(result.put_back)} of {result.pieces} pieces, "
+            f"reverted to the sliced lines: {len(result.put_back)} of {result.pieces} pieces, "
             f"{100 * result.put_back_extruding_share:.2f} % of the extruding time; left alone by "
             f"rule: {left_alone(result)}"
         )

@@ -41,7 +41,7 @@ def trajectories(
     stop: Annotated[
         float | None, typer.Option("--to", metavar="S", help="Second of the print. [default: end]")
     ] = None,
-    method: Annotated[str, typer.Option(help="As `compensate` has it; none: as it came.")] = "fbf",
+    method: Annotated[str, typer.Option(help="As `compensate` has it; none: as sliced.")] = "fbf",
     robust: Annotated[str, typer.Option(help="As `compensate` has it.")] = "off",
     budget_um: Annotated[
         float | None, typer.Option("--budget-um", help="As `compensate` has it.")

@@ -93,7 +93,7 @@ class PreviewFbf:
     Notes
     -----
     The machine's vibration is carried from one piece to the next: call `commit` when the last
-    command was used, `observe` for motion that leaves as it came, `reset` when the position jumps.
+    command was used, `observe` for motion that stays as sliced, `reset` when the position jumps.
     """
 
     name = "fbf"

@@ -41,7 +41,7 @@ class Command:
     words : mapping of str to str
         Text behind each letter; empty where there is no number.
     text : str
-        The whole line as it came.
+        The whole line as it was read.
     dropped : str
         Why the firmware passes the line over without reading it; empty: it does not.
     uncertain : bool

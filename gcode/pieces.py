@@ -23,7 +23,7 @@ __all__ = ["LeftOut", "Piece", "VerbatimPart"]
 
 @dataclass(frozen=True, slots=True)
 class VerbatimPart:
-    """Lines of the file in order, to leave as they came.
+    """Lines of the file in order, to stay as sliced.
 
     Attributes
     ----------
@@ -75,4 +75,4 @@ class Piece(VerbatimPart):
 
 
 class LeftOut(VerbatimPart):
-    """Lines that could be compensated and leave as they came because somebody chose so."""
+    """Lines that could be compensated and stay as sliced because somebody chose so."""

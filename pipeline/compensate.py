@@ -205,7 +205,7 @@ def _fitting(options: Options, name: str) -> Options:
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """What says of itself why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
-"""With those of our own: a piece that meets one stays as it came, and the others are printed."""
+"""With those of our own: a piece that meets one stays as sliced, and the others are printed."""
 
 
 def _counting_rms_um(channel: Channel) -> float:
@@ -385,7 +385,7 @@ class _Job:
             before_s, names = self._sum.original_s, self._reader.feature_names
             yield from self._timed(self._selection.divide(item, names))
             if isinstance(item, Piece) and self._options.where != "all":
-                # The file as it came does not stand still where it was divided.
+                # The sliced file does not stand still where it was divided.
                 self._sum.original_s = before_s + item.phases.duration_s
 
     def _items(self) -> Iterator[Piece | VerbatimPart]:
@@ -517,7 +517,7 @@ class _Job:
         self._budget.correct(self._pairs.sums())
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
-        """Let a piece leave as it came."""
+        """Let a piece stay as sliced."""
         phases = piece.phases
         row_s = phases.accel_s + phases.cruise_s + phases.decel_s
         extruding_s = float(np.sum(row_s[feeding(phases)]))
@@ -608,7 +608,7 @@ class _Job:
     ) -> MotionSamples:
         """Return the samples of an item whose moves have been counted.
 
-        `sliced` is how the file as it came is executed, where the firmware rounds.
+        `sliced` is how the sliced file is executed, where the firmware rounds.
         """
         return MotionSamples(
             path_mm=planned[:2],

@@ -62,7 +62,7 @@ _TRAVEL_EXCESS_MM = 200e-3
 
 
 class Unfit(ValueError):
-    """A piece that had better leave as it came; the message is the reason."""
+    """A piece that had better stay as sliced; the message is the reason."""
 
 
 class _Sudden(Unfit):

@@ -77,7 +77,7 @@ class GroupFigures(_Figures):
 
 
 class PutBack(_Figures):
-    """A piece of the file that left as it came."""
+    """A piece of the file that was reverted."""
 
     line_first: int
     """First line in the original file, counted from 1."""
@@ -147,7 +147,7 @@ class BudgetClass(_Figures):
 
     name: str
     """The slicer's name of the feature, `travel`, or `all that stays as sliced`: the first layer,
-    and lines that leave as they came."""
+    and lines that stay as sliced."""
     acceleration_factor: float
     """Ratio of its accelerations to the file's, before the machine's limits; 1: as in the file."""
     shaper_acceleration_factor: float
@@ -254,15 +254,15 @@ class Result(_Figures):
     best_shaper: str
     """The best-tuned firmware shaper of this machine, with its frequencies [Hz]."""
     original_time_s: float
-    """How long the file as it came takes, by the firmware's rules [s]."""
+    """How long the sliced file takes, by the firmware's rules [s]."""
     time_s: float
     """How long the written file takes [s]."""
     slicer: str = ""
     """The program that made the file, where it says so."""
     slicer_time_s: float | None = None
-    """The slicer's own estimate for the file as it came, where it has one [s]."""
+    """The slicer's own estimate for the sliced file, where it has one [s]."""
     original_bytes: int
-    """Size of the file as it came [bytes]."""
+    """Size of the sliced file [bytes]."""
     written_bytes: int
     """Size of the written file [bytes]."""
     segments: int
@@ -288,12 +288,12 @@ class Result(_Figures):
     pieces: int
     """Pieces that the file was cut into."""
     put_back: list[PutBack]
-    """Those that left as they came, in order."""
+    """Those that stayed as sliced, in order."""
     put_back_extruding_share: float
     """Their share of the extruding time, 0 to 1."""
     left_alone_s: float = 0.0
     """Time of the moves that keep their own lines by rule [s]: those behind homing or an object's
-    mark, steep ones, and others whose place or state is not known; put back pieces not counted."""
+    mark, steep ones, and others whose place or state is not known; reverted pieces not counted."""
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     left_out_s: float = 0.0

@@ -54,7 +54,7 @@ class Totals:
 
     @property
     def put_back_s(self) -> float:
-        """Extruding time of the pieces that left as they came."""
+        """Extruding time of the pieces that stayed as sliced."""
         return sum(piece.extruding_seconds for piece in self.put_back)
 
     @property
@@ -87,7 +87,7 @@ class Totals:
         if self.put_back_share > _WARN_SHARE:
             longest = max(self.put_back, key=lambda piece: piece.extruding_seconds)
             yield (
-                f"{self.put_back_share:.0%} of the extruding time left as it came and is not "
+                f"{self.put_back_share:.0%} of the extruding time stayed as sliced and is not "
                 f"compensated, for instance lines {longest.line_first} to {longest.line_last}: "
                 f"{longest.reason}"
             )

@@ -1,6 +1,6 @@
 """What the nozzle does, sample by sample: commanded and simulated motion as a table.
 
-The pipeline is gone once more, on the file as it came, up to the end of what is asked for.
+The pipeline is gone once more, on the sliced file, up to the end of what is asked for.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ def write_trajectories(
     Parameters
     ----------
     source : Path
-        The file as it came.
+        The sliced file.
     target : Path
         Written whole or not at all. Columns: ``t_s``; ``x_mm y_mm z_mm``, the motion that the
-        firmware makes of the file as it came; ``after_x_mm after_y_mm``, that of the written file;
+        firmware makes of the sliced file; ``after_x_mm after_y_mm``, that of the written file;
         ``before_sim_x_mm``, ..., the nozzle according to the machine's model;
         ``before_contour_um``, ``after_contour_um``, its distance to the planned path; ``line`` and
-        ``layer`` of the file as it came (-1: before the first layer); ``extruding``, 0 or 1.
+        ``layer`` of the sliced file (-1: before the first layer); ``extruding``, 0 or 1.
     machine : Machine
     options : Options or None
-        Those of the job; with None the file stays as it came, and no column is called ``after``.
+        Those of the job; with None the file stays as sliced, and no column is called ``after``.
         Of an advised file the motion is that of the written one, and so are its lines; no column
         is called ``before``.
     format : {"csv", "npz"}

@@ -139,5 +139,5 @@ class Verifier:
         if ours_um > max(_CLEARLY * came_um, NEGLIGIBLE_UM):
             raise Unfit(
                 f"on the motors' steps its contour error would be {ours_um:.1f} um rms, and it is "
-                f"{came_um:.1f} um as it came"
+                f"{came_um:.1f} um as sliced"
             )

@@ -35,7 +35,7 @@ def spectrum_figures(result: Result) -> list[SpectrumFigure]:
             y_title="µm/√Hz",
             lines=[
                 Line(spectrum.f_hz, spectrum.um_per_sqrt_hz[name], name)
-                for name in reversed(names)  # the file as it came lies on top
+                for name in reversed(names)  # the sliced file lies on top
                 if name in spectrum.um_per_sqrt_hz
             ],
             log=True,

@@ -1,4 +1,4 @@
-"""Does items beside each other, on this computer or a server, and keeps what was made."""
+"""Does items in parallel, on this computer or a server, and keeps what was made."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The written file: our lines among those of the original, with the printer's state kept right.
 
 Lines that are not ours leave byte for byte. Whatever the stream needs different (limits, firmware
-shaper, modes) is set before its first line and put back before any line that could depend on it.
+shaper, modes) is set before its first line and restored before any line that could depend on it.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class StreamWriter:
         return text if ends_with_newline or not text else b"\n" + text
 
     def verbatim(self, verbatim: VerbatimPart, extruder_mm: float) -> bytes:
-        """Text of lines that leave as they came.
+        """Text of lines that are not changed.
 
         Parameters
         ----------

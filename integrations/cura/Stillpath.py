@@ -171,7 +171,7 @@ class Stillpath(Script):
         return json.dumps(panel)
 
     def execute(self, data: list[str]) -> list[str]:
-        """Return the layers compensated; after a failure, which is shown, as they came.
+        """Return the layers compensated; after a failure, which is shown, as sliced.
 
         Parameters
         ----------

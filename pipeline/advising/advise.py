@@ -1,6 +1,6 @@
 """Advise a print file: its moves stay, and firmware commands for shaper and acceleration come in.
 
-The file is measured as it came, samples of it are tried, the choice is written, and what was
+The sliced file is measured, samples of it are tried, the choice is written, and what was
 written is read and measured again: by the firmware's rules, with the firmware's own shaper as the
 written lines set it. Where a feature exceeds its bound there, it is made slower and written anew.
 """

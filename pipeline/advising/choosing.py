@@ -156,7 +156,7 @@ def choose(
     budget_um : float, optional
         What every feature may err; None: what it erred before.
     whole_um : mapping
-        What every feature erred in the whole file as it came.
+        What every feature erred in the whole file as sliced.
     levels : sequence of (layer, OperatingPoint)
         Where the machine is from which layer on; more than one where plants follow a schedule.
     told : callable, optional

@@ -1,4 +1,4 @@
-"""Errors of the file as it came, at the places of the file as it is advised.
+"""Errors of the sliced file, at the places of the file as it is advised.
 
 Both make the same moves at other times. Errors of the first are kept in a file by their place,
 the number of the move and the part of it that is done, and read again at the places of the second.

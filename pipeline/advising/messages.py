@@ -23,7 +23,7 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
     """
     found = [
         f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "
-        "as it came are those without it."
+        "as sliced are those without it."
         for kind in unmodelled
     ]
     if none_known:

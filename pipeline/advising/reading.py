@@ -20,7 +20,7 @@ __all__ = ["FirstReading"]
 
 
 class FirstReading:
-    """What is noted while the file is read as it came.
+    """What is noted while the sliced file is read.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ class MotionSamples:
     first_move : int
         Number of the first of them in the file.
     sliced_mm : ndarray, shape (2, n), optional
-        X and Y as the firmware executes the file as it came, where that is not as planned.
+        X and Y as the firmware executes the sliced file, where that is not as planned.
     """
 
     path_mm: Array

@@ -53,8 +53,8 @@ class Responses:
     shaper : BestShaper
         Its delay is taken out.
     names : sequence of str
-        Channels: `before` is the file as it came (the executed motion, if nothing is compensated),
-        `after` the executed motion, `shaper` the file as it came, shaped.
+        Channels: `before` is the sliced file (the executed motion, if nothing is compensated),
+        `after` the executed motion, `shaper` the sliced file, shaped.
     compensated : bool
     """
 
@@ -81,7 +81,7 @@ class Responses:
         self._shapes_answer = linear and compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
         self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
-        """Planned: the path, and below it the file as it came, where that is not the same."""
+        """Planned: the path, and below it the sliced file, where that is not the same."""
         self._extruding = np.zeros(0, bool)
         self._answer = np.zeros((2, 0))
         """To the path, from `reach` samples before what is held to where it is known."""

@@ -129,7 +129,7 @@ class SpeedBudget:
         return move_classes(moves, self.first_layer)
 
     def paced(self, piece: Piece) -> Iterator[Piece]:
-        """Yield a piece at its new pace, then gentler ones, and at last the piece as it came.
+        """Yield a piece at its new pace, then gentler ones, and at last the piece as sliced.
 
         What it would take with the shaper is counted.
         """
@@ -147,7 +147,7 @@ class SpeedBudget:
         yield piece
 
     def passed(self, seconds: float) -> None:
-        """Count what leaves as it came."""
+        """Count what stays as sliced."""
         self._shaper_s += seconds
 
     def correct(self, sums: Mapping[int, ErrorSum]) -> None:

@@ -1,6 +1,6 @@
 """Figures of a print that became quicker, beside those of the print as it was sliced.
 
-What is written runs in a time of its own. The errors of the file as it came, and of it with the
+What is written runs in a time of its own. The errors of the sliced file, and of it with the
 best shaper, are those at the file's own speeds, and are measured there.
 """
 
@@ -32,7 +32,7 @@ class BudgetMeasurement(Measurement):
     """Measure both motions; parameters as `Measurement` has them.
 
     Channels, layers and features are those of the written file, with `before` and `shaper` at the
-    speeds of the file as it came. What is drawn along the print (track, spectra, tiles of layers)
+    speeds of the sliced file. What is drawn along the print (track, spectra, tiles of layers)
     shows all channels at the new speeds.
     """
 
@@ -64,7 +64,7 @@ class BudgetMeasurement(Measurement):
         self._set.operate_at(point)
 
     def add(self, samples: MotionSamples) -> None:
-        """Add motion that leaves as it came."""
+        """Add motion that stays as sliced."""
         self.add_pair(samples, samples, np.full(len(samples.moves), AS_SLICED, np.int32))
 
     def add_pair(
@@ -115,7 +115,7 @@ class BudgetMeasurement(Measurement):
 
 
 def _joined(written: list[GroupFigures], sliced: list[GroupFigures]) -> list[GroupFigures]:
-    """Put the figures of the file as it came over those at the new speeds."""
+    """Put the figures of the sliced file over those at the new speeds."""
     before = {group.name: group for group in sliced}
     joined = []
     for group in written:

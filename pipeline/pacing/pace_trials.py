@@ -64,7 +64,7 @@ class _Measured:
 class PaceTrials:
     """Try paces on samples; what was tried before is not worked out again.
 
-    Samples for which there is no command at their own pace are left out: they leave as they came.
+    Samples for which there is no command at their own pace are left out: they stay as sliced.
 
     Parameters
     ----------

@@ -45,7 +45,7 @@ from stillpath.version import __version__
 __all__ = ["Intake", "Taken"]
 
 _STORED_AT_ONCE = 12
-"""Uploads that are put into the storage beside each other: that may take minutes, and the threads
+"""Uploads that are put into the storage in parallel: that may take minutes, and the threads
 are for all requests."""
 
 _ASKED_AT_ONCE = 8

@@ -83,7 +83,7 @@ def test_compensate_writes_file_report_and_table(road, source, tmp_path, capsys)
     assert (road.machine, road.options.method, road.options.tolerance_um) == ("ender3", "fbf", 2.0)
     shown = capsys.readouterr().out
     assert "contour rms, extruding" in shown
-    assert "put back" in shown
+    assert "reverted" in shown
 
 
 def test_options_reach_the_road(road, source, tmp_path):

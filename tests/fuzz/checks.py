@@ -168,7 +168,7 @@ def through_the_road(
     Returns
     -------
     (bytes, int, float)
-        What was written, how many pieces were put back, and how long the print takes.
+        What was written, how many pieces were reverted, and how long the print takes.
     """
     source, target = folder / "in.gcode", folder / "out.gcode"
     target.unlink(missing_ok=True)

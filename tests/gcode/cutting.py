@@ -55,7 +55,7 @@ def ender3_with(kind: str, mesh_slope: float = 0.0) -> Machine:
 
 
 def compensated(text: str, machine: Machine) -> tuple[Piece, CompensatedPiece]:
-    """The piece behind the head, as it came and compensated."""
+    """The piece behind the head, as sliced and compensated."""
     work = PieceCompensator(machine, Options())
     piece = pieces_of(text, machine)[1]
     work.compensator.reset(piece.moves.start_mm[0, :2])

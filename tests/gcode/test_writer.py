@@ -60,7 +60,7 @@ def road(tmp_path: Path, cache: Path, machine: Machine) -> Road:
 
 
 def check(road: Road, text: str | bytes) -> list[bytes]:
-    """Compensate; every line must find its state, and no piece may be put back."""
+    """Compensate; every line must find its state, and no piece may be reverted."""
     original = tagged(text.encode() if isinstance(text, str) else text)
     written = road(original)
     assert differences(original, written, road.machine) == []

@@ -1,4 +1,4 @@
-"""Prints that go right to the limits of the machine are compensated, not put back."""
+"""Prints that go right to the limits of the machine are compensated, not reverted."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
 def test_where_the_shaper_would_serve_better_it_is_said(
     steps_per_mm: float, told: bool, tmp_path: Path
 ) -> None:
-    """Vertices on steps of .04 mm shake the printer more than the file as it came: that stays."""
+    """Vertices on steps of .04 mm shake the printer more than the sliced file: that stays."""
     drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
     own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
     machine = load_machine("annex-k3").model_copy(update={"firmware": own})
@@ -106,7 +106,7 @@ def test_where_the_shaper_would_serve_better_it_is_said(
     ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
     source.write_text(HEAD + "G1 F6000\n" + 4 * ring)
     result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
-    assert ["as it came" in one.reason for one in result.put_back] == [True] * told
+    assert ["as sliced" in one.reason for one in result.put_back] == [True] * told
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
 
 

@@ -1,4 +1,4 @@
-"""Pieces that cannot be compensated stay as they came, and the rest of the file is printed."""
+"""Pieces that cannot be compensated stay as sliced, and the rest of the file is printed."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     assert leaves.modes() == came.modes()
     assert leaves.position_mm == pytest.approx(came.position_mm, abs=1e-3)
     assert leaves.extruded_mm[0] == pytest.approx(came.extruded_mm[0], abs=1e-3)
-    # Inner walls leave line by line as they came.
+    # Inner walls leave line by line as sliced.
     inner = text.split(b";TYPE:WALL-INNER\n")[3].split(b";TYPE:")[0]
     kept = [line for line in inner.splitlines() if b"E" in line and not line.startswith(b";@")]
     assert len(kept) > 10

@@ -110,7 +110,7 @@ def test_gaps_stay_gaps(page: str):
 
 def test_a_simulation_promises_nothing():
     page = render_report(make_result(channels=("before", "shaper"), layers=1))
-    assert "the file as it came" in page
+    assert "the sliced file" in page
     for word in ("times smaller", "Put back", "The written file", "Compensated"):
         assert word not in page
 

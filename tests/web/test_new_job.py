@@ -21,7 +21,7 @@ _SECTIONS = (
     "Along the print",
     "Spectra at the resonances",
     "By feature",
-    "Put back as it came",
+    "Reverted to the sliced lines",
 )
 KEY = "sp_" + "0123456789abcdef" * 2
 

@@ -85,7 +85,7 @@ def _reach_s(kind: str, f_hz: float) -> float:
 
 
 def _number(text: str) -> float:
-    """Return a number of a line that stays as it came; Klipper would refuse what is none."""
+    """Return a number of a line that stays as sliced; Klipper would refuse what is none."""
     try:
         value = float(text)
     except ValueError:

@@ -26,9 +26,9 @@ export function headline(report, channels) {
     rms.after !== undefined
       ? h("div.figure.first", null, h("p.label", null, label),
         h("p.big", null, h("span.before", null, um(rms.before)), h("span.to", { "aria-hidden": "true" }, " → "), h("span.sr", null, " to "), h("span.after", null, said("after")), h("small", null, " µm")),
-        h("p.note", null, ranges.after ? `predicted, by all plants that explain the machine's measurement; ${um(rms.after)} by the one in the middle` : ratio >= LEAST_RATIO ? `${ratio >= 10 ? ratio.toFixed(0) : ratio.toFixed(1)} times smaller than the file as it came` : "no smaller than the file as it came"))
+        h("p.note", null, ranges.after ? `predicted, by all plants that explain the machine's measurement; ${um(rms.after)} by the one in the middle` : ratio >= LEAST_RATIO ? `${ratio >= 10 ? ratio.toFixed(0) : ratio.toFixed(1)} times smaller than the sliced file` : "no smaller than the sliced file"))
       : h("div.figure.first", null, h("p.label", null, label),
-        h("p.big", null, h("span.before", null, um(rms.before)), h("small", null, " µm")), h("p.note", null, "the file as it came")),
+        h("p.big", null, h("span.before", null, um(rms.before)), h("small", null, " µm")), h("p.note", null, "the sliced file")),
     rms.shaper === undefined ? null
       : h("div.figure", null, h("p.label", null, "Best-tuned shaper"), h("p.big", null, said("shaper"), h("small", null, " µm")), h("p.note", null, report.best_shaper)),
     h("div.figure", null, h("p.label", null, "Print time"), h("p.big", null, duration(report.time_s)),

@@ -1,4 +1,4 @@
-/** What was measured on the written file, from the headline to the pieces put back. */
+/** What was measured on the written file, from the headline to the reverted pieces. */
 
 import { h } from "../lib/dom.js";
 import { isAbort } from "../lib/api.js";
@@ -97,7 +97,7 @@ function budget(report) {
   const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
     : `, and ${saved(found.saved_share_against_shaper)} less than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
   return section("Speed budget",
-    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the file as it came${shaper}.`),
+    h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the sliced file${shaper}.`),
     longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
       feature(c.name), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
 }
@@ -108,7 +108,7 @@ function advice(report) {
   if (!found) return null;
   const shapers = found.shapers.map((/** @type {any} */ s) => `${s.layer > 0 ? `from layer ${s.layer} on ` : ""}${s.label}`).join("; ");
   return section("Advice",
-    h("p", null, `All moves are those of the file. ${grouped(found.lines)} lines were added; without them (they hold “; stillpath advise”) the file is as it came.`),
+    h("p", null, `All moves are those of the file. ${grouped(found.lines)} lines were added; without them (they hold “; stillpath advise”) the file is as sliced.`),
     h("p", null, shapers ? `Shaper: ${shapers}.` : `The firmware's shaper stays: ${found.before_shaper}.`),
     longTable("Advice by feature", [{ title: "Feature", text: true }, { title: "Acceleration, mm/s²" }, { title: "Contour, rms of the worst plant, µm", wide: true }, { title: "May have" }, { title: "Time", wide: true }], found.features, (f) => [
       feature(f.name), f.accel_mm_s2 === null ? "as sliced" : `${f.exact ? "" : "≥ "}${grouped(Math.round(f.accel_mm_s2))}`, `${um(f.before_um)} → ${um(f.after_um)}`,
@@ -121,12 +121,12 @@ function putBack(report, channels) {
   const pieces = report.put_back;
   const byChoice = report.left_out_s ? h("p", null, `By choice (${report.settings.where}) ${duration(report.left_out_s)} of the print, ${duration(report.left_out_extruding_s)} of it extruding, stay as sliced.`) : null;
   const byRule = h("p", null, `By rule ${duration(report.left_alone_s || 0)} of the print (${(100 * (report.left_alone_s || 0) / (report.time_s || 1)).toFixed(2)} %), ${duration(report.left_alone_extruding_s || 0)} of it extruding, keep the file's own lines: behind homing or an object's mark, say, or steep ones.`);
-  if (pieces.length === 0) return section("Put back as it came", byChoice, byRule, h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`));
-  return section("Put back as it came",
+  if (pieces.length === 0) return section("Reverted to the sliced lines", byChoice, byRule, h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`));
+  return section("Reverted to the sliced lines",
     h("p", null, `${grouped(pieces.length)} of ${counted(report.pieces, "piece")}, ${(100 * report.put_back_extruding_share).toFixed(2)} % of the extruding time. They are in the file as the slicer wrote them.`),
     byChoice,
     byRule,
-    longTable("Pieces put back as they came", [{ title: "Lines", text: true }, { title: "Time" }, { title: "Extruding", wide: true }, { title: "Why", text: true }], pieces, (p) => [
+    longTable("Pieces reverted to the sliced lines", [{ title: "Lines", text: true }, { title: "Time" }, { title: "Extruding", wide: true }, { title: "Why", text: true }], pieces, (p) => [
       `${p.line_first}–${p.line_last}`, duration(p.seconds), duration(p.extruding_seconds), p.reason], 20));
 }
 
