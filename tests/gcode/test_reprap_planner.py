@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
@@ -207,6 +208,22 @@ def test_moves_that_come_too_fast_make_the_motion_stutter() -> None:
     # 2 ms each: half a ring lasts 38 ms.
     calm = plan(path([(0.2 * k, 0) for k in range(200)], 100.0), limits)
     assert np.max(np.diff(calm.t_s) - lasts(calm)[:-1]) < 1e-9
+
+
+@pytest.mark.parametrize("speed", [1e-3, 1e-6, 1e-9, 1e-11, 1e-13])
+def test_moves_of_a_million_years_are_planned(speed: float) -> None:
+    """The clock of the plan goes on where its numbers are too large for a nanosecond."""
+    limits = replace(LIMITS, speed_x_mm_s=speed, min_speed_mm_s=0.0)
+    phases = plan(path([(7.3 * (k % 5), 0.1 * k) for k in range(90)], 60.0), limits)
+    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    assert lasts_s.sum() == pytest.approx(phases.cruise_s.sum(), rel=1e-2)
+    assert lasts_s.max() > 29.0 / speed
+
+
+def test_a_speed_that_no_clock_can_count_is_refused() -> None:
+    limits = replace(LIMITS, speed_x_mm_s=1e-300, min_speed_mm_s=0.0)
+    with pytest.raises(GcodeError, match="line 1: .*must be above 0"):
+        plan(path([(0.0, 0.0), (10.0, 0.0)], 60.0), limits)
 
 
 def test_places_are_whole_steps_and_filament_is_not() -> None:

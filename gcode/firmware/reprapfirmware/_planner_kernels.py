@@ -57,7 +57,8 @@ S_SIZE = 7
 OK, BAD_SPEED = -1, 1
 
 SHORT_CLOCKS = 10.0  # a shorter acceleration is left out
-_EPS_S = 1e-9
+_EPS_S, _ROUNDING = 1e-9, 1e-15
+_MOST_S = 1e15
 _NO_STEP = 1e-9
 OPEN_MOST_S, OPEN_BUT_FIRST_S = 2.0, 0.5  # the ring takes no more when its open moves last longer
 
@@ -123,6 +124,8 @@ def append(
                     accel = min(accel, limit[L_ACCEL + k] / share)
                     cruise = min(cruise, limit[L_SPEED + k] / share)
         if not (cruise > 0.0 and accel > 0.0 and np.isfinite(cruise) and np.isfinite(accel)):
+            return count, BAD_SPEED, m
+        if not (path < _MOST_S * cruise and path < _MOST_S**2 * accel):
             return count, BAD_SPEED, m
         row[Q_PATH] = path
         row[Q_ACCEL] = accel
@@ -193,7 +196,7 @@ def run(
             lead = state[S_FROZEN_END] - now
             if frozen == over:
                 begins = now + ahead
-            elif lead > ahead + _EPS_S:
+            elif lead > ahead + max(_EPS_S, _ROUNDING * now):  # else `now` might never come there
                 break
             elif lead >= least:
                 begins = state[S_FROZEN_END]
