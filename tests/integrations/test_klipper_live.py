@@ -85,7 +85,7 @@ def test_steps_are_the_filtered_plan(
     # Motors that round to whole steps are within half a step, .29 rms; the plan is known by steps.
     off = off_steps(prints, given, corexy)
     assert np.sqrt(np.mean(off**2)) < 0.4
-    assert np.abs(off).max() < 1.5
+    assert np.abs(off).max() < 2.0
 
     # Time and material: one shift for all of the print, of all other motors too.
     for ours, theirs in zip(prints.live.others_s, prints.plain.others_s, strict=True):
