@@ -1,4 +1,4 @@
-"""Kernels of the last check's own reader: lines like ``G1 X10.5 Y-3 E.02 F1800``, and no others.
+"""Kernels of the last check's own reader: lines like ``G1 X10.5 Y-3 E.02 F1800``, and few others.
 
 A state is an array of `SIZE` floats; nan is what nobody knows. Text ends with a newline.
 """
@@ -12,12 +12,14 @@ import numpy as np
 
 from stillpath.models.jit import kernel
 
-__all__ = ["carry_out_moves", "compare", "compare_moves", "move", "ours", "way_xy_mm"]
+__all__ = ["carry_out_moves", "compare", "compare_moves", "move", "ours", "settle", "way_xy_mm"]
 
 X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
 """Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
 mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 behind a move of X and Y
 so short that the firmware may carry it out with the next one."""
+WORD_COUNT = 7
+"""X Y Z E F, and I J of arcs."""
 SAME, PLACE, FILAMENT, FEED, MODES = -1, 0, 4, 5, 7
 """What `compare` finds: nothing, or the first of a state's numbers that differs."""
 WORDS, WITHIN = 15, 32
@@ -30,13 +32,15 @@ _FEED_MM_MIN, _FEED_SHARE = 1e-4, 2e-6
 
 
 @kernel(force_inline=True, allocates=False)
-def _words(text: Any, at: int, words: Any) -> tuple[int, int]:
+def _words(text: Any, at: int, words: Any, arcs: bool) -> tuple[int, int]:
     """Read a plain G0 or G1; return where the next line begins, or -1, and which words there are.
 
-    Bit 0 to 4 of the latter: X Y Z E F. Words are parted by one blank and have a plain number.
+    Bits 0 to 4 of the latter: X Y Z E F. Words are parted by blanks and have a plain number.
+    With `arcs` it may be a G2 or G3 with a centre too, which has bits 5 or 6: I J.
     """
     mask = 0
-    if text[at] != 71 or (text[at + 1] != 48 and text[at + 1] != 49):
+    number = text[at + 1] - 48
+    if text[at] != 71 or number < 0 or number > (3 if arcs else 1):
         return -1, mask
     p = at + 2
     while True:
@@ -48,14 +52,17 @@ def _words(text: Any, at: int, words: Any) -> tuple[int, int]:
             break
         if c != 32:
             return -1, mask
-        p += 1
-        c = text[p]
+        while c == 32:
+            p += 1
+            c = text[p]
         if c == 59:  # ; a comment
             while text[p] != 10:
                 p += 1
             break
         word = 3 if c == 69 else 4 if c == 70 else c - 88
-        if word < 0 or word > 4 or (c >= 88 and word > 2) or mask >> word & 1:
+        if c == 73 or c == 74:
+            word = c - 68 if number > 1 else -1
+        if word < 0 or word > 6 or (c >= 88 and word > 2) or mask >> word & 1:
             return -1, mask
         p += 1
         negative = text[p] == 45
@@ -80,6 +87,8 @@ def _words(text: Any, at: int, words: Any) -> tuple[int, int]:
         words[word] = -value if negative else value
         mask |= 1 << word
     if p - at > _LONGEST or (mask & 16 and words[4] <= 0.0):
+        return -1, mask
+    if number > 1 and not (mask & 32 and words[5] != 0.0) and not (mask & 64 and words[6] != 0.0):
         return -1, mask
     return p + 1, mask
 
@@ -140,6 +149,19 @@ def move(state: Any, words: Any, mask: int) -> None:
             state[FED] = state[E] = nan
     if mask & 16:
         state[F] = words[4] * state[UNIT]
+
+
+@kernel(force_inline=True, allocates=False)
+def settle(state: Any, way_mm: float, shortest_mm: float, z_mm: float, fed_mm: float) -> None:
+    """Note behind a move whether it waits, from where Z and filament were before it.
+
+    What waits is carried out with the next move that is long enough, of whatever axis.
+    """
+    waits = state[WAITS] == 1.0 if way_mm == 0.0 else way_mm <= shortest_mm
+    others_mm, more_mm = fabs(state[Z] - z_mm), fabs(state[FED] - fed_mm)
+    if more_mm > others_mm:
+        others_mm = more_mm
+    state[WAITS] = 1.0 if waits and not others_mm > shortest_mm else 0.0
 
 
 @kernel(allocates=False)
@@ -225,7 +247,7 @@ def ours(
             while k < length and text[at + k] == wanted[k]:
                 k += 1
             is_wanted = k == length and (text[at + k] == 10 or text[at + k] == 13)
-        next_at, mask = _words(text, at, words)
+        next_at, mask = _words(text, at, words, False)
         if next_at < 0:
             break
         if is_wanted and rests:
@@ -250,11 +272,14 @@ def carry_out_moves(
     stop: int,
     most: int,
     shortest_mm: float,
+    arcs: bool,
+    divides_extruder: bool,
     state: Any,
     words: Any,
     before: Any,
-) -> tuple[int, int, int]:
-    """Carry out plain moves of the original that move X or Y, and one behind them that does not.
+    perhaps: Any,
+) -> tuple[int, int, int, int]:
+    """Carry out plain moves of the original that may move X or Y, and one that surely does not.
 
     Parameters
     ----------
@@ -263,41 +288,57 @@ def carry_out_moves(
     most : int
         So many lines at most.
     shortest_mm : float
-        What is no longer than this in X and Y is left to others, unless it stands still there.
+        A move that is no longer than this in X and Y may be joined with the next one.
+    arcs, divides_extruder : bool
+        Arcs in the plane of X and Y are plain moves, and give each of their pieces a part of E.
     before : float array
         Takes the state before the one that does not move X or Y.
+    perhaps : int array
+        Takes where those begin of which nobody knows whether they move X or Y; so many at most.
 
     Returns
     -------
-    (int, int, int)
-        Where the next line begins, how many were carried out, and which words the last has if it
-        does not move X or Y; else -1.
+    (int, int, int, int)
+        Where the next line begins, how many were carried out, which words the last has if it does
+        not move X or Y (else -1), and how many are in `perhaps`.
     """
-    lines = 0
-    while at < stop and lines < most:
+    lines, found = 0, 0
+    while at < stop and lines < most and found < len(perhaps):
         if text[at] == 59 or text[at] == 10:
             while text[at] != 10:
                 at += 1
             at += 1
             lines += 1
             continue
-        behind, mask = _words(text, at, words)
+        behind, mask = _words(text, at, words, arcs)
         if behind < 0:
             break
+        lines += 1
+        if mask > 31:
+            move(state, words, mask)
+            if divides_extruder and mask & 8 and state[RELATIVE_E] != 1.0:
+                state[E] = state[FED] = nan
+            perhaps[found] = at
+            found += 1
+            at = behind
+            continue
         way_mm = way_xy_mm(state, words, mask)
-        if not (way_mm > shortest_mm or (way_mm == 0.0 and state[WAITS] == 0.0)):
-            break
-        if way_mm == 0.0:
+        if way_mm == 0.0 and (state[WAITS] == 0.0 or not mask & WORDS):
             for k in range(SIZE):
                 before[k] = state[k]
-        else:
+            move(state, words, mask)
+            return behind, lines, mask, found
+        if way_mm > shortest_mm:
             state[WAITS] = 0.0
-        move(state, words, mask)
+            move(state, words, mask)
+        else:
+            z_mm, fed_mm = state[Z], state[FED]
+            move(state, words, mask)
+            settle(state, way_mm, shortest_mm, z_mm, fed_mm)
+            perhaps[found] = at
+            found += 1
         at = behind
-        lines += 1
-        if way_mm == 0.0:
-            return at, lines, mask
-    return at, lines, -1
+    return at, lines, -1, found
 
 
 @kernel(allocates=False)
@@ -313,7 +354,7 @@ def compare_moves(
     words: Any,
     place_mm: Any,
     filament_mm: float,
-) -> tuple[int, int, int, int, int, int, int]:
+) -> tuple[int, int, int, int, int, int, int, int]:
     """Carry out plain moves that both texts share, and compare the states behind each.
 
     Parameters
@@ -329,11 +370,12 @@ def compare_moves(
 
     Returns
     -------
-    (int, int, int, int, int, int, int)
+    (int, int, int, int, int, int, int, int)
         Where both texts go on, how many lines of each were passed, how many moves were carried
-        out, how many of these without X and Y known, and what differs behind the last.
+        out, how many of these without X and Y known, how many lines stand before the first with
+        them, and what differs behind the last.
     """
-    lines, written_lines, moves, unknown = 0, 0, 0, 0
+    lines, written_lines, moves, unknown, before_known = 0, 0, 0, 0, -1
     while True:
         at, passed = _comments(before, at, stop, False)
         written_at, written_passed = _comments(after, written_at, written_stop, True)
@@ -341,7 +383,7 @@ def compare_moves(
         written_lines += written_passed
         if at >= stop or written_at >= written_stop:
             break
-        behind, mask = _words(before, at, words)
+        behind, mask = _words(before, at, words, False)
         length = behind - at
         if behind < 0 or written_at + length > written_stop:
             break
@@ -359,7 +401,9 @@ def compare_moves(
         moves += 1
         if isnan(one[X] + one[Y] + other[X] + other[Y]):
             unknown += 1
+        elif before_known < 0:
+            before_known = lines - 1
         found = compare(one, other, mask, place_mm, filament_mm)
         if found != SAME:
-            return at, written_at, lines, written_lines, moves, unknown, found
-    return at, written_at, lines, written_lines, moves, unknown, SAME
+            return at, written_at, lines, written_lines, moves, unknown, before_known, found
+    return at, written_at, lines, written_lines, moves, unknown, before_known, SAME

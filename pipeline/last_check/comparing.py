@@ -113,7 +113,7 @@ class LastCheck:
         self._original, self._written = Original(original, self._before), Text()
         self._rest: list[bytes] = []
         self._place_mm = _PLACE_MM + np.array(step_mm[:3], float)
-        self._words = np.zeros(5)
+        self._words = np.zeros(at.WORD_COUNT)
         self._idle: set[bytes] = set()
         """Lines of ours that leave place and modes as they are."""
         self._streaming = False
@@ -187,7 +187,7 @@ class LastCheck:
         if original.is_read:
             self._original.read_on()
         before, after = original.line, written.at
-        original.at, written.at, lines, written_lines, moves, unknown, found = at.compare_moves(
+        original.at, written.at, *counts, known, found = at.compare_moves(
             original.array,
             original.at,
             original.stop,
@@ -200,6 +200,7 @@ class LastCheck:
             self._place_mm,
             self._filament_mm,
         )
+        lines, written_lines, moves, unknown = counts
         original.line += lines
         written.line += written_lines
         if found != at.SAME:
@@ -208,7 +209,7 @@ class LastCheck:
             code = written.data[max(start, after) : end]
             place = original.line - 1, written.line - 1
             raise self._differs(found, self._before.state, "behind", code, *place)
-        self._note(moves, unknown, before)
+        self._note(moves, unknown, before, before + known)
         if written.is_read or (lines and original.is_read):
             return
         line, behind = written.peek()
@@ -276,7 +277,7 @@ class LastCheck:
         if line in self._idle and line != wanted.code:
             written.skip(end + 1)
             return
-        code = code_of(line)
+        code = line if line == wanted.code else code_of(line)
         if code:
             if not self._takes(code, held_back=False):
                 if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
@@ -294,6 +295,8 @@ class LastCheck:
         elif (off := _OFF.match(line)) is not None:
             self._leave(int(off[1]) if off[1] else ALL)
         written.skip(end + 1)
+        if self._streaming and self._wanted is None:
+            self._take_harmless()
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
@@ -366,6 +369,17 @@ class LastCheck:
         self._wanted = None
         self._begun.append(self._original.place())
 
+    def _take_harmless(self) -> None:
+        """Take lines that come next in both files and do nothing to place and modes."""
+        written, original = self._written, self._original
+        while line := original.harmless():
+            if not written.data.startswith(line, written.at):
+                return
+            self._kept += 1
+            written.skip(written.at + len(line))
+            original.text.skip(original.text.at + len(line))
+            self._begun.append(original.place())
+
     def _leave(self, number: int) -> None:
         """Leave a stream behind which the file goes on with a line of the original."""
         original = self._original
@@ -418,16 +432,16 @@ class LastCheck:
         """Count a line that was compared."""
         before, after = self._before.state, self._after.state
         unknown = before[at.X] + before[at.Y] + after[at.X] + after[at.Y]
-        self._note(1, int(unknown != unknown), line)
+        self._note(1, int(unknown != unknown), line, line)
 
-    def _note(self, lines: int, unknown: int, line: int) -> None:
-        """Count lines that were compared, the first of them without a place."""
+    def _note(self, lines: int, unknown: int, line: int, known_line: int) -> None:
+        """Count lines that were compared, from a line on; the place is known from another one."""
         self._kept += lines
         self._compared += lines - unknown
         if unknown and not self._gap_line:
             self._gap_line = line
         if lines > unknown and self._gap_line:
-            self._close_gap(f"line {line + unknown}")
+            self._close_gap(f"line {known_line}")
 
     def _close_gap(self, until: str) -> None:
         line, self._gap_line = self._gap_line, 0

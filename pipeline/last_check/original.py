@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ ALL = 1 << 60
 """Lines of a file, all of them."""
 _BLOCK_BYTES = 1 << 18
 _MOST_PERHAPS = 1 << 12
+_AT_A_TIME = 1 << 10
 _BOM = b"\xef\xbb\xbf"
 
 
@@ -69,7 +70,7 @@ class Text:
         self.line += lines
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Wanted:
     """The next line of the original that must be in the written file.
 
@@ -82,7 +83,7 @@ class Wanted:
     mask : int
         Words of a plain move (`Reader.carry_out`).
     before : float array
-        State before it.
+        State before it, if it is a plain move without X and Y.
     """
 
     line: int = ALL
@@ -93,8 +94,7 @@ class Wanted:
     before: NDArray[np.float64] = field(default_factory=lambda: np.zeros(at.SIZE))
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(NamedTuple):
     """A place in the original, and what its reader knew there."""
 
     bytes_before: int
@@ -122,7 +122,7 @@ class Original:
         source.seek(0)
         self._source, self.reader, self.text = source, reader, Text()
         self.perhaps: deque[bytes] = deque(maxlen=_MOST_PERHAPS)
-        self._words = np.zeros(5)
+        self._words, self._places = np.zeros(at.WORD_COUNT), np.zeros(_AT_A_TIME, int)
         self._still = np.zeros(at.SIZE)
         """State before the last line that stood still in X and Y."""
         self._ahead: tuple[Wanted, Place, tuple[bytes, ...]] | None = None
@@ -176,6 +176,12 @@ class Original:
         """Go on behind the next line."""
         self.text.skip(self.text.data.index(b"\n", self.text.at) + 1)
 
+    def harmless(self) -> bytes:
+        """Return the next line with its end if it does nothing to place and modes; else nothing."""
+        text = self.text
+        line = text.data[text.at : text.data.find(b"\n", text.at) + 1]
+        return line if self.reader.leaves_alone(line.strip()) else b""
+
     def wanted(self) -> Wanted:
         """Carry out what a stream may stand for, and the line behind it, which must stay."""
         if self._ahead is not None:
@@ -184,19 +190,21 @@ class Original:
                 self.go_to(place)
                 self.perhaps.extend(perhaps)
                 return wanted
-        while (found := self._next())[0]:
-            (code, mask), before = found, self._still
-            line, kind = self.text.line - 1, Kind.RESTS if mask & at.WORDS else Kind.STAYS
+        while (found := self._next(ALL, self.perhaps))[0]:
+            code, mask = found
+            line, before, kind = self.text.line - 1, self._still, Kind.STAYS
             if mask < 0:
-                before = self.reader.state.copy()
-                kind, mask = self.reader.carry_out(code)
+                if not self.reader.leaves_alone(code):
+                    before = self.reader.state.copy()
+                    kind, mask = self.reader.carry_out(code)
                 self.skip()
                 line += 1
+            elif mask & at.WORDS:
+                before, kind = before.copy(), Kind.RESTS
             if kind is Kind.PERHAPS:
                 self.perhaps.append(code)
             elif kind is not Kind.MOVES:
-                array = np.frombuffer(code, np.uint8)
-                return Wanted(line, code, kind, mask, array, before.copy())
+                return Wanted(line, code, kind, mask, np.frombuffer(code, np.uint8), before)
         return Wanted()
 
     def look_ahead(self, wanted: Wanted) -> None:
@@ -212,13 +220,20 @@ class Original:
 
     def go_up_to(self, line: int) -> None:
         """Carry out the lines before another one."""
-        while (found := self._next(line))[0]:
+        while (found := self._next(line, deque(maxlen=0)))[0]:
             if found[1] < 0:
                 self.reader.carry_out(found[0])
                 self.skip()
 
-    def _next(self, before_line: int = ALL) -> tuple[bytes, int]:
+    def _next(self, before_line: int, perhaps: deque[bytes]) -> tuple[bytes, int]:
         """Carry out moves of X and Y, and go on to what is behind them.
+
+        Parameters
+        ----------
+        before_line : int
+            Where to stop.
+        perhaps : deque of bytes
+            Takes those of which nobody knows whether they move X or Y.
 
         Returns
         -------
@@ -226,25 +241,32 @@ class Original:
             The line behind them, to be carried out, and -1; or one that stands still in X and Y and
             was carried out, with its words. Nothing at the end of the file, and before the line.
         """
-        text = self.text
+        text, reader = self.text, self.reader
         while text.line < before_line:
             if text.is_read and not self.read_on():
                 break
-            behind, lines, mask = at.carry_out_moves(
+            behind, lines, mask, found = at.carry_out_moves(
                 text.array,
                 text.at,
                 text.stop,
                 before_line - text.line,
-                self.reader.shortest_mm,
-                self.reader.state,
+                reader.shortest_mm,
+                reader.knows_arcs,
+                reader.rules.divides_extruder,
+                reader.state,
                 self._words,
                 self._still,
+                self._places,
             )
             text.skip(behind, lines)
+            if found:
+                data = text.data
+                for begin in self._places[:found].tolist():
+                    perhaps.append(data[begin : data.index(b"\n", begin)].rstrip())
             if mask >= 0:
                 begin = text.data.rfind(b"\n", 0, behind - 1) + 1
                 return text.data[begin : behind - 1].rstrip(), mask
-            if text.is_read or text.line >= before_line:
+            if text.is_read or text.line >= before_line or found == _AT_A_TIME:
                 continue
             line, behind = text.peek()
             if code := code_of(line):

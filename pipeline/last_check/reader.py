@@ -38,7 +38,8 @@ _MAY_MOVE = re.compile(
 )
 _TEXT = (b"M117", b"M118", b"M23")
 _AXES = b"XYZEF"
-_NO_WORDS = np.zeros(5)
+_NO_WORDS = np.zeros(at.WORD_COUNT)
+_MOST_HARMLESS = 1 << 10
 
 
 class Kind(IntEnum):
@@ -82,8 +83,10 @@ class Reader:
         self.lost = b""
         self.least_flow = 1.0
         """The smallest flow factor so far (M221): what E says may be many times what is fed."""
+        # Never changed in place, so that `keep` need not copy them.
         self._saved: dict[bytes, tuple[float, ...]] = {}
-        self._pushed: list[tuple[float, ...]] = []
+        self._pushed: tuple[tuple[float, ...], ...] = ()
+        self._harmless_lines: set[bytes] = set()
         self._in_plane_xy = True
         self._condition = -1
         """Indentation of the condition under which lines stand; -1: none."""
@@ -94,8 +97,8 @@ class Reader:
             self.state.copy(),
             self._says_relative_e,
             self.lost,
-            self._saved.copy(),
-            self._pushed.copy(),
+            self._saved,
+            self._pushed,
             self._in_plane_xy,
             self._condition,
         )
@@ -106,13 +109,21 @@ class Reader:
             state,
             self._says_relative_e,
             self.lost,
-            saved,
-            pushed,
+            self._saved,
+            self._pushed,
             self._in_plane_xy,
             self._condition,
         ) = kept
         self.state[:] = state
-        self._saved, self._pushed = saved.copy(), pushed.copy()
+
+    @property
+    def knows_arcs(self) -> bool:
+        """Whether arcs in the plane of X and Y are carried out here."""
+        return self._in_plane_xy and len(self.rules.arcs) > 0
+
+    def leaves_alone(self, line: bytes) -> bool:
+        """Whether a line was carried out before and does nothing to place and modes."""
+        return line in self._harmless_lines
 
     def carry_out(self, line: bytes) -> tuple[Kind, int]:
         """Carry out a line that `code_of` says is one, without its end.
@@ -122,6 +133,8 @@ class Reader:
         (Kind, int)
             And which of X Y Z E F are its words (bits 0 to 4), of a plain move.
         """
+        if line in self._harmless_lines:
+            return Kind.STAYS, 0
         rules = self.rules
         code = line.split(b";", 1)[0]
         if rules.several and not self._holds(code):
@@ -142,6 +155,9 @@ class Reader:
         if name == b"M221" and (flow := _FLOW.search(rest)) is not None:
             self.least_flow = min(self.least_flow, max(0.01 * float(flow[1]), 1e-9))
         if name in rules.harmless or name in _TEXT:
+            # Where a line may hold several commands its place matters too.
+            if not (rules.several or rules.stacks) and len(self._harmless_lines) < _MOST_HARMLESS:
+                self._harmless_lines.add(line)
             return self._harmless(code, name, rest), 0
         return self._command(code, name, rest), 0
 
@@ -176,11 +192,8 @@ class Reader:
         at.move.py_func(self.state, values, mask)  # type: ignore[attr-defined]
         if not mask & at.WORDS:
             return Kind.STAYS, mask
-        others_mm = max(abs(self.state[at.Z] - z_mm), abs(self.state[at.FED] - fed_mm))
         waited = self.state[at.WAITS] == 1.0
-        # What waits is carried out with the next move that is long enough, of whatever axis.
-        waits = waited if way_mm == 0.0 else way_mm <= self.shortest_mm
-        self.state[at.WAITS] = float(waits and not others_mm > self.shortest_mm)
+        at.settle.py_func(self.state, way_mm, self.shortest_mm, z_mm, fed_mm)  # type: ignore[attr-defined]
         if way_mm == 0.0 and not waited:
             return Kind.RESTS, mask
         return Kind.MOVES if way_mm > self.shortest_mm else Kind.PERHAPS, mask
@@ -230,18 +243,19 @@ class Reader:
         elif name == b"G21" or (name == b"G20" and rules.inches):
             state[at.UNIT] = 1.0 if name == b"G21" else 25.4
         elif rules.restores and name == b"SAVE_GCODE_STATE":
-            self._saved[_state_name(rest)] = self._modes()
+            self._saved = self._saved | {_state_name(rest): self._modes()}
         elif rules.restores and name == b"RESTORE_GCODE_STATE":
             saved = self._saved.get(_state_name(rest))
             self._forget(code, modes=saved is None)
             if saved is not None:
                 self._set_modes(saved)
         elif rules.stacks and name == b"M120":
-            self._pushed.append(self._modes())
+            self._pushed = (*self._pushed, self._modes())
         elif rules.stacks and name == b"M121":
             if self._pushed:
                 reads = state[at.E]
-                self._set_modes(self._pushed.pop())
+                self._set_modes(self._pushed[-1])
+                self._pushed = self._pushed[:-1]
                 state[at.E] = reads
         elif name in (b"G28", b"G29", b"G30", b"G32"):
             state[at.X : at.Z + 1] = NAN

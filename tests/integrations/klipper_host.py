@@ -28,6 +28,7 @@ __all__ = [
     "EXTRA",
     "NO_KLIPPER",
     "PYTHON",
+    "STEP_MM",
     "Steps",
     "klipper_with_extra",
     "printer_cfg",
@@ -42,7 +43,8 @@ EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"
 _CLOCK_HZ = 20_000_000
 """So slow that no stand of a motor is longer than the clock's 32 bits."""
 _MICROSTEPS, _ROTATION_MM = 256, 40.0
-_STEP_MM = _ROTATION_MM / (200 * _MICROSTEPS)
+STEP_MM = _ROTATION_MM / (200 * _MICROSTEPS)
+"""Of the motors of X and Y: .8 um, so that no step hides anything."""
 _QUEUE_STEP = "queue_step oid=%c interval=%u count=%hu add=%hi"
 _DIRECTION = "set_next_step_dir oid=%c dir=%c"
 _RESET = "reset_step_clock oid=%c clock=%u"
@@ -146,11 +148,21 @@ class Steps:
     others_s: list[NDArray[np.float64]] = field(default_factory=list)
 
     def sampled(self, sample_s: float, corexy: bool = False) -> NDArray[np.float64]:
-        """Places of X and Y at even times from 0 to the end, (2, n), straight between steps."""
+        """Places of X and Y at even times from 0 to the end, (2, n), straight between steps.
+
+        Klipper steps where its motion is half a step short of the place behind the step
+        (klippy/chelper/itersolve.c, 2026-08).
+        """
         end_s = max(float(t[-1]) for t in self.time_s)
         at_s = np.arange(0.0, end_s + 0.05, sample_s)
-        a, b = (np.interp(at_s, t, p) for t, p in zip(self.time_s, self.place_mm, strict=True))
+        halfway = (p - np.diff(p, prepend=0.0) / 2.0 for p in self.place_mm)
+        a, b = (np.interp(at_s, t, p) for t, p in zip(self.time_s, halfway, strict=True))
         return np.stack(((a + b) / 2.0, (a - b) / 2.0) if corexy else (a, b))
+
+    def held(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the two motors stand at some times, (2, n), jumping at each step."""
+        rows = zip(self.time_s, self.place_mm, strict=True)
+        return np.stack([np.append(0.0, p)[np.searchsorted(t, at_s, "right")] for t, p in rows])
 
 
 def printer_cfg(machine: Machine, *more: str) -> str:
@@ -301,7 +313,7 @@ def _read(data: bytes) -> Steps:
                 assert kind != reset, "nothing takes a homed motor's clock back in batch mode"
     found = [motors[oid] for oid in sorted(motors)]
     times = [np.concatenate([np.zeros(0), *m.clocks]) / _CLOCK_HZ for m in found]
-    return Steps(times[:2], [np.concatenate(m.places) * _STEP_MM for m in found[:2]], times[2:])
+    return Steps(times[:2], [np.concatenate(m.places) * STEP_MM for m in found[:2]], times[2:])
 
 
 def _blocks(data: bytes) -> list[bytes]:

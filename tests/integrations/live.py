@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.compensation.live_filter import LiveFilter
 from stillpath.models.machine import Machine
-from tests.integrations.klipper_host import Steps, printer_cfg, steps_of
+from tests.integrations.interrupted import two_objects
+from tests.integrations.klipper_host import STEP_MM, Steps, printer_cfg, steps_of
 
-__all__ = ["EVENTS", "Pair", "both", "print_with", "shifted", "stands"]
+__all__ = [
+    "EVENTS",
+    "FILES",
+    "FINE",
+    "Pair",
+    "both",
+    "curves",
+    "later",
+    "off_steps",
+    "predicted",
+    "print_begins",
+    "print_with",
+    "shifted",
+    "stands",
+    "with_event",
+]
 
 Array = NDArray[np.float64]
 
+GEAR = Path(__file__).resolve().parents[2] / "examples" / "cura_ender3_gear24.gcode"
+FINE, _FAR_MM, _HOMED_S = 4, 1e4, 2.5
+"""`FINE`: samples of a plan to one of the filter."""
 SECTION = "[stillpath]\nfile: stillpath.json"
 MORE = """[force_move]
 enable_force_move: True
@@ -96,6 +118,26 @@ EVENTS = {
 """What happens in the middle of lines that are fast."""
 
 
+def curves() -> str:
+    """Circles as slicers write them, at several speeds, and short zigzags."""
+    lines = ["G28", "G90", "M83", "G1 Z.3 F900"]
+    for radius, feed in ((3, 3000), (12, 9000), (25, 15000)):
+        for k in range(73):
+            a = 2 * np.pi * k / 72
+            x, y = 60 + radius * np.cos(a), 60 + radius * np.sin(a)
+            lines.append(f"G1 X{x:.3f} Y{y:.3f} E.03 F{feed}")
+        lines += ["G1 E-.8 F2100", "G1 Z.6", "G1 X40 Y40 F18000", "G1 Z.3", "G1 E.8"]
+        lines += [f"G1 X{40 + 0.4 * k:.1f} Y{40 + 4 * (k % 2)} E.1 F{feed}" for k in range(40)]
+    return "\n".join(lines) + "\n"
+
+
+FILES: dict[str, Callable[[], str]] = {
+    "two objects": two_objects,
+    "curves": curves,
+    "gear": lambda: GEAR.read_text().partition(";LAYER:1")[0],
+}
+
+
 @dataclass(frozen=True)
 class Pair:
     """A print as Klipper makes it, and with the extra; and what the host said."""
@@ -154,3 +196,49 @@ def shifted(found: Array, late: float, count: int) -> Array:
     """Return a motion (2, n) so many samples earlier, (2, count)."""
     at = np.arange(count) + late
     return np.stack([np.interp(at, np.arange(len(row)), row) for row in found])
+
+
+def with_event(event: str) -> str:
+    """Two objects, with an event in fast lines and a stand behind the next one."""
+    lines = two_objects().split("\n")
+    fast = [k for k, line in enumerate(lines) if line.startswith("G1 X") and "F9000" in line]
+    script = EVENTS[event].split("\n")
+    if event == "CANCEL_PRINT":
+        return "\n".join([*lines[: fast[12] + 1], *script, ""])
+    for k in reversed(fast[3::9]):
+        lines[k + 1 : k + 2] = [*script, lines[k + 1], "G4 P1500"]
+    return "\n".join(lines)
+
+
+def print_begins(times: list[Any]) -> float:
+    """When X or Y moves after the homing of Z, the only long stand."""
+    t = np.sort(np.concatenate(times))
+    return float(t[np.flatnonzero(np.diff(t) > _HOMED_S)[-1] + 1])
+
+
+def later(prints: Pair) -> float:
+    """By how much later the extruder makes its last step, which no filter touches."""
+    return float(prints.live.others_s[1][-1] - prints.plain.others_s[1][-1])
+
+
+def predicted(plan: Array, given: dict[str, Any]) -> Array:
+    """Filter a plan whose samples are `FINE` to one of the filter."""
+    taps = np.array([given["axes"][axis]["taps"] for axis in ("x", "y")])
+    command = given["command"]
+    far = np.array([[-_FAR_MM, _FAR_MM]] * 2)
+    live = LiveFilter(taps, 1e-3, command["velocity_mm_s"], command["accel_mm_s2"], far)
+    out = np.empty_like(plan)
+    for phase in range(FINE):
+        rows = np.pad(plan[:, phase::FINE], ((0, 0), (live.margin, live.margin)), mode="edge")
+        out[:, phase::FINE] = live.command(rows)
+    return out
+
+
+def off_steps(prints: Pair, given: dict[str, Any], corexy: bool) -> Array:
+    """By how many steps the motors stand off the filtered plan, (2, n), from the print on."""
+    first = (round(print_begins(prints.plain.time_s) * 1e3) - 500) * FINE
+    plan = prints.plain.sampled(1e-3 / FINE, corexy)[:, first:]
+    x, y = predicted(plan, given)
+    motors = np.stack((x + y, x - y) if corexy else (x, y))
+    at_s = (first + np.arange(plan.shape[1])) * 1e-3 / FINE + later(prints)
+    return np.asarray((prints.live.held(at_s) - motors) / STEP_MM)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import random
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from stillpath.models.firmware import Firmware, Klipper, Marlin, RepRapFirmware
 from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.original import Original
 from stillpath.pipeline.last_check.reader import Kind, Reader, code_of
 from stillpath.pipeline.last_check.rules import rules_of
 from tests.gcode.plain_reader import read
@@ -147,13 +149,60 @@ def test_kernels_read_as_the_slow_way_does(lines: list[str]) -> None:
     text = np.frombuffer("".join(f"{line}\n" for line in moves).encode(), np.uint8)
     slow = after("\n".join(["M83", *moves]), MARLIN)
     quick = after("M83", MARLIN)
-    nothing, states = np.frombuffer(b"", np.uint8), np.zeros((2, at.SIZE))
+    nothing, (before, behind) = np.frombuffer(b"", np.uint8), np.zeros((2, at.SIZE))
+    words, near_mm = np.zeros(at.WORD_COUNT), np.zeros(3)
     found = at.ours(
-        text, 0, len(text), quick.state, np.zeros(5), nothing, False, *states, np.zeros(3), 0.0
+        text, 0, len(text), quick.state, words, nothing, False, before, behind, near_mm, 0.0
     )
     assert found == (len(text), len(moves), False, at.SAME)
     known = slice(at.WAITS)  # moves of ours do not wait
     np.testing.assert_allclose(quick.state[known], slow.state[known], rtol=1e-12)
+
+
+# fmt: off
+STEPS = [
+    "G1 X5.01", "G1 X5", "G1  X5.02  Y5 ", "G0 Z.1", "G1 Z.1 E.00004", "G1 E2",
+    "G1 E2.00003", "G1 F900", "G1 X9 Y9 F600", "G1 X5 ; moves", "G1 Y5.005", "g1 z3",
+    "G2 X9 Y9 I2", "G3 X5 I1 J-2 E5", "G2 X5 I0 J0", "G2 X5 R5", "G17", "G18",
+    "G90", "G91", "M82", "M83", "G92 E0", "G92 X5",
+    "M204 S500", "M105", "START_PRINT", ";",
+]
+# fmt: on
+
+
+@given(
+    st.lists(st.sampled_from(STEPS), max_size=40),
+    st.sampled_from([KLIPPER, MARLIN, FOLDING]),
+    st.booleans(),
+)
+def test_what_is_waited_for_is_what_line_by_line_would_be(
+    lines: list[str], firmware: Firmware, plain_start: bool
+) -> None:
+    lines = [*(["G92 X5 Y5 Z0 E0"] if plain_start else []), *lines]
+    slow = Reader(rules_of(firmware), 0.05)
+    steps = []
+    perhaps: list[bytes] = []
+    for number, line in enumerate(lines, 1):
+        before, code = slow.state.copy(), code_of(line.encode())
+        if not code:
+            continue
+        kind, _ = slow.carry_out(code)
+        if kind is Kind.PERHAPS:
+            perhaps.append(code)
+        elif kind is not Kind.MOVES:
+            steps.append((number, code, kind, perhaps, before, slow.state.copy()))
+            perhaps = []
+    original = Original(io.BytesIO("\n".join(lines).encode()), Reader(rules_of(firmware), 0.05))
+    for number, code, kind, may_move, before, behind in steps:
+        wanted = original.wanted()
+        assert (wanted.line, wanted.code, wanted.kind) == (number, code, kind)
+        assert list(original.perhaps) == may_move
+        np.testing.assert_array_equal(original.reader.state, behind)
+        if kind is Kind.RESTS:
+            np.testing.assert_array_equal(wanted.before, before)
+        original.perhaps.clear()
+    assert original.wanted().code == b""
+    np.testing.assert_array_equal(original.reader.state, slow.state)
 
 
 def test_any_bytes_are_read() -> None:
