@@ -14,7 +14,7 @@ import numpy as np
 
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.types import EventKind, Limits, ModalState
+from stillpath.gcode.types import EventKind, Limits, ModalState, Moves
 from stillpath.models.machine import Machine
 
 __all__ = ["State", "differences", "states", "tagged"]
@@ -109,7 +109,7 @@ def states(data: bytes, machine: Machine) -> list[State]:
             number, at = int(events.line[i]), int(events.move_index[i]) - block.first_move
             if len(moves) and at > 0 and latest[at - 1] >= 0:
                 row = latest[at - 1]
-                last, known = moves.end_mm[row], int(moves.known[row])
+                last, known = moves.end_mm[row], _known(moves, row, known)
             found[number] = State(
                 lines[number - 1],
                 int(events.kind[i]),
@@ -122,9 +122,15 @@ def states(data: bytes, machine: Machine) -> list[State]:
                 streams[number - 1],
             )
         if len(moves) and latest[-1] >= 0:
-            last, known = moves.end_mm[latest[-1]], int(moves.known[latest[-1]])
+            last, known = moves.end_mm[latest[-1]], _known(moves, int(latest[-1]), known)
     assert sorted(found) == list(range(1, len(lines) + 1))
     return [found[k] for k in sorted(found)]
+
+
+def _known(moves: Moves, row: int, before: int) -> int:
+    """Axes that are known behind a move; one of the extruder by itself (G10) does not say."""
+    stays = not np.any(moves.start_mm[row, :3] != moves.end_mm[row, :3])
+    return before if stays and moves.known[row] == 0 else int(moves.known[row])
 
 
 def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:

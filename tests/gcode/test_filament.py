@@ -58,6 +58,10 @@ CASES = {
         "M200 D1.75\nG92 E30\nG1 E-1\nM200 D0\nG1 X60 E2\nM82\nG1 E10\nM400\nG1 X90 E11"
     ),
     "leading zeros": "G092 E5\nG1 X60 E2.2\nM082\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
+    "a new origin behind G10": (
+        "M82\nG92 E0\nG1 E-5\nG1 X90.3 Y90.015 E-4.9\nG1 E-5.9\nG10\nG92 E0\n"
+        "G1 X90.598 Y90.045 E.015"
+    ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"

@@ -222,7 +222,7 @@ def test_moves_of_a_million_years_are_planned(speed: float) -> None:
 
 def test_a_speed_that_no_clock_can_count_is_refused() -> None:
     limits = replace(LIMITS, speed_x_mm_s=1e-300, min_speed_mm_s=0.0)
-    with pytest.raises(GcodeError, match="line 1: .*must be above 0"):
+    with pytest.raises(GcodeError, match=r"line 1: .*must be above 0"):
         plan(path([(0.0, 0.0), (10.0, 0.0)], 60.0), limits)
 
 

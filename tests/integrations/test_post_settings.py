@@ -227,7 +227,7 @@ def test_the_line_for_windows_survives_its_quoting(tmp_path: Path, monkeypatch, 
     monkeypatch.setattr(sys, "argv", [program])
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(Path, "absolute", lambda self: self)
-    stillpath_post._set_up(settings(tmp_path), stillpath_post.StreamCommands())
+    stillpath_post._set_up(settings(tmp_path), stillpath_post.Voice())
     line = capsys.readouterr().out.splitlines()[-1].strip()
     assert windows_split(line) == [f"{program}.exe"]
 
@@ -298,4 +298,4 @@ def test_it_needs_python_3_8_and_its_standard_library_only():
         elif isinstance(node, ast.ImportFrom):
             imported.add((node.module or "").partition(".")[0])
     # The package is asked for only when no server is named.
-    assert imported - {"service"} <= set(sys.stdlib_module_names)
+    assert imported - {"stillpath"} <= set(sys.stdlib_module_names)
