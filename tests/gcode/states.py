@@ -14,7 +14,7 @@ import numpy as np
 
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.types import EventKind, Limits, ModalState, Moves
+from stillpath.gcode.types import EventKind, Limits, ModalState
 from stillpath.models.machine import Machine
 
 __all__ = ["State", "differences", "states", "tagged"]
@@ -22,6 +22,7 @@ __all__ = ["State", "differences", "states", "tagged"]
 _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
 _DUST_MM = 1e-9
+_XYZ = np.array([True, True, True, False])
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
@@ -89,6 +90,9 @@ def states(data: bytes, machine: Machine) -> list[State]:
         # Dust (see `_is_dust`) is a move in one file and none in the other: it tells nothing.
         is_move = np.max(np.abs(moves.end_mm - moves.start_mm), axis=1, initial=0.0) >= _DUST_MM
         latest = np.maximum.accumulate(np.where(is_move, np.arange(len(moves)), -1))
+        # One of the extruder by itself (G10) does not say whether X and Y are known.
+        tells = (moves.known != 0) | np.any(moves.start_mm != moves.end_mm, axis=1, where=_XYZ)
+        told = np.maximum.accumulate(np.where(is_move & tells, np.arange(len(moves)), -1))
         for i in range(len(moves)):
             number = int(moves.line[i])
             first = found.get(number)
@@ -109,7 +113,8 @@ def states(data: bytes, machine: Machine) -> list[State]:
             number, at = int(events.line[i]), int(events.move_index[i]) - block.first_move
             if len(moves) and at > 0 and latest[at - 1] >= 0:
                 row = latest[at - 1]
-                last, known = moves.end_mm[row], _known(moves, row, known)
+                last = moves.end_mm[row]
+                known = int(moves.known[told[at - 1]]) if told[at - 1] >= 0 else known
             found[number] = State(
                 lines[number - 1],
                 int(events.kind[i]),
@@ -122,15 +127,10 @@ def states(data: bytes, machine: Machine) -> list[State]:
                 streams[number - 1],
             )
         if len(moves) and latest[-1] >= 0:
-            last, known = moves.end_mm[latest[-1]], _known(moves, int(latest[-1]), known)
+            last = moves.end_mm[latest[-1]]
+            known = int(moves.known[told[-1]]) if told[-1] >= 0 else known
     assert sorted(found) == list(range(1, len(lines) + 1))
     return [found[k] for k in sorted(found)]
-
-
-def _known(moves: Moves, row: int, before: int) -> int:
-    """Axes that are known behind a move; one of the extruder by itself (G10) does not say."""
-    stays = not np.any(moves.start_mm[row, :3] != moves.end_mm[row, :3])
-    return before if stays and moves.known[row] == 0 else int(moves.known[row])
 
 
 def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:
