@@ -1,14 +1,18 @@
-"""One server for all tests here; and which programs were not there, said loudly."""
+"""What all tests here share: a server, a Klipper; and which programs were not there."""
 
 from __future__ import annotations
 
+import copy
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from stillpath.service.live.export import write_export
 
-from tests.integrations.klipper_host import NO_KLIPPER
+from stillpath.models.store import load_machine
+from tests.integrations.klipper_host import NO_KLIPPER, klipper_with_extra
 from tests.integrations.moonraker import NO_MOONRAKER
 from tests.integrations.octoprint import NO_OCTOPRINT
 from tests.integrations.running import Running
@@ -41,6 +45,25 @@ def alone(request: pytest.FixtureRequest) -> Iterator[None]:
         running: Running = request.getfixturevalue("running")
         for job in running.job_ids():
             running.client.delete(f"/v1/jobs/{job}")
+
+
+@pytest.fixture(scope="session")
+def klipper_live(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Klipper's host with the extra."""
+    return klipper_with_extra(tmp_path_factory.mktemp("klipper"))
+
+
+@pytest.fixture(scope="session")
+def export(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
+    """The export of a built-in machine, designed once."""
+    folder, made = tmp_path_factory.mktemp("exports"), {}
+
+    def of(name: str) -> dict[str, Any]:
+        if name not in made:
+            made[name] = write_export(load_machine(name), folder / f"{name}.json")
+        return copy.deepcopy(made[name])
+
+    return of
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

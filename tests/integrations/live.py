@@ -198,15 +198,19 @@ def shifted(found: Array, late: float, count: int) -> Array:
     return np.stack([np.interp(at, np.arange(len(row)), row) for row in found])
 
 
-def with_event(event: str) -> str:
-    """Two objects, with an event in fast lines and a stand behind the next one."""
+def with_event(script: str) -> str:
+    """Two objects, with an event in fast lines and a stand behind the next one.
+
+    `script`: one of `EVENTS`, or other lines.
+    """
+    event, script = script, EVENTS.get(script, script)
     lines = two_objects().split("\n")
     fast = [k for k, line in enumerate(lines) if line.startswith("G1 X") and "F9000" in line]
-    script = EVENTS[event].split("\n")
+    happens = script.split("\n")
     if event == "CANCEL_PRINT":
-        return "\n".join([*lines[: fast[12] + 1], *script, ""])
+        return "\n".join([*lines[: fast[12] + 1], *happens, ""])
     for k in reversed(fast[3::9]):
-        lines[k + 1 : k + 2] = [*script, lines[k + 1], "G4 P1500"]
+        lines[k + 1 : k + 2] = [*happens, lines[k + 1], "G4 P1500"]
     return "\n".join(lines)
 
 

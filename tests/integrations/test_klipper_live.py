@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -10,18 +9,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stillpath.service.live.export import export_digest
+from stillpath.service.pipeline.options import Options
+from stillpath.service.pipeline.road import compensate_file
 
-from stillpath.applications.live.export import export_digest, write_export
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.options import Options
 from tests.integrations.interrupted import MACROS, USERS, asked, homed, two_objects
 from tests.integrations.klipper_host import (
     NO_KLIPPER,
     PYTHON,
     Steps,
-    klipper_with_extra,
     printer_cfg,
     steps_of,
 )
@@ -45,37 +43,19 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLI
 MACHINES = ("ender3", "voron-v24-250", "voron-v0", "annex-k3")
 
 
-@pytest.fixture(scope="module")
-def klipper(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return klipper_with_extra(tmp_path_factory.mktemp("klipper"))
-
-
-@pytest.fixture(scope="module")
-def export(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
-    """The export of a built-in machine, designed once."""
-    folder, made = tmp_path_factory.mktemp("exports"), {}
-
-    def of(name: str) -> dict[str, Any]:
-        if name not in made:
-            made[name] = write_export(load_machine(name), folder / f"{name}.json")
-        return copy.deepcopy(made[name])
-
-    return of
-
-
 @pytest.mark.parametrize("file", FILES)
 @pytest.mark.parametrize("name", MACHINES)
 def test_steps_are_the_filtered_plan(
     name: str,
     file: str,
-    klipper: Path,
+    klipper_live: Path,
     export: Callable[[str], dict[str, Any]],
     tmp_path: Path,
 ) -> None:
     if name == "voron-v0" and file == "gear":
         pytest.skip("does not fit on its bed")
     machine, given = homed(load_machine(name)), export(name)
-    prints = both(FILES[file](), machine, given, tmp_path, klipper)
+    prints = both(FILES[file](), machine, given, tmp_path, klipper_live)
     assert f"stillpath: on for {name}; limited 0.000 s" in prints.log
 
     corexy = machine.kinematics == "corexy"
@@ -99,12 +79,12 @@ def test_steps_are_the_filtered_plan(
 def test_no_step_is_lost_whatever_happens(
     name: str,
     event: str,
-    klipper: Path,
+    klipper_live: Path,
     export: Callable[[str], dict[str, Any]],
     tmp_path: Path,
 ) -> None:
     machine = homed(load_machine(name))
-    prints = both(with_event(event), machine, export(name), tmp_path, klipper)
+    prints = both(with_event(event), machine, export(name), tmp_path, klipper_live)
     assert "stillpath: " + ("off" if event == "off" else "on") + " for" in prints.log
     assert "passing through" not in prints.log
     assert stands(prints.live) == stands(prints.plain)
@@ -115,12 +95,12 @@ def test_no_step_is_lost_whatever_happens(
 
 
 def test_limits_bring_the_plan_back(
-    klipper: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
+    klipper_live: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
     machine, given = homed(load_machine("ender3")), export("ender3")
     given["command"]["accel_mm_s2"] = 5200.0
     given["digest"] = export_digest(given)
-    prints = both(two_objects(), machine, given, tmp_path, klipper)
+    prints = both(two_objects(), machine, given, tmp_path, klipper_live)
     assert "limited 0.000 s" not in prints.log
     first = (round(print_begins(prints.plain.time_s) * 1e3) - 500) * FINE
     plan, found = (s.sampled(1e-3 / FINE)[:, first:] for s in (prints.plain, prints.live))
@@ -131,14 +111,14 @@ def test_limits_bring_the_plan_back(
 
 
 def test_a_compensated_file_is_not_compensated_twice(
-    klipper: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
+    klipper_live: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
     machine = homed(load_machine("ender3"))
     (tmp_path / "in.gcode").write_text(two_objects())
     made = tmp_path / "out.gcode"
     compensate_file(tmp_path / "in.gcode", made, machine, Options(robust="off"))
     more = f"[force_move]\nenable_force_move: True\n{USERS}\n{MACROS}"
-    prints = both(made.read_text(), machine, export("ender3"), tmp_path, klipper, more)
+    prints = both(made.read_text(), machine, export("ender3"), tmp_path, klipper_live, more)
     # It stands aside for SET_INPUT_SHAPER, so that there the head stands a little longer.
     wanted = stands(prints.plain)
     assert [place for place in stands(prints.live) if place in wanted] == wanted
@@ -209,7 +189,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], str], str]] = {
 @pytest.mark.parametrize("what", HOSTILE)
 def test_bad_exports_are_refused_and_klipper_prints(
     what: str,
-    klipper: Path,
+    klipper_live: Path,
     export: Callable[[str], dict[str, Any]],
     tmp_path: Path,
 ) -> None:
@@ -218,7 +198,7 @@ def test_bad_exports_are_refused_and_klipper_prints(
     text = "G28\nG90\nG1 X50 Y20 F9000\nSTILLPATH ENABLE=1\nG1 X20 Y60\nSTILLPATH_STATUS\n"
     bad = change(export("ender3"))
     (tmp_path / "export.json").write_text(bad)
-    prints = _with_file(text, machine, tmp_path, klipper)
+    prints = _with_file(text, machine, tmp_path, klipper_live)
     log = (tmp_path / "klippy.log").read_text()
     assert "Klipper moves as without it" in log
     assert reason in log
@@ -227,22 +207,22 @@ def test_bad_exports_are_refused_and_klipper_prints(
     assert end != home
 
 
-def _with_file(text: str, machine: Machine, place: Path, klipper: Path) -> Steps:
+def _with_file(text: str, machine: Machine, place: Path, klipper_live: Path) -> Steps:
     config = printer_cfg(machine, "[stillpath]\nfile: export.json")
-    return steps_of(text, config, place, klipper)
+    return steps_of(text, config, place, klipper_live)
 
 
-def test_a_missing_export_is_said(klipper: Path, tmp_path: Path) -> None:
-    _with_file("G28\nSTILLPATH_STATUS\n", homed(load_machine("ender3")), tmp_path, klipper)
+def test_a_missing_export_is_said(klipper_live: Path, tmp_path: Path) -> None:
+    _with_file("G28\nSTILLPATH_STATUS\n", homed(load_machine("ender3")), tmp_path, klipper_live)
     assert "cannot read export.json" in (tmp_path / "klippy.log").read_text()
 
 
 def test_an_emergency_stop_stays_one(
-    klipper: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
+    klipper_live: Path, export: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
     machine = homed(load_machine("ender3"))
     with pytest.raises(AssertionError):
-        print_with("G28\nG1 X50 F9000\nM112\n", machine, export("ender3"), tmp_path, klipper)
+        print_with("G28\nG1 X50 F9000\nM112\n", machine, export("ender3"), tmp_path, klipper_live)
     log = (tmp_path / "klippy.log").read_text()
     assert "Shutdown due to M112 command" in log
     assert "stillpath.py" not in log

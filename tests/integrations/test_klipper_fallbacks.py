@@ -1,0 +1,190 @@
+"""When the extra cannot do its work: in Klipper's own host, what its motors do then.
+
+Whatever happens, Klipper runs on, no motor jumps, and at every stand the motors are where Klipper's
+own would be.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from stillpath.service.live.export import export_digest
+
+from stillpath.models.machine import Machine
+from stillpath.models.store import load_machine
+from tests.integrations.interrupted import asked, homed, two_objects
+from tests.integrations.klipper_host import CHECKOUT, NO_KLIPPER, PYTHON, printer_cfg, steps_of
+from tests.integrations.live import (
+    MORE,
+    SECTION,
+    Pair,
+    both,
+    print_with,
+    stands,
+    with_event,
+)
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLIPPER)]
+
+Export = Callable[[str], dict[str, Any]]
+
+TROUBLE = """
+import time
+def load_config(config):
+    printer, what = config.get_printer(), config.get("what")
+    def ready():
+        extra = printer.lookup_object("stillpath")
+        if what == "slow":
+            push, filter = extra.filter.push, extra.filter
+            def slowly(until):
+                pieces = push(until)
+                end = time.perf_counter() + 0.7e-3 * len(pieces)
+                while time.perf_counter() < end:
+                    pass
+                return pieces
+            extra.filter.push = slowly
+        elif what == "late":
+            extend = extra.filter._extend
+            extra.filter._extend = lambda size: extend(size + 500)
+    printer.register_event_handler("klippy:ready", ready)
+    return ready
+"""
+"""An extra of Klipper that makes trouble: computing takes .7 s for each s; the plan is taken for
+known .5 s further than Klipper promises, so that moves come late."""
+SHAPER_OFF = "SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
+SHAPER_ON = "SET_INPUT_SHAPER SHAPER_FREQ_X=40 SHAPER_FREQ_Y=35"
+
+
+@pytest.fixture(scope="session")
+def troubled(klipper_live: Path) -> Path:
+    (klipper_live / "klippy/extras/trouble.py").write_text(TROUBLE)
+    return klipper_live
+
+
+def check(prints: Pair, machine: Machine) -> None:
+    """No shutdown, no step lost, nothing that the motors do not bear or Klipper did not ask for."""
+    assert "Traceback" not in prints.log
+    assert "shutdown" not in prints.log
+    assert stands(prints.live) == stands(prints.plain)
+    bears, plain, live = machine.command, asked(prints.plain, machine), asked(prints.live, machine)
+    assert live.step_mm_s <= max(bears.speed_step_mm_s, 1.05 * plain.step_mm_s)
+    assert live.ramp_mm_s <= max(10e-3 * bears.accel_mm_s2, 1.05 * plain.ramp_mm_s)
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+@pytest.mark.parametrize(
+    ("what", "said"), [("slow", "this computer is too slow"), ("late", "a move came later")]
+)
+def test_it_passes_the_plan_through_where_it_falls_behind(
+    what: str, said: str, name: str, troubled: Path, export: Export, tmp_path: Path
+) -> None:
+    if what == "late" and CHECKOUT is not None:
+        pytest.skip("without a board, Klipper of 2026 makes steps when it knows all moves")
+    machine = homed(load_machine(name))
+    more = f"[trouble]\nwhat: {what}\n"
+    text = with_event("G4 P100").replace("G90\n", "G90\nSTILLPATH_STATUS\n", 1)
+    prints = troubled_pair(text, machine, export(name), tmp_path, troubled, more)
+    assert f"stillpath: passing through: {said}" in prints.log
+    assert f"stillpath: passing for {name}: {said}" in prints.log
+    check(prints, machine)
+
+
+def troubled_pair(
+    text: str, machine: Machine, given: dict[str, Any], place: Path, host: Path, more: str
+) -> Pair:
+    """Print without the extra, and with it and something that troubles it."""
+    plain = "\n".join(line for line in text.split("\n") if not line.startswith("STILLPATH"))
+    first = steps_of(plain, printer_cfg(machine, MORE), place, host)
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
+    second = print_with(text, machine, given, place, host, MORE + more)
+    return Pair(first, second, (place / "klippy.log").read_text())
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+@pytest.mark.parametrize("share", [0.3, 0.8, 1.2])
+@pytest.mark.parametrize("field", ["accel_mm_s2", "velocity_mm_s"])
+def test_limits_below_the_files_own(
+    field: str, share: float, name: str, klipper_live: Path, export: Export, tmp_path: Path
+) -> None:
+    machine, given = homed(load_machine(name)), export(name)
+    own = {"accel_mm_s2": given["limits"]["max_accel_mm_s2"], "velocity_mm_s": 150.0}
+    given["command"][field] = share * own[field]
+    given["digest"] = export_digest(given)
+    prints = both(with_event("G4 P100"), machine, given, tmp_path, klipper_live)
+    assert f"stillpath: on for {name}" in prints.log
+    check(prints, machine)
+    # Nothing is added to what the plan asks for already.
+    plain, live = asked(prints.plain, machine), asked(prints.live, machine)
+    if field == "accel_mm_s2":
+        most = max(share, 1.0) * own[field]
+        assert live.ramp_mm_s <= max(1.05 * plain.ramp_mm_s, 10e-3 * np.sqrt(2.0) * most)
+
+
+@pytest.mark.parametrize("kinematics", ["corexy", "hybrid_corexy"])
+def test_other_kinematics_are_refused(
+    kinematics: str, klipper_live: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    (tmp_path / "stillpath.json").write_text(json.dumps(export("ender3")))
+    config = printer_cfg(machine).replace("kinematics: cartesian", f"kinematics: {kinematics}")
+    text = "G28\nG90\nG1 X20 Y30 F9000\n"
+    plain = steps_of(text, config, tmp_path, klipper_live)
+    live = steps_of(f"{text}STILLPATH_STATUS\n", f"{config}{SECTION}\n", tmp_path, klipper_live)
+    log = (tmp_path / "klippy.log").read_text()
+    assert "the export is for cartesian, this printer's kinematics are" in log
+    assert "stillpath: refused" in log
+    assert "Traceback" not in log
+    for ours, theirs in zip(live.place_mm, plain.place_mm, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.skipif(CHECKOUT is None, reason="the [input_shaper] of the package does not start")
+@pytest.mark.parametrize("starts_on", [True, False])
+@pytest.mark.parametrize("event", [SHAPER_ON, SHAPER_OFF, f"{SHAPER_ON}\nG4 P200\n{SHAPER_OFF}"])
+def test_beside_klippers_own_shaper(
+    event: str, starts_on: bool, klipper_live: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    section = "[input_shaper]\nshaper_type: mzv\n"
+    section += "shaper_freq_x: 40\nshaper_freq_y: 35\n" if starts_on else ""
+    macro = "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400\n"
+    config = printer_cfg(machine, MORE)
+    assert macro in config
+    config = config.replace(macro, section)
+    (tmp_path / "stillpath.json").write_text(json.dumps(export("ender3")))
+    text = with_event(event)
+    plain = steps_of(text, config, tmp_path, klipper_live)
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
+    live = steps_of(text, f"{config}{SECTION}\n", tmp_path, klipper_live)
+    log = (tmp_path / "klippy.log").read_text()
+    if starts_on or event == SHAPER_ON:
+        assert "stillpath: off: input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0" in log
+    assert ("off" if event == SHAPER_ON else "on") + " for ender3" in log
+    check(Pair(plain, live, log), machine)
+
+
+@pytest.mark.parametrize("command", ["RESTART", "FIRMWARE_RESTART"])
+def test_klipper_starts_again(
+    command: str, klipper_live: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    (tmp_path / "stillpath.json").write_text(json.dumps(export("ender3")))
+    config = printer_cfg(machine, MORE).replace("[mcu]\n", "[mcu]\nrestart_method: command\n")
+    # The host reads blocks of 4096 bytes, and what it has read is gone with it.
+    before = f"{two_objects(1)}STILLPATH_STATUS\n{command}\n"
+    before += ";" * (-len(before) % 4096 - 1) + "\n"
+    without = before.replace("STILLPATH", ";TILLPATH")
+    plain = steps_of(f"{without}{two_objects(1)}", config, tmp_path, klipper_live)
+    (tmp_path / "klippy.log").unlink()
+    text = f"{before}{two_objects(1)}SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
+    live = steps_of(text, f"{config}{SECTION}\n", tmp_path, klipper_live)
+    log = (tmp_path / "klippy.log").read_text()
+    assert log.count("Start printer at") == 2
+    assert log.count("stillpath: on for ender3") == 2
+    # What the board was sent is that of the second start alone.
+    check(Pair(plain, live, log), machine)
