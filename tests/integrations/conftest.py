@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from stillpath.service.live.export import write_export
 
+from stillpath.applications.live.export import write_export
 from stillpath.models.store import load_machine
 from tests.integrations.klipper_host import NO_KLIPPER, klipper_with_extra
 from tests.integrations.moonraker import NO_MOONRAKER

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stillpath.service.live.export import export_digest
 
+from stillpath.applications.live.export import export_digest
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from tests.integrations.interrupted import asked, homed, two_objects

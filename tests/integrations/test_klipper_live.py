@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stillpath.service.live.export import export_digest
-from stillpath.service.pipeline.options import Options
-from stillpath.service.pipeline.road import compensate_file
 
+from stillpath.applications.live.export import export_digest
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
 from tests.integrations.interrupted import MACROS, USERS, asked, homed, two_objects
 from tests.integrations.klipper_host import (
     NO_KLIPPER,
