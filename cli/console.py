@@ -93,8 +93,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     if result.slicer_time_s is not None:
         console.print(
-            f"{result.slicer or 'the slicer'} says {result.slicer_time_s:.0f} s for the file as it "
-            "came"
+            f"{result.slicer or 'the slicer'} says {result.slicer_time_s:.0f} s for the sliced file"
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)

@@ -182,9 +182,10 @@ def move(
             # Only the extruder moves: M220 and M221 do not hold.
             at = (f[F_LAST + 3] - f[F_BASE + 3]) / f[F_EXTRUDE_FACTOR]
             f[F_LAST + 3] += length - at if absolute else length
-            if f[F_EXTRUDE_FACTOR] != 1.0 and absolute:
+            if f[F_EXTRUDE_FACTOR] != 1.0:
                 settle(f, i, rows)
-                f[F_BASE + 3] = f[F_LAST + 3] - scaled
+                reads = length if absolute else at + length
+                f[F_BASE + 3] = f[F_LAST + 3] - reads * f[F_EXTRUDE_FACTOR]
             f[F_SPEED] = f[F_SPEED] / (f[F_SPEED_FACTOR] * 60.0)
         elif absolute:
             f[F_LAST + 3] = scaled + f[F_BASE + 3]

@@ -364,7 +364,9 @@ class LastCheck:
             self._count(wanted.line)
         else:
             self._kept += 1
-        self._original.perhaps.clear()
+        # A line that sets the shaper may have been ours: those before the file's own may still come.
+        if _SHAPER.search(wanted.code) is None:
+            self._original.perhaps.clear()
         self._original.forget_ahead()
         self._wanted = None
         self._begun.append(self._original.place())

@@ -62,6 +62,9 @@ CASES = {
         "M82\nG92 E0\nG1 E-5\nG1 X90.3 Y90.015 E-4.9\nG1 E-5.9\nG10\nG92 E0\n"
         "G1 X90.598 Y90.045 E.015"
     ),
+    "E relative and scaled, then absolute": (
+        "M221 S80\nM83\nG1 X60 E1\nG1 E1\nG1 Y60 E.5\nM82\nG1 X90 E0\nG1 Y80 E3\nM400\nG1 Y60 E4"
+    ),
     "M220 is not for the extruder alone": "M220 S80\nG1 X60 E2.2\nG1 E-1\nG1 Y60 E1\nG1 E1\nM400",
 }
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
