@@ -364,7 +364,7 @@ class LastCheck:
             self._count(wanted.line)
         else:
             self._kept += 1
-        # A line that sets the shaper may have been ours: those before the file's own may still come.
+        # A line for the shaper may be ours: lines before the file's own may still come.
         if _SHAPER.search(wanted.code) is None:
             self._original.perhaps.clear()
         self._original.forget_ahead()
