@@ -59,7 +59,7 @@ _TOO_LARGE = {("voron-v0", "gear")}
 def main() -> None:
     parser = argparse.ArgumentParser(description="The extra in Klipper's own host.")
     parser.add_argument("--machines", nargs="+", default=list(_MACHINES))
-    parser.add_argument("--files", nargs="+", default=list(FILES), choices=list(FILES))
+    parser.add_argument("--files", nargs="*", default=list(FILES), choices=list(FILES))
     parser.add_argument("--events", nargs="*", default=list(EVENTS), choices=list(EVENTS))
     parser.add_argument("--event-machines", nargs="*", default=["ender3", "voron-v24-250"])
     parser.add_argument("--minutes", type=float, default=2.0, help="of print for computing time")

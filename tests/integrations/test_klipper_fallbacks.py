@@ -7,6 +7,7 @@ own would be.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from tests.integrations.live import (
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLIPPER)]
 
+MOVES = 700
 Export = Callable[[str], dict[str, Any]]
 
 TROUBLE = """
@@ -56,6 +58,26 @@ def load_config(config):
 """
 """An extra of Klipper that makes trouble: computing takes .7 s for each s; the plan is taken for
 known .5 s further than Klipper promises, so that moves come late."""
+WATCH = """
+import gc, logging, tracemalloc
+def load_config(config):
+    printer = config.get_printer()
+    extra = printer.lookup_object("stillpath")
+    def watch(gcmd):
+        gc.collect()
+        ours = tracemalloc.Filter(True, "*/extras/stillpath/*")
+        traces = tracemalloc.take_snapshot().filter_traces([ours]).traces
+        held = extra.filter
+        objects = sum(map(len, (held.x, held.dx, held.allowed, held.plan.phases, held.blocked)))
+        count = sum(1 for thing in gc.get_objects() if "stillpath" in type(thing).__module__)
+        size = sum(trace.size for trace in traces)
+        logging.info("watch: %d %d %d %d", size, len(traces), objects, count)
+    printer.lookup_object("gcode").register_command("WATCH", watch)
+    tracemalloc.start(1)
+    return watch
+"""
+"""An extra of Klipper that counts what Stillpath's holds: bytes and blocks of Python's memory that
+its modules asked for, samples and phases in its buffers, objects of its classes."""
 SHAPER_OFF = "SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
 SHAPER_ON = "SET_INPUT_SHAPER SHAPER_FREQ_X=40 SHAPER_FREQ_Y=35"
 
@@ -188,3 +210,29 @@ def test_klipper_starts_again(
     assert log.count("stillpath: on for ender3") == 2
     # What the board was sent is that of the second start alone.
     check(Pair(plain, live, log), machine)
+
+
+@pytest.mark.skipif(CHECKOUT is not None, reason="without a board, its plan waits for a stand")
+def test_its_memory_does_not_grow(klipper_live: Path, export: Export, tmp_path: Path) -> None:
+    machine = homed(load_machine("ender3"))
+    (klipper_live / "klippy/extras/watch.py").write_text(WATCH)
+    lines = ["G28", "G90", "G1 X20 Y20 F12000"]
+    for k in range(MOVES):
+        lines.append(f"G1 X{80 - 60 * (k % 2)} Y{20 + k % 60} F12000")
+        if k % 50 == 49:
+            # Limits in force, moves that pass, stands: every buffer is used.
+            lines += ["G4 P1500", "SET_VELOCITY_LIMIT ACCEL=60000", "G1 X50 Y50", "WATCH"]
+            lines += ["SET_VELOCITY_LIMIT ACCEL=5000"]
+    print_with(
+        "\n".join([*lines, "M400", ""]),
+        machine,
+        export("ender3"),
+        tmp_path,
+        klipper_live,
+        "[watch]\n",
+    )
+    log = (tmp_path / "klippy.log").read_text()
+    found = np.array([row.split() for row in re.findall(r"watch: ([\d ]+)", log)], int)
+    assert len(found) == MOVES // 50
+    first, last = found[3 : len(found) // 2], found[len(found) // 2 :]
+    assert last.max(axis=0).tolist() == pytest.approx(first.max(axis=0).tolist(), rel=0.02)
