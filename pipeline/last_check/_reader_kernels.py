@@ -5,14 +5,23 @@ A state is an array of `SIZE` floats; nan is what nobody knows. Text ends with a
 
 from __future__ import annotations
 
-from math import fabs, isnan, nan, sqrt
+from math import atan2, fabs, isnan, nan, sqrt
 from typing import Any
 
 import numpy as np
 
 from stillpath.models.jit import kernel
 
-__all__ = ["carry_out_moves", "compare", "compare_moves", "move", "ours", "settle", "way_xy_mm"]
+__all__ = [
+    "carry_out_moves",
+    "compare",
+    "compare_moves",
+    "may_be_no_arc",
+    "move",
+    "ours",
+    "settle",
+    "way_xy_mm",
+]
 
 X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
 """Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
@@ -28,6 +37,7 @@ WORDS, WITHIN = 15, 32
 _POWERS = 10.0 ** np.arange(16)
 _LONGEST = 90
 """Marlin's buffer takes 95 characters."""
+_LEAST_ARC_MM = 0.01
 _FEED_MM_MIN, _FEED_SHARE = 1e-4, 2e-6
 
 
@@ -149,6 +159,26 @@ def move(state: Any, words: Any, mask: int) -> None:
             state[FED] = state[E] = nan
     if mask & 16:
         state[F] = words[4] * state[UNIT]
+
+
+@kernel(force_inline=True, allocates=False)
+def may_be_no_arc(state: Any, words: Any, mask: int) -> bool:
+    """Whether a firmware may take an arc with a centre for one of no length, and pass over it.
+
+    Its end is then seen from the centre in the direction of its beginning, without being there.
+    """
+    i_mm = words[5] * state[UNIT] if mask & 32 else 0.0
+    j_mm = words[6] * state[UNIT] if mask & 64 else 0.0
+    x_mm = words[0] * state[UNIT] if mask & 1 else 0.0
+    y_mm = words[1] * state[UNIT] if mask & 2 else 0.0
+    if state[RELATIVE] != 1.0:
+        x_mm -= state[X] if mask & 1 else 0.0
+        y_mm -= state[Y] if mask & 2 else 0.0
+    cross = j_mm * (x_mm - i_mm) - i_mm * (y_mm - j_mm)
+    dot = -i_mm * (x_mm - i_mm) - j_mm * (y_mm - j_mm)
+    if x_mm == 0.0 and y_mm == 0.0:
+        return False  # a whole circle
+    return not sqrt(i_mm * i_mm + j_mm * j_mm) * atan2(fabs(cross), dot) > _LEAST_ARC_MM
 
 
 @kernel(force_inline=True, allocates=False)
@@ -315,6 +345,9 @@ def carry_out_moves(
             break
         lines += 1
         if mask > 31:
+            if not divides_extruder and may_be_no_arc(state, words, mask):
+                lines -= 1
+                break
             move(state, words, mask)
             if divides_extruder and mask & 8 and state[RELATIVE_E] != 1.0:
                 state[E] = state[FED] = nan

@@ -187,6 +187,9 @@ class LastCheck:
         if original.is_read:
             self._original.read_on()
         before, after = original.line, written.at
+        states = self._before.state, self._after.state
+        if np.isnan(sum(state[at.E] + state[at.FED] for state in states)):
+            self._original.forget_ahead()  # which counts filament from earlier on
         original.at, written.at, *counts, known, found = at.compare_moves(
             original.array,
             original.at,
@@ -421,6 +424,8 @@ class LastCheck:
         self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "behind"
     ) -> None:
         """Compare a state of the original with where the written file is."""
+        if np.isnan(before[at.FED] + self._after.state[at.FED]):
+            self._original.forget_ahead()  # which counts filament from earlier on
         found = at.compare(before, self._after.state, mask, self._place_mm, self._filament_mm)
         if found != at.SAME:
             raise self._differs(found, before, where, code, line, self._written.line)

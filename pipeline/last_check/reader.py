@@ -212,20 +212,26 @@ class Reader:
         return Kind.PERHAPS
 
     def _is_plain_arc(self, words: dict[int, float]) -> bool:
-        """Whether an arc ends where its words say: Marlin passes over one without a centre."""
+        """Whether an arc ends where its words say: Marlin passes over one of no length."""
         if not self._in_plane_xy or not words.keys() <= set(b"XYZEFIJR"):
             return False
         turned = any(words.get(letter, 0.0) != 0.0 for letter in b"IJ")
+        values = np.array([words.get(letter, 0.0) for letter in b"XYZEFIJ"])
+        mask = sum(1 << k for k, letter in enumerate(b"XYZEFIJ") if letter in words)
         if ord("R") not in words:
-            return turned
-        values = np.array([words.get(letter, 0.0) for letter in _AXES])
-        mask = sum(1 << k for k, letter in enumerate(b"XY") if letter in words)
+            if self.rules.divides_extruder:
+                return turned
+            nothing = at.may_be_no_arc.py_func(self.state, values, mask)  # type: ignore[attr-defined]
+            return turned and not nothing
+        mask &= 3
         way_mm = at.way_xy_mm.py_func(self.state, values, mask)  # type: ignore[attr-defined]
         return not turned and words[ord("R")] != 0.0 and way_mm > _STILL_MM
 
     def _command(self, code: bytes, name: bytes, rest: bytes) -> Kind:
         """Carry out a command that changes modes or the place, or forget."""
         rules, state = self.rules, self.state
+        if not name:  # odd: what stands in it may be carried out, or not
+            return self._forget(code, modes=_FURTHER.search(code) is not None)
         if rules.several and _FURTHER.search(rest):
             return self._forget(code, modes=True)
         if name in rules.arcs:
@@ -349,7 +355,10 @@ def _cut(code: bytes, rules: Rules) -> tuple[bytes, bytes] | None:
         number = found[2]
         if rules.leading_zeros:
             number = number.lstrip(b"0") or b"0"
-        return found[1] + number + found[3], code[found.end() :]
+        name = found[1] + number + found[3]
+        if rules.ignores_subcodes and name not in rules.harmless:
+            name = found[1] + number
+        return name, code[found.end() :]
     found = _LONG_NAME.match(code)
     return (found[0], code[found.end() :]) if found is not None else (b"", begin)
 

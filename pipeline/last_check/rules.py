@@ -44,6 +44,8 @@ class Rules:
     folds_case, leading_zeros : bool
         ``g1`` is G1; ``G01`` is G1, and G91 ends where its number does: Klipper's name goes on to
         the next letter.
+    ignores_subcodes : bool
+        G90.5 is G90 (Marlin).
     inches : bool
         G20 changes the unit.
     arcs : frozenset of bytes
@@ -77,6 +79,7 @@ class Rules:
     harmless: frozenset[bytes]
     folds_case: bool = True
     leading_zeros: bool = True
+    ignores_subcodes: bool = False
     inches: bool = False
     arcs: frozenset[bytes] = frozenset()
     positioning_sets_extruder: bool = False
@@ -110,6 +113,7 @@ def rules_of(firmware: Firmware) -> Rules:
         return Rules(
             harmless=_EVERYWHERE | _MARLIN,
             folds_case=firmware.case_insensitive,
+            ignores_subcodes=True,
             inches=firmware.inch_mode,
             arcs=arcs,
             positioning_sets_extruder=True,

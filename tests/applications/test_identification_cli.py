@@ -315,7 +315,7 @@ def test_ctrl_c_leaves_nothing(store: MachineStore, data: Path, folder: Path) ->
     before = tree(folder.parent)
     written = ["-o", str(folder / "out.json"), "--report", str(folder / "report"), "-m", "mine"]
     code = (
-        "import sys, cli.console as console, cli.main as cli; "
+        "import sys, stillpath.cli.console as console, stillpath.cli.main as cli; "
         "console._PLAIN_EVERY_S = 0.0; sys.exit(cli.run(sys.argv[1:]))"
     )
     process = subprocess.Popen(

@@ -330,7 +330,8 @@ def test_writers_beside_somebody_who_deletes(store: MachineStore, tmp_path: Path
 def test_a_killed_writer_leaves_a_readable_store(store: MachineStore, tmp_path: Path):
     root = tmp_path / "machines"
     code = (
-        "import sys; from pathlib import Path; from tests.service import test_machine_store as t; "
+        "import sys; from pathlib import Path; "
+        "from tests.applications import test_machine_store as t; "
         "print('go', flush=True); t.write_many(Path(sys.argv[1]), int(sys.argv[2]), 900)"
     )
     chance = random.Random(4)

@@ -57,6 +57,14 @@ CASES: list[tuple[str, Firmware, dict[str, float]]] = [
     ("N7 G1 X5*33", MARLIN, {"X": 5}),
     ("G1 X5 F100\nG1 X6 F0", MARLIN, {"F": 100}),
     ("G1 X0 Y0\nG2 X9 Y9", MARLIN, {"X": math.nan}),  # passed over: no centre
+    # Perhaps passed over: from its centre the end lies where the beginning does.
+    ("G1 X127.4 Y92.279\nG3 X100 Y104.303 I.082 J-.036", MARLIN, {"X": math.nan}),
+    ("G1 X0 Y0\nG2 X10 Y0 I5 J0", MARLIN, {"X": 10}),
+    ("G1 X0 Y0\nG2 X0 Y0 I5 J0", MARLIN, {"X": 0}),
+    # Numbers behind the point of a command's name are passed over.
+    ("M83\nG90.638\nG1 E5\nG1 E6", MARLIN, {"FED": 6}),
+    # What stands behind an odd character may be carried out, or not.
+    ("M82\nG1 E1\nM83\rG1 X3\nG1 E3", MARLIN, {"FED": math.nan}),
     # RepRapFirmware: an E behind a digit is an exponent, sums are checked, conditions hold lines.
     ("M83\nG91\nG1 E5\nG90\nG1 E5", REPRAP, {"FED": 10}),
     ("G1 X5 Y5\nG1X1Y1E2", REPRAP, {"X": math.nan}),
