@@ -257,7 +257,7 @@ def test_help_and_version_are_quick_and_light():
 def test_a_job_loads_only_what_it_needs():
     """Each of these costs every job a tenth of a second or more."""
     program = (
-        "import sys, cli.main, pipeline.compensate\n"
+        "import sys, stillpath.cli.main, stillpath.pipeline.compensate\n"
         "from stillpath.cli.machines import open_machines\n"
         "open_machines().for_job('ender3', files=True)\n"
         "heavy = ('scipy.signal', 'scipy.stats', 'pydantic_settings', 'fastapi', 'sqlite3')\n"
