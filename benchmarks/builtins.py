@@ -4,7 +4,7 @@
 
 Prints, axis by axis, what the fit leaves, its modes and its members, and whether the machine that
 is shipped says the same; exits with 1 if one does not. With `--write` the documents are made anew:
-`benchmarks/reference shapers.py --write` goes after it.
+`benchmarks/reference_shapers.py --write` goes after it.
 """
 
 from __future__ import annotations

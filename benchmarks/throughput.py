@@ -134,7 +134,7 @@ def main() -> None:
     # Caches of one core are not another's.
     with contextlib.suppress(AttributeError, OSError):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    parser = argparse.ArgumentParser(description="Speed and memory of the road.")
+    parser = argparse.ArgumentParser(description="Speed and memory of the pipeline.")
     parser.add_argument("file", nargs="?", help=f"path, or corpus name (default {_FILE})")
     parser.add_argument("--machine", default="ender3")
     parser.add_argument("--tolerance-um", type=float, default=2.0)

@@ -1,1 +1,1 @@
-"""Commands that belong to no room of their own, and what all commands take and check."""
+"""The command line: one module for each command or group of commands."""

@@ -41,7 +41,10 @@ def compensate(
         Path | None, typer.Option("--output", "-o", metavar="OUT", help="The file to write.")
     ] = None,
     in_place: Annotated[
-        bool, typer.Option("--in-place", help="Write over IN, as slicers ask of their scripts.")
+        bool,
+        typer.Option(
+            "--in-place", help="Overwrite IN, as slicers expect of post-processing scripts."
+        ),
     ] = False,
     method: Annotated[str, typer.Option(help=METHODS)] = "fbf",
     basis: Annotated[
@@ -58,7 +61,7 @@ def compensate(
         float | None,
         typer.Option(
             help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
-            "takes longer. [default: .09 with a set, else 1]"
+            "takes longer. [default: 1]"
         ),
     ] = None,
     tolerance_um: Annotated[

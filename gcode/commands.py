@@ -1,4 +1,4 @@
-"""Commands that Python carries out and that several firmwares have."""
+"""Command handlers in Python that several firmwares share."""
 
 from __future__ import annotations
 

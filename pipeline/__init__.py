@@ -1,1 +1,1 @@
-"""The pipeline: a file in, runs, a file and its figures out; without web framework or database."""
+"""A file in, a compensated and checked file and its figures out; no web framework, no database."""

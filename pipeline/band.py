@@ -1,4 +1,4 @@
-"""How much of a planned motion lies beyond the frequencies for which a machine's model stands."""
+"""How much of a planned motion lies beyond the band in which a machine's model is valid."""
 
 from __future__ import annotations
 

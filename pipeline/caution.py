@@ -1,4 +1,4 @@
-"""How much of a machine's compensation its plant set can bear: the promise of the default.
+"""Blend fbf with a shaper so that no likely plant does worse: what `robust=auto` decides.
 
 On the plants that explain the measurement a file shall print no worse than with the shaper that the
 same measurement leads to. Before anything is printed, both commands are tried on the reference

@@ -95,8 +95,8 @@ def compensate_file(
     ----------
     source, target : Path
         Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
-        name says so and the source's does not. It is written beside itself and renamed when it is
-        complete; the source is only read. They may be the same file.
+        name says so and the source's does not. It is written next to itself, under another name,
+        and renamed when it is complete; the source is only read. They may be the same file.
     machine : Machine
     options : Options
     cache_dir : Path, optional
@@ -259,7 +259,7 @@ class _Job:
             with self._clock.stage("design"):
                 self._work = PieceCompensator(machine, options)
         self._say("tuning the shaper to compare with", 0.0)
-        with self._clock.stage("yardstick"):
+        with self._clock.stage("reference shaper"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
             chosen = caution_for(
                 machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S

@@ -1,4 +1,4 @@
-"""Planned motion that arrives in blocks, with the command that the extra of Klipper makes of it."""
+"""Planned motion in blocks, with the command that the Klipper extra computes from it."""
 
 from __future__ import annotations
 

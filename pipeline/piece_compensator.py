@@ -256,7 +256,7 @@ class PieceCompensator:
             encoded = self.encoder.encode(piece, timeline, segments)
             if len(encoded.row) == 0:
                 line = int(piece.moves.line[0])
-                raise Unfit(f"line {line}: all moves round to nothing on the grid of a file")
+                raise Unfit(f"line {line}: all moves round to zero at the resolution of a file")
             step = self._speed_step(encoded.phases)
             if step <= limit:
                 return segments, encoded

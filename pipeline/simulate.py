@@ -137,7 +137,7 @@ def simulate_file(
     motion is also what the extra of Klipper makes of it.
     """
     clock = StageClock()
-    with clock.stage("yardstick"):
+    with clock.stage("reference shaper"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)

@@ -1,4 +1,4 @@
-"""What adds up along a file on its way, and what is to be said of it."""
+"""Running totals of one file, and the warnings that follow from them."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def write_trajectories(
         names = _SHOWN[1:]
     with (
         _table(target, format, names) as table,
-        tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-road-") as folder,
+        tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-trajectories-") as folder,
     ):
         window = _Window(table, names, start_s, stop_s)
         try:

@@ -1,4 +1,4 @@
-"""Whether a compensated piece may be printed: executed as commanded, and better than it came."""
+"""Accept or reject a compensated piece: executed as commanded, and no worse than as sliced."""
 
 from __future__ import annotations
 

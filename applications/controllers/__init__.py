@@ -1,1 +1,1 @@
-"""Add-on controllers of closed-loop machines: options, design, figures, page, commands."""
+"""Add-on controllers of closed-loop machines: options, design, figures, page."""

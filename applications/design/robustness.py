@@ -1,4 +1,4 @@
-"""What commands for the reference motion leave when one axis is not the one that was measured.
+"""Residual error of the reference motion when one axis differs from the measured one.
 
 Every command is designed once. This axis' plant is then replaced, by itself with all frequencies
 scaled together and by the members of its set, while the other axis stays nominal.

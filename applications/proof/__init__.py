@@ -1,1 +1,1 @@
-"""Proof on metal: prints that show compensated beside planned motion, and logs read back."""
+"""Validation on the real printer: test prints with a compensated half, and logs read back."""

@@ -143,7 +143,7 @@ class _Job:
         self._before, self._unmodelled = stated.modelled, stated.unknown_types
         self._doubts = doubts(source, machine, options.dialect)
         self._say("tuning the shaper to compare with", 0.0)
-        with self._clock.stage("yardstick"):
+        with self._clock.stage("reference shaper"):
             self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
 
     def run(

@@ -61,7 +61,7 @@ class Measurement:
         Channels to measure, where it is not all of these.
     beside : callable, optional
         Gives the errors of the other channels at measured points, (2, n): `before` and `shaper`,
-        measured earlier (`pipeline.earlier`), for what is shown along the path.
+        measured earlier (`pipeline.advising.earlier`), for what is shown along the path.
     noted : callable, optional
         Is given measured points with their errors.
     take_layer : callable, optional

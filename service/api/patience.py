@@ -1,4 +1,4 @@
-"""Bodies that stop coming: nobody waits for their senders without end, or lets others wait."""
+"""Timeouts for request bodies that stall: senders cannot hold places, or others up."""
 
 from __future__ import annotations
 

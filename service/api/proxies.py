@@ -1,4 +1,4 @@
-"""Who a caller is behind proxies: what they say of him counts only from those that are trusted."""
+"""The client address behind proxies; only trusted proxies are believed."""
 
 from __future__ import annotations
 

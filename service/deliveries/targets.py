@@ -1,4 +1,4 @@
-"""Where the service may send to, so that nobody can make it talk to whom he cannot reach himself.
+"""Which addresses the service may contact, so that nobody can send it into private networks.
 
 An address is checked when a job is handed in, and again when it is sent to; then the name is
 resolved once, what it stands for is checked, and exactly that is connected to.

@@ -1,4 +1,4 @@
-"""The work itself, in a worker process: claim a job, do it, put its files away, say so.
+"""One attempt at a job, in a worker process: claim it, run it, store its files, report.
 
 Nothing but the job's id travels through Dask; everything else is read from database and storage.
 An attempt's files lie under a prefix of its own, so that two attempts never meet, and the row

@@ -38,8 +38,8 @@ def compensate(
     Parameters
     ----------
     source, target : path
-        G-code, binary G-code or 3MF. `target` is written beside itself and renamed when it is
-        complete; it may be `source`.
+        G-code, binary G-code or 3MF. `target` is written next to itself, under another name, and
+        renamed when it is complete; it may be `source`.
     machine : Machine or str
         A machine, the name of a built-in one, or a path to a machine's document.
     **options

@@ -24,7 +24,7 @@ __all__ = ["KlipperAdapter"]
 
 
 class KlipperAdapter:
-    """Kit of a Klipper machine; see `gcode.firmware.base.FirmwareAdapter`."""
+    """Adapter of a Klipper machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     step_mm = (0.0, 0.0, 0.0, 0.0)
     shortest_move_mm = 0.0

@@ -1,4 +1,4 @@
-"""Klipper's words around a stream."""
+"""G-code that Klipper needs before and after a stream."""
 
 from __future__ import annotations
 

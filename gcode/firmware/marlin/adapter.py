@@ -43,7 +43,7 @@ _ALTERNATIVE = (
 
 
 class MarlinAdapter:
-    """Kit of a Marlin machine; see `gcode.firmware.base.FirmwareAdapter`."""
+    """Adapter of a Marlin machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     extruder_alone_stops = False
 

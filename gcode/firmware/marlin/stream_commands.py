@@ -1,4 +1,4 @@
-"""Marlin's words around a stream."""
+"""G-code that Marlin needs before and after a stream."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ _JERKS = ("jerk_x_mm_s", "jerk_y_mm_s", "max_jerk_x_mm_s", "max_jerk_y_mm_s")
 
 
 class RepRapAdapter:
-    """Kit of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareAdapter`."""
+    """Adapter of a RepRapFirmware machine; see `gcode.firmware.base.FirmwareAdapter`."""
 
     extruder_alone_stops = False
     shortest_move_mm = 0.0

@@ -1,4 +1,4 @@
-"""RepRapFirmware's words around a stream."""
+"""G-code that RepRapFirmware needs before and after a stream."""
 
 from __future__ import annotations
 
