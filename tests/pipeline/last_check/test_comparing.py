@@ -358,10 +358,49 @@ SHORT = (
     "M105\n"
 )
 
+FILAMENT = """\
+G28
+G90
+M83
+G1 X100 Y100 Z1 F6000
+G1 X99.946 Y98 F1800
+g1X99.924Y99.80280E0.16935
+G1Y100.900E0.01378
+G1 Y101 E0.04448
+G1 X99.085 Y99.926
+G21 ; said
+G1 X99.770 Y100.02734 E0.03980 F18000
+N11 G1 X100.932 Y99 E0.03921 F6000
+M83
+N13 G91
+SAVE_GCODE_STATE NAME=s
+g1X98.93533
+G0 X100.84841 Y100.046 E0.11527 F600
+G92 X10 Y10
+G3 X99.89373 Y89.5 R0.100 E.05
+G1 X99.596 Y100.04945
+M82
+G1 X100.18970 Y71.9 E-0.67651
+G1 X101.0 F6000
+G0 X0.0000001 F6000
+G3 X99.555 Y100.0 I0.542 J-0.915 E.05
+M204 P1 T1
+G1X101.65129Y99.972
+G01X100.0Y99.965E0.36068F30
+G01 X99.581 Y98.75430 F1800
+M220 S80
+; TYPE:External perimeter
+g1 X97 Y101.022 E0.43523
+G1X100.64044Y102.24233E-0.31294
+; LAYER_CHANGE
+"""
+
 
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
+        # Filament is counted anew at a line between two streams.
+        pytest.param("marlin", FILAMENT, id="filament"),
         # A line that stands still moves what the short one before it left.
         pytest.param("marlin", SHORT, id="short"),
         # Several lines of one text, and nobody knows which of them moved.
