@@ -307,8 +307,8 @@ class Reader:
     def _settle(self) -> None:
         """Work out whether E is relative."""
         relative = self._says_relative_e
-        if self.rules.relative_rules_extruder and not np.isnan(self.state[at.RELATIVE]):
-            relative = max(relative, float(self.state[at.RELATIVE]))
+        if self.rules.relative_rules_extruder and relative != 1.0:
+            relative = float(relative + self.state[at.RELATIVE])  # nan where nobody knows
         self.state[at.RELATIVE_E] = relative
 
 
