@@ -62,9 +62,9 @@ CASES: list[tuple[str, Firmware, dict[str, float]]] = [
     ("G1 X0 Y0\nG2 X10 Y0 I5 J0", MARLIN, {"X": 10}),
     ("G1 X0 Y0\nG2 X0 Y0 I5 J0", MARLIN, {"X": 0}),
     # Whether E is relative depends on G91 too, which nobody knows behind an odd line.
-    ("G91\n\\G90\nM82", KLIPPER, {"RELATIVE_E": math.nan}),
-    ("G91\n\\G90\nM83", KLIPPER, {"RELATIVE_E": 1}),
-    ("G91\n\\G90\nM82\nG90", KLIPPER, {"RELATIVE_E": 0}),
+    ("G91\n\\G90\nM82", KLIPPER, {"REL": math.nan}),
+    ("G91\n\\G90\nM83", KLIPPER, {"REL": 1}),
+    ("G91\n\\G90\nM82\nG90", KLIPPER, {"REL": 0}),
     # Numbers behind the point of a command's name are passed over.
     ("M83\nG90.638\nG1 E5\nG1 E6", MARLIN, {"FED": 6}),
     # What stands behind an odd character may be carried out, or not.
