@@ -25,7 +25,7 @@ TEXT = b"G28\nG1 X10 Y10 F6000\n"
 
 @pytest.fixture
 def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
-    """Put a pipeline in place that does what `pipeline.behave` says."""
+    """Put a pipeline in place that does what `road.behave` says."""
     seen = types.SimpleNamespace(behave=lambda: None, options=None, machine=None, rate_hz=None)
 
     def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None, **_):

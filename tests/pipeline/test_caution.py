@@ -53,7 +53,7 @@ def shaper(f_hz: float) -> BestShaper:
 
 
 def contour_um(machine: Machine, command: np.ndarray, member: int) -> float:
-    """Contour error of a member, by another pipeline than the choice's."""
+    """Contour error of a member, computed in another way than the choice's."""
     path, extruding = reference_motion(DT_S)
     plants = [plant_set(machine.axes[a], DT_S).members[member] for a in ("x", "y")]  # type: ignore[index]
     error = contour_error(path, response(plants, command), DT_S)
