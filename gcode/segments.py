@@ -33,6 +33,9 @@ __all__ = ["ErrorFilter", "Segments", "across_tolerance_mm", "fit_segments"]
 ALONG_SHARE = 0.8
 LOOSE_MM = 0.3e-3
 FULL_GAIN = 5.0
+BEYOND_MODEL = 0.5
+"""Added to what a machine answers to an error. A model ends with its band, a machine does not: all
+of the error would otherwise be steered to frequencies of which nothing is known."""
 Z_TOLERANCE_MM = 1e-3
 E_TOLERANCE_MM = 3e-4
 """Filament that comes unevenly is a step of the extruder's speed, which firmwares brake for."""
@@ -95,7 +98,7 @@ class ErrorFilter:
             if len(form) or plant.order == 0:
                 direct[i] = plant.d
         self.pole, self.weight, self.direct = pole, weight, direct
-        tables = [_tables(*axis) for axis in zip(pole, weight, direct, strict=True)]
+        tables = [_tables(*axis) for axis in zip(pole, weight, direct + BEYOND_MODEL, strict=True)]
         self.answers = Answers(pole, *(np.stack(table) for table in zip(*tables, strict=True)))
         self.share = float(np.clip(FULL_GAIN / _peak_gain(pole, weight, direct), 0.5, 1.0))
 

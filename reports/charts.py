@@ -1,4 +1,4 @@
-"""Line charts as SVG text: lines with their names at their ends, two scales, marks."""
+"""Line charts as SVG text: bands, lines with their names at their ends, two scales, marks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-__all__ = ["Chart", "Line", "Mark", "draw"]
+__all__ = ["Band", "Chart", "Line", "Mark", "draw"]
 
 Values = Sequence[float | None]
 
@@ -26,6 +26,16 @@ class Line:
     y: Values
     style: str
     name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """What lies between two lines, filled; it stands behind all lines."""
+
+    x: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    style: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +69,7 @@ class Chart:
     log: bool = False
     marks: Sequence[Mark] = field(default=())
     log_x: bool = False
+    bands: Sequence[Band] = field(default=())
 
 
 def draw(chart: Chart, width: float, height: float) -> str:
@@ -69,8 +80,9 @@ def draw(chart: Chart, width: float, height: float) -> str:
         [(x, y) for x, y in zip(line.x, line.y, strict=True) if y is not None and _shown(y, chart)]
         for line in chart.lines
     ]
-    xs = [x for line in chart.lines for x in line.x] or [0.0, 1.0]
+    xs = [x for row in (*chart.lines, *chart.bands) for x in row.x] or [0.0, 1.0]
     ys = [y for line in points for _, y in line] or [1.0]
+    ys += [y for band in chart.bands for y in (*band.low, *band.high) if _shown(y, chart)]
     ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(min(0.0, *ys), max(0.0, *ys), 5)
     low, high = (f(f(ticks), f(ys)) for f in (min, max))
     scaled: Callable[[float], float] = math.log10 if chart.log_x else float
@@ -107,6 +119,10 @@ def draw(chart: Chart, width: float, height: float) -> str:
             place = at_x(x) + (10.0 if edge else 0.0)
             anchor = "end" if edge else "middle"
             out.append(_text(place, bottom + _LINE * (1.1 + row), part, anchor))
+    for band in chart.bands:
+        edges = zip([*band.x, *reversed(band.x)], [*band.high, *reversed(band.low)], strict=True)
+        around = "L".join(f"{at_x(x):.1f} {at_y(max(y, low)):.1f}" for x, y in edges)
+        out.append(f'<path class="{band.style}" d="M{around}Z"/>')
     for mark in chart.marks:
         out.append(_stroke("mark", at_x(mark.x), lower - 4, at_x(mark.x), bottom))
         side = "start" if at_x(mark.x) < width / 2 else "end"

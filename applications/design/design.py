@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stillpath.applications.design.figures import (
     AxisFigures,
     DesignReport,
+    Frequencies,
     LiftedFigures,
     Member,
     Metrics,
@@ -54,6 +55,7 @@ Array = NDArray[np.float64]
 AXES = ("x", "y")
 ERRORS_PERCENT = tuple(range(-20, 21, 2))
 """Errors of frequency at which every command is tried."""
+_FREQUENCIES_HZ = tuple(np.geomspace(5.0, 200.0, 160).round(3).tolist())
 
 
 def design_report(
@@ -150,6 +152,7 @@ def design_report(
             "window_s": window_s,
             "update_s": update_s,
             "plant": _plant(plants, designers.get("minimax"), row),
+            "frequencies": _frequencies(machine, axis, dt_s),
             "lifted": _singular_values(lifted.plants, lifted.weights, window),
             "metrics": _metrics(plants, guarded, window),
             "ladder": ladder,
@@ -212,6 +215,21 @@ def _plant(plants: PlantSet, guarded: PreviewFbf | None, row: int) -> AxisFigure
         ),
         notes=plants.notes,
     )
+
+
+def _frequencies(machine: Machine, axis: str, dt_s: float) -> Frequencies:
+    spec = machine.axes["x" if axis == "x" else "y"]
+    plants = plant_set(spec.without_delay(), dt_s)
+    responses = [p.frequency_response(_FREQUENCIES_HZ) for p in (plants.nominal, *plants.members)]
+    gain = np.abs(responses)
+    phase_deg = np.degrees(np.unwrap(np.angle(responses), axis=1))
+    found: dict[str, Any] = {"f_hz": _FREQUENCIES_HZ}
+    for name, unit, rows in (("gain", "", gain), ("phase", "_deg", phase_deg)):
+        found[f"{name}{unit}"] = rows[0].tolist()
+        found[f"{name}_low{unit}"] = rows.min(axis=0).tolist()
+        found[f"{name}_high{unit}"] = rows.max(axis=0).tolist()
+    measured = spec.provenance is not None and not spec.provenance.magnitude_only
+    return Frequencies.model_validate({**found, "phase_measured": measured})
 
 
 def _modes(plant: DiscretePlant) -> tuple[ModeFigures, ...]:

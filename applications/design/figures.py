@@ -15,6 +15,7 @@ __all__ = [
     "AxisFigures",
     "Curve",
     "DesignReport",
+    "Frequencies",
     "LiftedFigures",
     "Member",
     "Metrics",
@@ -67,6 +68,25 @@ class AxisFigures(_Figures):
     zeros_outside: tuple[ZeroFigures, ...]
     members: tuple[Member, ...]
     notes: tuple[str, ...]
+
+
+class Frequencies(_Figures):
+    """Frequency response of the axis: its nominal plant, and how far the set reaches on either side.
+
+    Gains in mm/mm, phases in degrees, unwrapped from 0 at the lowest frequency on; without a set
+    low and high are the nominal plant's. Delays of the whole axis count in neither, as no command
+    is designed against them.
+    """
+
+    f_hz: tuple[float, ...]
+    gain: tuple[float, ...]
+    gain_low: tuple[float, ...]
+    gain_high: tuple[float, ...]
+    phase_deg: tuple[float, ...]
+    phase_low_deg: tuple[float, ...]
+    phase_high_deg: tuple[float, ...]
+    phase_measured: bool
+    """Whether a measurement told the phase, or only the structure of the model does."""
 
 
 class LiftedFigures(_Figures):
@@ -145,6 +165,7 @@ class Curve(_Figures):
     members_um: tuple[float, ...]
     members_mean_um: float
     """Mean with the weights of the set."""
+    members_best_um: float
     members_worst_um: float
     peak_accel_mm_s2: float
     rms_accel_mm_s2: float
@@ -177,6 +198,7 @@ class DesignReport(_Figures):
     window_s: float
     update_s: float
     plant: AxisFigures
+    frequencies: Frequencies
     lifted: LiftedFigures
     metrics: Metrics
     ladder: tuple[RungFigures, ...]

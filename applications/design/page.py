@@ -18,7 +18,7 @@ from stillpath.applications.design.figures import (
 from stillpath.applications.design.summary import Summary, modes_text, zero_text
 from stillpath.compensation.basis import ZERO
 from stillpath.compensation.preview import MAX_CONDITION, MAX_SPECTRAL_RADIUS
-from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.charts import Band, Chart, Line, Mark, draw
 from stillpath.reports.pages import rendered, style_of, write_texts
 
 __all__ = ["render_design", "write_design"]
@@ -84,6 +84,7 @@ def render_design(report: DesignReport) -> str:
             {"curve": c, "style": _style(c, summary), "worst": summary.worst(c)}
             for c in report.robustness.curves
         ],
+        response=_response_figures(report),
         robust_wide=chart and draw(chart, *_WIDE),
         robust_narrow=chart and draw(chart, *_NARROW),
         figures=_all_figures(report, summary),
@@ -102,6 +103,33 @@ class _Figure:
     lines: Sequence[Line]
     columns: Sequence[str]
     svg: str
+
+
+def _response_figures(report: DesignReport) -> list[_Figure]:
+    """Return gain and phase of the axis, with the set as a band around the nominal plant."""
+    found = report.frequencies
+    several = len(report.plant.members) > 1
+    source = "measured" if found.phase_measured else "of the model: no measurement told it"
+    rows = (
+        ("Gain", "nozzle over command, mm/mm", found.gain, found.gain_low, found.gain_high),
+        ("Phase", source, found.phase_deg, found.phase_low_deg, found.phase_high_deg),
+    )
+    out = []
+    for title, note, middle, low, high in rows:
+        unit = "gain" if title == "Gain" else "phase, °"
+        line = Line(found.f_hz, middle, "after main", "")
+        chart = Chart(
+            about=f"{title} of axis {report.axis.upper()} against frequency, with the range of "
+            f"{len(report.plant.members)} plants.",
+            x_title="Hz",
+            y_title=unit,
+            lines=[line],
+            log=title == "Gain",
+            log_x=True,
+            bands=[Band(found.f_hz, low, high, "band")] if several else (),
+        )
+        out.append(_Figure(title, note, [line], [unit], draw(chart, *_SMALL)))
+    return out
 
 
 def _robustness_chart(report: DesignReport, summary: Summary) -> Chart | None:

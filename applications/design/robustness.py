@@ -145,6 +145,7 @@ class Trial:
             nominal_um=self._rms(command, self._nominal, other),
             members_um=tuple(members),
             members_mean_um=float(self._weights @ members),
+            members_best_um=min(members),
             members_worst_um=max(members),
             peak_accel_mm_s2=peak,
             rms_accel_mm_s2=rms,

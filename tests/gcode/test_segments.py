@@ -238,7 +238,7 @@ def twin(command: np.ndarray, tolerance: float, plant: DiscretePlant) -> np.ndar
 def answered(plant: DiscretePlant, state: np.ndarray, error: np.ndarray) -> np.ndarray:
     x, y = state.copy(), np.empty(len(error))
     for k, value in enumerate(error):
-        y[k] = plant.c @ x + plant.d * value
+        y[k] = plant.c @ x + (plant.d + module.BEYOND_MODEL) * value
         x = plant.a @ x + plant.b * value
     return y
 

@@ -82,10 +82,12 @@ class KlipperEncoder:
     limits : KlipperLimits
         What the stream runs under.
     decimals : int
-        Decimals of X and Y (Z has 5); the last point of every stretch keeps all the file's digits.
+        Of X and Y (Z has 5); the last point of every stretch keeps all the file's digits. Rounding
+        to 1 um is noise at all frequencies, and a resonance above the model's band makes microns
+        of it (docs/tried.md).
     """
 
-    def __init__(self, firmware: Klipper, limits: KlipperLimits, *, decimals: int = 3) -> None:
+    def __init__(self, firmware: Klipper, limits: KlipperLimits, *, decimals: int = 4) -> None:
         self._firmware = firmware
         self._grid = 10 ** (6 - decimals)
         self.grid_mm = self._grid / UNITS_PER_MM
