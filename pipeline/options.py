@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
 from stillpath.compensation.registry import COMPENSATORS
 from stillpath.models.machine import Machine
 from stillpath.version import __version__
@@ -80,8 +81,8 @@ class Options(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: MethodName = "fbf"
-    basis: BasisName = "ce-opt"
+    method: MethodName = DEFAULT_METHOD
+    basis: BasisName = DEFAULT_BASIS
     robust: RobustMode = "auto"
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
     plate: Annotated[int, Field(ge=1)] | None = None

@@ -10,6 +10,7 @@ import structlog
 from sqlalchemy import Engine
 
 from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
@@ -260,7 +261,7 @@ class Sender:
             return [], []
         try:
             machine = self._machine(job)
-            method = str(job.options.get("method", "fbf"))
+            method = str(job.options.get("method", DEFAULT_METHOD))
             found = self._checker.check(printer, machine, method=method).findings
         except (PrinterUnknown, ModelError) as error:
             # Whether its limits and macros are what the file needs is not known then.
