@@ -75,8 +75,7 @@ def trajectories(
             found.machine,
             options,
             format="npz" if chosen == "npz" else "csv",
-            start_s=start,
-            stop_s=stop,
+            window_s=(start, stop),
             progress=progress,
         )
     typer.echo(f"{rows} rows, {rows / 1000:.3f} s")

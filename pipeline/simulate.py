@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -56,6 +56,20 @@ STANDING_S = 2.0
 """How long a stand is measured: all vibration has died down after that."""
 _BLOCK_BYTES = 1 << 17
 _COLUMNS = ("t", "x", "y", "z", "e")
+_NOTHING_WRITTEN: dict[str, Any] = {
+    "segments": 0,
+    "segments_per_s": 0.0,
+    "peak_segments_per_s": 0.0,
+    "peak_accel_mm_s2": 0.0,
+    "emission_rms_um": 0.0,
+    "emission_max_um": 0.0,
+    "filament_error_mm": 0.0,
+    "compensated_s": 0.0,
+    "pieces": 0,
+    "put_back": [],
+    "put_back_extruding_share": 0.0,
+}
+"""Figures of a result whose file stays as it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +155,6 @@ def simulate_file(
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
-    extruding_s = 0.0
-    peak_velocity = 0.0
     with contextlib.ExitStack() as files:
         writer = None
         if layers is not None:
@@ -158,26 +170,7 @@ def simulate_file(
             size=source.stat().st_size,
         )
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
-
-        def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
-            for samples, point in ready:
-                measurement.operate_at(point)
-                measurement.add(samples)
-
-        for part in motion:
-            if part.jumped:
-                add(stream.flush())
-                measurement.jump()
-            with clock.stage("measure"):
-                samples = part.motion()
-                moves = part.own_moves()
-                add(stream.push(samples, part.shaping, operation.at(moves)))
-                operation.passed(moves)
-            extruding_s += DT_S * float(np.sum(samples.extruding))
-            if len(samples) > 1:
-                step = np.hypot(*np.diff(samples.path_mm))
-                peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
-        add(stream.flush())
+        seen = _measure(motion, stream, measurement, operation, clock)
         measurement.finish()
         if writer is not None:
             writer.finish(motion.feature_names)
@@ -200,19 +193,8 @@ def simulate_file(
         slicer_time_s=motion.facts.estimate_s,
         original_bytes=size,
         written_bytes=size,
-        segments=0,
-        segments_per_s=0.0,
-        peak_segments_per_s=0.0,
-        peak_velocity_mm_s=peak_velocity,
-        peak_accel_mm_s2=0.0,
-        emission_rms_um=0.0,
-        emission_max_um=0.0,
-        filament_error_mm=0.0,
-        compensated_s=0.0,
-        extruding_s=extruding_s,
-        pieces=0,
-        put_back=[],
-        put_back_extruding_share=0.0,
+        peak_velocity_mm_s=seen.peak_velocity_mm_s,
+        extruding_s=seen.extruding_s,
         warnings=[*motion.warnings, *measurement.warnings()],
         notes=notes,
         layers=measurement.layers(),
@@ -221,7 +203,51 @@ def simulate_file(
         spectra=measurement.spectra(),
         layer_views=measurement.layer_views(),
         stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+        **_NOTHING_WRITTEN,
     )
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What is added up while motion is measured."""
+
+    extruding_s: float = 0.0
+    peak_velocity_mm_s: float = 0.0
+
+    def add(self, samples: MotionSamples) -> None:
+        self.extruding_s += DT_S * float(np.sum(samples.extruding))
+        if len(samples) > 1:
+            step = np.hypot(*np.diff(samples.path_mm))
+            self.peak_velocity_mm_s = max(self.peak_velocity_mm_s, float(step.max()) / DT_S)
+
+
+def _measure(
+    motion: _Motion,
+    stream: ShapedMotion | LiveMotion,
+    measurement: Measurement,
+    operation: Operation,
+    clock: StageClock,
+) -> _Seen:
+    """Measure a whole motion as the firmware's shaper, or the filter in Klipper, passes it on."""
+    seen = _Seen()
+
+    def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
+        for samples, point in ready:
+            measurement.operate_at(point)
+            measurement.add(samples)
+
+    for part in motion:
+        if part.jumped:
+            add(stream.flush())
+            measurement.jump()
+        with clock.stage("measure"):
+            samples = part.motion()
+            moves = part.own_moves()
+            add(stream.push(samples, part.shaping, operation.at(moves)))
+            operation.passed(moves)
+        seen.add(samples)
+    add(stream.flush())
+    return seen
 
 
 @dataclass(frozen=True, slots=True)

@@ -113,10 +113,7 @@ def _trace(task: Task, progress: ProgressCallback) -> None:
         task.pinned().machine,
         settings,
         format=asked["format"],
-        start_s=asked["start_s"],
-        stop_s=asked["stop_s"],
-        dialect=settings.dialect,
-        plate=settings.plate,
+        window_s=(asked["start_s"], asked["stop_s"]),
         cache_dir=task.cache_dir,
         progress=progress,
     )
