@@ -325,7 +325,8 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     fresh = make_plants(on=date.today())
     config.write_text(CONFIG.replace("[include mainsail.cfg]", ""))
     machines("from-config", config, "--name", "mine")
-    store.update_axis("mine", {"x": fresh, "y": fresh}, author="anna")
+    measured = store.current("mine").machine.model_copy(update={"axes": {"x": fresh, "y": fresh}})
+    store.add_revision("mine", measured, author="anna")
     capsys.readouterr()
     assert machines("check", "mine", "--printer-cfg", config) == 0
     assert capsys.readouterr().out == "mine: nothing speaks against it\n"
