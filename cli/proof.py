@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import Resolver
     from stillpath.applications.proof.program import PrintSettings
     from stillpath.applications.proof.ring_figures import RingReport
+    from stillpath.models.machine import Machine
 
 __all__ = ["register"]
 
@@ -204,27 +205,37 @@ def verify(
     from stillpath.applications.proof.ring_motion import is_ring_test
 
     if is_ring_test(printed):
-        from stillpath.applications.proof.confirming import verify_ring
-        from stillpath.cli.proof_tables import print_ring
-        from stillpath.reports.pages import write_texts
-
-        told = verify_ring(printed, logs, found)
-        if report is not None:
-            write_texts(report, {"ring-test.json": told.model_dump_json(indent=1)})
-        print_ring(told)
+        said = _verify_ring(printed, logs, found, report)
         if remember:
-            _remember(machines, machine, told, who(by), message)
+            _remember(machines, machine, said, who(by), message)
         return
+    if len(logs) > 1:
+        raise typer.BadParameter("of a print, one log is compared at a time")
+    _verify_print(printed, logs[0], found, report)
 
+
+def _verify_ring(
+    printed: Path, logs: list[Path], machine: Machine, report: Path | None
+) -> RingReport:
+    from stillpath.applications.proof.confirming import verify_ring
+    from stillpath.cli.proof_tables import print_ring
+    from stillpath.reports.pages import write_texts
+
+    made = verify_ring(printed, logs, machine)
+    if report is not None:
+        write_texts(report, {"ring-test.json": made.model_dump_json(indent=1)})
+    print_ring(made)
+    return made
+
+
+def _verify_print(printed: Path, log: Path, machine: Machine, report: Path | None) -> None:
     from stillpath.applications.proof.page import write_readback
     from stillpath.applications.proof.readback import verify_log
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_readback
 
-    if len(logs) > 1:
-        raise typer.BadParameter("of a print, one log is compared at a time")
     with progress_shown("stillpath") as progress:
-        made = verify_log(printed, logs[0], found, progress=progress)
+        made = verify_log(printed, log, machine, progress=progress)
     if report is not None:
         write_readback(made, report)
     print_readback(made)

@@ -26,7 +26,7 @@ from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
-from stillpath.pipeline.advising.choosing import Choice, choose
+from stillpath.pipeline.advising.choosing import AsSliced, Choice, choose
 from stillpath.pipeline.advising.earlier import EarlierErrors
 from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
 from stillpath.pipeline.advising.messages import (
@@ -167,20 +167,18 @@ class _Job:
         with self._clock.stage("choose"):
             self._source.seek(0)
             samples = take_samples(self._source, machine, self._dialect)
+            errors_um = {f: error.rms_um for f, error in was.items()}
             choice = choose(
                 samples,
-                names,
+                AsSliced(names, self._before, errors_um, reading.levels),
                 machine,
                 self._adviser,
-                self._before,
                 options.budget_um,
-                {f: error.rms_um for f, error in was.items()},
-                reading.levels,
                 lambda share: self._say("choosing", 0.3 + 0.3 * share),
                 shaped=shaped,
             )
         with self._clock.stage("verify"):
-            writer, now = self._settled(choice, was, asked.time_s, samples.first_layer)
+            writer, now = self._within_bounds(choice, was, asked.time_s, samples.first_layer)
         earlier.rewind()
         advised = Measurement(
             machine,
@@ -226,7 +224,7 @@ class _Job:
             ],
         )
 
-    def _settled(
+    def _within_bounds(
         self,
         choice: Choice,
         was: dict[int, ClassError],
