@@ -36,9 +36,9 @@ __all__ = [
 
 METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
-    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
-    "it undoes the machine's ripple too; or advise: leave all moves as they are and add firmware "
-    "commands for shaper and acceleration"
+    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple "
+    "appended undoes the machine's ripple too; or advise: leave all moves as they are and add "
+    "firmware commands for shaper and acceleration"
 )
 """The methods of `compensate`, in words."""
 

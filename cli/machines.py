@@ -99,7 +99,7 @@ def open_documents(name: str) -> Documents:
 
         settings = _service_settings()
         if engine.database_url(settings).get_backend_name() != "sqlite":
-            # Without a pool nothing is left open behind a command.
+            # Without a pool nothing is left open after a command.
             return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
     return DocumentFolder(data_dir() / name)
 

@@ -191,12 +191,12 @@ def _progress() -> Iterator[_Tell]:
 
 
 def _reports(tell: _Tell) -> Callable[[JobView], None]:
-    def told(job: JobView) -> None:
+    def report(job: JobView) -> None:
         waits = job.state.value == "queued" and job.queue_position
         stage = f"waiting behind {job.queue_position} jobs" if waits else job.stage
         tell(stage, job.progress, job.eta_s)
 
-    return told
+    return report
 
 
 def _print_figures(report: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
 _ALL_BITS = 6
-"""Of a long print, every second block behind the first 64 tells enough, every fourth behind the
+"""Of a long print, every second block after the first 64 tells enough, every fourth after the
 first 128, and so on; each counts for all that it stands for."""
 _TOGETHER = 16
 """Blocks are transformed so many at a time, as to prepare for it takes longer than a block."""
@@ -123,7 +123,7 @@ class BandContent:
 
 
 def _span(before: NDArray[T], behind: NDArray[T], start: int, stop: int) -> NDArray[T]:
-    """Return the samples start..stop - 1 of two arrays, the second being behind the first."""
+    """Return the samples start..stop - 1 of two arrays, the second being after the first."""
     held = before.shape[-1]
     if start >= held:
         return behind[..., start - held : stop - held]

@@ -144,10 +144,12 @@ def compensate_file(
     with (
         contextlib.ExitStack() as files,
         replacing(target) as temporary,
-        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+        open_text(
+            source, plate=options.plate, folder=target.parent, progress=unpacking
+        ) as container,
     ):
         with (
-            rewriting(container, temporary, name=target, told=packing) as text,
+            rewriting(container, temporary, name=target, progress=packing) as text,
             tempfile.TemporaryFile(dir=target.parent) as spool,
         ):
             writer = None

@@ -43,7 +43,7 @@ _METHOD = rf"^(advise|({'|'.join(_PLAIN)})(\+ripple)?)$"
 def _known(method: str) -> str:
     if re.fullmatch(_METHOD, method) is None:
         raise ValueError(
-            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple behind it, "
+            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple appended, "
             "and advise"
         )
     return method
@@ -62,7 +62,7 @@ class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
+    with a firmware shaper's name; with `+ripple` appended the machine's ripple is undone as well.
     `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`).
     `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
     the set of plants that explain the measurement, with as much of a shaper's smoothing as no

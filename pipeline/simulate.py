@@ -304,7 +304,7 @@ class TextMotion:
         What the machine stands longer is left out of the samples.
     shaping : Shaping
         The firmware's shaper before the first line.
-    told : callable, optional
+    progress : callable, optional
         Is given the share of the file that is read and the time that it takes, now and then.
     each : callable, optional
         Is given every block of the program before its motion.
@@ -327,12 +327,12 @@ class TextMotion:
         *,
         longest_stand_s: float = np.inf,
         shaping: Shaping = OFF,
-        told: Callable[[float, float], None] = lambda _share, _time_s: None,
+        progress: Callable[[float, float], None] = lambda _share, _time_s: None,
         each: Callable[[ProgramBlock], None] = lambda _block: None,
     ) -> None:
         self._file, self._machine, self._dialect = file, machine, dialect
         self._longest_stand_s = longest_stand_s
-        self._told, self._each = told, each
+        self._progress, self._each = progress, each
         self._left_out_s = self._end_s = 0.0
         self._held: list[tuple[int, Moves]] = []
         self._jumps: list[int] = []
@@ -371,7 +371,7 @@ class TextMotion:
                 for samples, path_mm in self._sampled(self._shortened(phases), final=False):
                     yield from self._parts(samples, path_mm)
             self.time_s = planner.time_s
-            self._told(file.tell() / size, self.time_s)
+            self._progress(file.tell() / size, self.time_s)
             if not data:
                 break
         phases = planner.flush()
@@ -508,7 +508,7 @@ class _Motion:
 
     def __iter__(self) -> Iterator[MotionPart]:
         unpacking = progress_to(self._progress, "unpacking", 0.0)
-        with open_text(self._source, plate=self._plate, told=unpacking) as container:
+        with open_text(self._source, plate=self._plate, progress=unpacking) as container:
             self.facts = container.facts()
             doubtful = doubts(container.text, self._machine, self._asked)
             motion = TextMotion(
@@ -517,7 +517,7 @@ class _Motion:
                 self._dialect,
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,
-                told=partial(self._reports.say, "planning"),
+                progress=partial(self._reports.say, "planning"),
             )
             self.feature_names = motion.reader.feature_names
             yield from motion

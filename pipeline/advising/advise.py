@@ -98,11 +98,13 @@ def advise_file(
     with (
         contextlib.ExitStack() as files,
         replacing(target) as temporary,
-        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
+        open_text(
+            source, plate=options.plate, folder=target.parent, progress=unpacking
+        ) as container,
     ):
         writer = None
         with (
-            rewriting(container, temporary, name=target, told=packing) as text,
+            rewriting(container, temporary, name=target, progress=packing) as text,
             tempfile.TemporaryFile(dir=target.parent) as spool,
             EarlierErrors(target.parent, 2) as earlier,
         ):
@@ -289,7 +291,7 @@ class _Job:
             DT_S,
             longest_stand_s=STANDING_S,
             shaping=self._before,
-            told=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
+            progress=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
             each=each,
         )
         operation, shaper = Operation(self._machine), ShapedMotion(DT_S)

@@ -99,7 +99,7 @@ class JobQuery(BaseModel):
         default=DEFAULT_METHOD,
         description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
         "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
-        "3hump_ei) or `none`; with `+ripple` behind it the machine's ripple is undone as well. "
+        "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
         "`advise` leaves all moves as they are and adds firmware commands.",
     )
     basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")

@@ -48,7 +48,7 @@ async def read_trajectories(
     ] = 0.0,
     stop_s: Annotated[
         float | None,
-        Query(gt=0, le=1e7, allow_inf_nan=False, description="By default 60 s behind `start_s`."),
+        Query(gt=0, le=1e7, allow_inf_nan=False, description="By default 60 s after `start_s`."),
     ] = None,
 ) -> Response:
     """Return the motion before and after, planned and simulated, with the contour errors.

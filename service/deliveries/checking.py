@@ -372,7 +372,7 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
         files = "stillpath-m600.cfg" if missing == ["M600"] else f"{files} and stillpath-m600.cfg"
     names = ", ".join(missing)
     text = (
-        f"{names} would move under a compensated stretch's limits: include {files} behind your own "
+        f"{names} would move under a compensated stretch's limits: include {files} after your own "
         "macros in printer.cfg, then send STILLPATH_CHECK"
     )
     yield Finding(place=names, text=text)
