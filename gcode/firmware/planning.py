@@ -128,7 +128,8 @@ def check_print_ends(time_s: float, line: int) -> None:
     if not time_s <= LONGEST_PRINT_S:
         raise GcodeError(
             f"up to here the print takes {_in_words(time_s)}, more than "
-            f"{_in_words(LONGEST_PRINT_S)}; correct F, M220, dwells or the limits in force, or print it in parts",
+            f"{_in_words(LONGEST_PRINT_S)}; correct F, M220, dwells or the limits in force, or "
+            "print it in parts",
             line=line,
         )
 
