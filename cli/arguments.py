@@ -73,8 +73,8 @@ RobustOption = Annotated[
     str,
     typer.Option(
         "--robust",
-        help="What fbf looks at: auto (all that explains the measurement, no more than that "
-        "bears), off (the nominal plant), ensemble or minimax (its set).",
+        help="What fbf is designed for: auto (all plants that explain the measurement, as far as "
+        "they allow), off (the nominal plant), ensemble or minimax (the set).",
     ),
 ]
 BasisOption = Annotated[
@@ -94,7 +94,7 @@ ServerOption = Annotated[
         "--server",
         metavar="URL",
         envvar="STILLPATH_SERVER",
-        help="Let a service do it, for instance http://127.0.0.1:8000.",
+        help="Send the work to a service, for instance http://127.0.0.1:8000.",
     ),
 ]
 KeyOption = Annotated[
@@ -104,7 +104,7 @@ KeyOption = Annotated[
         metavar="KEY",
         envvar="STILLPATH_KEY",
         show_envvar=False,
-        help="Of the service; better in the environment (STILLPATH_KEY), where nobody sees it.",
+        help="Key of the service; better set STILLPATH_KEY, which other users cannot see.",
     ),
 ]
 
@@ -157,7 +157,7 @@ class CompensationOptions:
 
 
 class Refused(Exception):
-    """The request cannot be met as it was put."""
+    """The command cannot be carried out as given."""
 
 
 def check_input(source: Path) -> None:
@@ -165,7 +165,7 @@ def check_input(source: Path) -> None:
     if source.is_dir():
         raise Refused(f"{source} is a folder, not a G-code file")
     if not source.exists():
-        raise Refused(f"there is no file {source}")
+        raise Refused(f"{source} does not exist")
     if not source.is_file():
         # The pipeline reads a file twice, and opening a pipe waits for somebody to write.
         raise Refused(f"{source} is a pipe or a device; save it as a file first")

@@ -61,7 +61,7 @@ def compensate(
     check_input(source)
     target = check_output(output or source)
     if output is not None and target.exists() and target.samefile(source):
-        raise Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
+        raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
     check_folder(report)
     if server:
         compensate_on_server(

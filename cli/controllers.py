@@ -51,10 +51,11 @@ class SettingOptions:
     shape: Annotated[str | None, typer.Option(help="pointwise or hermite.")] = None
     detuning: Annotated[float | None, typer.Option(help="Notches end at 1 - detuning.")] = None
     tones: Annotated[int | None, typer.Option(help="fmsdob-adaptive: how many.")] = None
-    cutoff_hz: Annotated[float | None, typer.Option(help="dob: of its filter.")] = None
+    cutoff_hz: Annotated[float | None, typer.Option(help="dob: cutoff of its filter.")] = None
     nominal: Annotated[str | None, typer.Option(help="dob: machine whose plant it takes.")] = None
     fundamental_hz: Annotated[
-        float | None, typer.Option("--fundamental-hz", "--period-hz", help="rc: of the error.")
+        float | None,
+        typer.Option("--fundamental-hz", "--period-hz", help="rc: fundamental of the error."),
     ] = None
     nyquist_pairs: Annotated[int | None, typer.Option(help="rc: zero pairs of the filter.")] = None
     notches_hz: Annotated[str | None, typer.Option(help=f"rc: left alone. {_MANY}")] = None
@@ -65,7 +66,7 @@ class SettingOptions:
     uncertainty: Annotated[
         float | None, typer.Option(help="Relative plant error to survive at every frequency.")
     ] = None
-    duration_s: Annotated[float | None, typer.Option(help="Of the time response.")] = None
+    duration_s: Annotated[float | None, typer.Option(help="Length of the time response.")] = None
 
     def given(self) -> dict[str, Any]:
         """Return the settings that were given, numbers and machines read."""

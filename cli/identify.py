@@ -62,7 +62,7 @@ class TargetOptions:
             help="What a new machine starts from: a name of `stillpath machines`, or a file."
         ),
     ] = None
-    title: Annotated[str | None, typer.Option(help="Of the machine.")] = None
+    title: Annotated[str | None, typer.Option(help="What people call the machine.")] = None
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", metavar="OUT", help="Write the machine to a JSON file too."),

@@ -106,8 +106,8 @@ class BandContent:
                 if beyond > NOTABLE_UM:
                     found.append(
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
-                        f"{high_hz:g} Hz, where its model was not measured (band_hz): figures are "
-                        "a guess there. Measure up to higher frequencies, or print with less "
+                        f"{high_hz:g} Hz, where its model was not measured (band_hz): the figures "
+                        "are a guess there. Measure up to higher frequencies, or print with less "
                         "acceleration."
                     )
             if trust_hz is not None:
@@ -115,9 +115,9 @@ class BandContent:
                 if beyond > NOTABLE_UM:
                     found.append(
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
-                        f"{trust_hz:.3g} Hz, from where its model is not to be trusted "
-                        "(trust_below_hz; the phase was not measured): a raw accelerometer log "
-                        "would tell."
+                        f"{trust_hz:.3g} Hz, above which its model cannot be trusted "
+                        "(trust_below_hz): the phase was not measured. A raw accelerometer log "
+                        "would tell it."
                     )
         return found
 

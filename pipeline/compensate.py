@@ -123,8 +123,8 @@ def compensate_file(
     if options.method == "advise":
         if trace is not None:
             raise GcodeError(
-                "an advised file has moves of its own times: ask for the trajectories of the "
-                "written file, not compensated"
+                "method advise gives the moves times of their own: ask for the trajectories of the "
+                "written file instead"
             )
         from stillpath.pipeline.advising.advise import advise_file
 
@@ -215,8 +215,8 @@ def _fitting(options: Options, name: str) -> Options:
     less = narrower(options)
     if less is None:
         raise GcodeError(
-            f"{name} does not fit into max_mb {options.max_mb:g} even if its outer walls alone are "
-            "compensated: allow more, or take a larger tolerance_um"
+            f"{name} exceeds max_mb {options.max_mb:g} even if only its outer walls are "
+            "compensated: allow more, or choose a larger tolerance_um"
         )
     return less
 
@@ -365,7 +365,7 @@ class _Job:
             self._operation.passed(item.moves)
             self._say("compensating", self._source.tell() / size)
         if self._sum.moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
+            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
             self._wait(switching_s(self._checker.push(text)))
@@ -455,7 +455,7 @@ class _Job:
             except Unfit as error:
                 reason = str(error)
             except GcodeError as error:  # its line is one of what was written
-                reason = f"the firmware would refuse what was made of it: {error.message}"
+                reason = f"the firmware would refuse the compensated lines: {error.message}"
         else:
             self._sum.time_s -= switched_s
             self._put_back(piece, original_s, reason)

@@ -380,7 +380,7 @@ class TextMotion:
             yield from self._parts(samples, path_mm)
         self.time_s = planner.time_s
         if moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
+            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):

@@ -78,8 +78,8 @@ def write_trajectories(
     start_s, stop_s = window_s
     if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
         raise GcodeError(
-            f"from {start_s:g} s to {stop_s or 0.0:g} s is no time; it begins at 0 or later and "
-            "ends after its start"
+            f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
+            "or later, and end after its start"
         )
     advised = options.method == "advise"
     names = ("after",) if advised else ("before", "after")

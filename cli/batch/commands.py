@@ -96,8 +96,8 @@ def batch(
             write_summary(outcomes, output)
     except Interrupted as interruption:
         sys.stderr.write(
-            f"stillpath: interrupted; {len(outcomes)} of {len(items)} are over, and the same "
-            "command goes on with the rest\n"
+            f"stillpath: interrupted; {len(outcomes)} of {len(items)} are finished; run the "
+            "same command again for the rest\n"
         )
         raise SystemExit(interruption.exit_code) from None
     print_summary(outcomes)
@@ -113,11 +113,13 @@ def watch(
     *,
     work: WorkOptions,
     settle_s: Annotated[
-        float, typer.Option(min=0.1, help="A file is complete when unchanged for so long.")
+        float, typer.Option(min=0.1, help="A file is complete once it has not changed for so long.")
     ] = 2.0,
     every_s: Annotated[
         float,
-        typer.Option(min=0.5, help="Look so often where changes are not told, as on shares."),
+        typer.Option(
+            min=0.5, help="How often to look where changes are not reported, as on shares."
+        ),
     ] = 10.0,
     how: CompensationOptions,
 ) -> None:
@@ -139,7 +141,7 @@ def watch(
         try:
             run_watch(watcher, folder, every_s=every_s, check=check)
         except Interrupted:
-            sys.stderr.write("stillpath: stopped; what was begun is done at the next start\n")
+            sys.stderr.write("stillpath: stopped; the next start does what was in progress\n")
 
 
 @contextmanager

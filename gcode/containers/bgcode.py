@@ -80,7 +80,7 @@ class Block:
             how = Compression(self.compression)
         except ValueError:
             raise GcodeError(
-                f"{self.place} is compressed in way {self.compression}, which is not known "
+                f"{self.place} has the unknown compression {self.compression} "
                 "(0 none, 1 deflate, 2 and 3 heatshrink); export plain G-code instead"
             ) from None
         try:
@@ -325,7 +325,7 @@ def _text_of(block: Block, unpacker: Unpacker) -> bytes:
     (encoding,) = block.parameters
     if encoding not in set(Encoding):
         raise GcodeError(
-            f"{block.place} is encoded in way {encoding}, which is not known (0 text, 1 and 2 "
+            f"{block.place} has the unknown encoding {encoding} (0 text, 1 and 2 "
             "MeatPack); export plain G-code instead"
         )
     data = block.content()

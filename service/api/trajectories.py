@@ -61,8 +61,8 @@ async def read_trajectories(
         raise Problem(
             422,
             "Bad parameter",
-            f"From start_s {start_s:g} to stop_s {stop_s:g} is no time of at most {_LONGEST_S:g} "
-            "s; ask for a part after the other.",
+            f"start_s {start_s:g} to stop_s {stop_s:g} must be a period of at most {_LONGEST_S:g} "
+            "s; ask for longer ones in parts.",
         )
     job = await find_done(request, job_id, caller)
     question = Question(
