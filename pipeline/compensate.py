@@ -8,10 +8,8 @@ motion.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import io
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +18,6 @@ from typing import BinaryIO, TypeVar
 import numpy as np
 
 from stillpath.compensation.base import DesignError
-from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
@@ -39,10 +36,11 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import caution_for, prediction_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
-from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
+from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.last_check.comparing import LastCheck
-from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
-from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.layer_files import LayerWriter
+from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
@@ -59,7 +57,7 @@ from stillpath.pipeline.piece_compensator import (
     as_executed,
     deviation,
 )
-from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports
 from stillpath.pipeline.reading import dialect_for, doubts, passed_over
 from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge, narrower
@@ -137,38 +135,15 @@ def compensate_file(
             progress=progress,
             layers=layers,
         )
-    unpacking, packing = (
-        progress_to(progress, "unpacking", 0.0),
-        progress_to(progress, "packing", 1.0),
-    )
-    with (
-        contextlib.ExitStack() as files,
-        replacing(target) as temporary,
-        open_text(
-            source, plate=options.plate, folder=target.parent, progress=unpacking
-        ) as container,
-    ):
-        with (
-            rewriting(container, temporary, name=target, progress=packing) as text,
-            tempfile.TemporaryFile(dir=target.parent) as spool,
-        ):
-            writer = None
-            if layers is not None:
-                writer = files.enter_context(
-                    written_layers(layers, channel_names(compensated=True))
-                )
-            order = _Order(machine, options, cache_dir, progress)
-            about = (source.name, container.facts())
-            job, result = _final_job(container.text, spool, order, about, writer, trace)
-            spool.seek(0)
-            result = job.deliver(result, text)
-            if options.times == "new":
-                container.delay(job.delay_s)
-        sizes = {
-            "original_bytes": source.stat().st_size,
-            "written_bytes": temporary.stat().st_size,
-        }
-        return result.model_copy(update=sizes)
+    opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
+    with opened as file:
+        order = _Order(machine, options, cache_dir, progress)
+        job, result = _final_job(file, order, source.name, trace)
+        file.spool.seek(0)
+        result = job.deliver(result, file.text)
+        if options.times == "new":
+            file.container.delay(job.delay_s)
+    return result.model_copy(update=file.sizes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,32 +157,31 @@ class _Order:
 
 
 def _final_job(
-    source: BinaryIO,
-    spool: BinaryIO,
+    file: FileRewriting,
     order: _Order,
-    about: tuple[str, SlicerFacts],
-    writer: LayerWriter | None,
+    name: str,
     trace: Callable[[Trace], None] | None,
 ) -> tuple[_Job, Result]:
     """Run jobs until what one writes fits `max_mb` and keeps the budget; return that one."""
     # Within a budget a file may be written more than once: only the last time is traced.
     traced = None if _Job.has_budget(order.options) else trace
     budget: SpeedBudget | None = None
+    layers = file.layers
     while True:
-        job = _Job(source, spool, order, writer, traced, budget)
+        job = _Job(file.container.text, file.spool, order, layers, traced, budget)
         try:
-            result = job.run(*about)
+            result = job.run(name, file.container.facts())
         except TooLarge:
-            order = replace(order, options=_fitting(order.options, about[0]))
+            order = replace(order, options=_fitting(order.options, name))
         else:
             budget = job.gentler
             if budget is None and traced is trace:
                 return job, result
             if budget is None:
                 budget, traced = job.same, trace
-        spool.seek(0)
-        spool.truncate()
-        writer = writer.anew() if writer is not None else None
+        file.spool.seek(0)
+        file.spool.truncate()
+        layers = layers.anew() if layers is not None else None
 
 
 def _fitting(options: Options, name: str) -> Options:

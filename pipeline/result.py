@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict
 
 __all__ = [
+    "NOTHING_COMPENSATED",
     "AdviceFigures",
     "AdvisedFeature",
     "AdvisedShaper",
@@ -324,3 +327,18 @@ class Result(_Figures):
     """What is advised, by method `advise`."""
     last_check: LastCheckFigures | None = None
     """What the last check compared; null where nothing was compensated."""
+
+
+NOTHING_COMPENSATED: dict[str, Any] = {
+    "segments": 0,
+    "segments_per_s": 0.0,
+    "peak_segments_per_s": 0.0,
+    "emission_rms_um": 0.0,
+    "emission_max_um": 0.0,
+    "filament_error_mm": 0.0,
+    "compensated_s": 0.0,
+    "pieces": 0,
+    "put_back": [],
+    "put_back_extruding_share": 0.0,
+}
+"""Figures of a `Result` whose moves stay as they are."""

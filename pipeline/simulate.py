@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
-from stillpath.pipeline.result import Result, StageTime
+from stillpath.pipeline.result import NOTHING_COMPENSATED, Result, StageTime
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
 
@@ -56,20 +56,6 @@ STANDING_S = 2.0
 """How long a stand is measured: all vibration has died down after that."""
 _BLOCK_BYTES = 1 << 17
 _COLUMNS = ("t", "x", "y", "z", "e")
-_NOTHING_WRITTEN: dict[str, Any] = {
-    "segments": 0,
-    "segments_per_s": 0.0,
-    "peak_segments_per_s": 0.0,
-    "peak_accel_mm_s2": 0.0,
-    "emission_rms_um": 0.0,
-    "emission_max_um": 0.0,
-    "filament_error_mm": 0.0,
-    "compensated_s": 0.0,
-    "pieces": 0,
-    "put_back": [],
-    "put_back_extruding_share": 0.0,
-}
-"""Figures of a result whose file stays as it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +179,7 @@ def simulate_file(
         slicer_time_s=motion.facts.estimate_s,
         original_bytes=size,
         written_bytes=size,
+        peak_accel_mm_s2=0.0,
         peak_velocity_mm_s=seen.peak_velocity_mm_s,
         extruding_s=seen.extruding_s,
         warnings=[*motion.warnings, *measurement.warnings()],
@@ -203,7 +190,7 @@ def simulate_file(
         spectra=measurement.spectra(),
         layer_views=measurement.layer_views(),
         stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
-        **_NOTHING_WRITTEN,
+        **NOTHING_COMPENSATED,
     )
 
 
