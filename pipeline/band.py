@@ -115,7 +115,7 @@ class BandContent:
                 if beyond > NOTABLE_UM:
                     found.append(
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
-                        f"{trust_hz:.3g} Hz, above which its model cannot be trusted "
+                        f"{trust_hz:.3g} Hz, where its model cannot be trusted "
                         "(trust_below_hz): the phase was not measured. A raw accelerometer log "
                         "would tell it."
                     )
