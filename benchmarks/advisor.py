@@ -42,7 +42,7 @@ _HEAD = f"\n| {' | '.join(_COLUMNS)} |\n{'|---' * len(_COLUMNS)}|"
 _LONGER = 1.0005
 """Rests of a shaper that changes are no misses."""
 _SHORT_S = 1.0
-"""What may stand in a last line without an end, behind which nothing could be set back."""
+"""What may stand in a last line without an end, after which nothing could be set back."""
 
 
 def main() -> int:

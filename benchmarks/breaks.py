@@ -48,7 +48,7 @@ FACTORS = (0.5, 1.0, 2.0)
 _SAMPLE_S, _REACH = 5e-5, 20
 _SAME_MM = 1e-4
 _AROUND = 60
-"""Moves that are looked at before and behind a break."""
+"""Moves that are looked at before and after a break."""
 
 
 def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
@@ -90,7 +90,7 @@ def worst_steps(written: Path, machine: Machine, breaks: int) -> list[float]:
     total = max(sum(map(len, ours)), 1)
     for block, rows in zip(blocks, ours, strict=True):
         chosen = rows[rng.random(len(rows)) < breaks / total]
-        # Homing and the like: behind it the machine is elsewhere.
+        # Homing and the like: after it the machine is elsewhere.
         apart = np.abs(block.moves.start_mm[1:, :3] - block.moves.end_mm[:-1, :3]) > _SAME_MM
         jumps = np.concatenate([[0], np.flatnonzero(apart.any(axis=1)) + 1, [len(block.moves)]])
         for k in chosen.tolist():

@@ -191,7 +191,7 @@ class Laid(Timed):
     """A written file against the original's path, matched by the extruder's position.
 
     While it feeds, the extruder is where it was when the original was there. A segment of the
-    written file may lie across the end of a line and the travel behind it; it feeds less than the
+    written file may lie across the end of a line and the travel after it; it feeds less than the
     line did, and is not judged.
     """
 

@@ -121,8 +121,7 @@ def watched(
     """Compensate a file on the watched pipeline."""
     options = Options(tolerance_um=tolerance_um)
     with source.open("rb") as text, target.open("wb") as written:
-        unwatched = {"progress": None, "layers": None, "trace": None, "budget": None}
-        job = Watched(text, written, machine, options, cache, **unwatched)
+        job = Watched(text, written, compensate._Order(machine, options, cache))
         job.prepare()
         return job, job.run(source.name, SlicerFacts())
 

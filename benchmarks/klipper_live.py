@@ -154,7 +154,7 @@ def _contour_um(prints: Pair, machine: Machine) -> float:
     command = shifted(live, later(prints) / DT_S, plan.shape[1])
     answer = response([plant_set(machine.axes[a], DT_S).nominal for a in ("x", "y")], command)
     at_s = (first + np.arange(plan.shape[1])) * DT_S
-    # The extruder steps shortly before and behind; it alone moves in retractions.
+    # The extruder steps shortly before and after; it alone moves in retractions.
     around = np.stack((at_s - _EXTRUDES_S, at_s, at_s + _EXTRUDES_S))
     fed = np.searchsorted(prints.plain.others_s[1], around)
     moves = np.append(np.any(np.diff(plan) != 0.0, axis=0), False)

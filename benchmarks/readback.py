@@ -152,7 +152,7 @@ def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Mot
     Parameters
     ----------
     forced : sequence of int
-        Rising numbers of moves behind which the machine stops although the file does not say so.
+        Rising numbers of moves after which the machine stops although the file does not say so.
     """
     reader, planner = Interpreter(machine), adapter(machine).planner()
     parts: list[Phases] = []

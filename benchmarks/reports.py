@@ -3,7 +3,7 @@
 Each file is compensated; the report's print time and its largest contour errors are compared with
 those of the bytes that were written: interpreted, planned by the firmware's rules, sampled at
 10 kHz, answered by the continuous plants (`readback.py`). As in reports, the nozzle's ringing
-behind the end of a line counts for the line, while it stands there.
+after the end of a line counts for the line, while it stands there.
 """
 
 from __future__ import annotations

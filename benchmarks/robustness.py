@@ -41,7 +41,7 @@ GOLDEN = Path(__file__).parents[1] / "examples" / "machines" / "klipper-golden.j
 DT = 1e-3
 FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24")
 METHODS = ("off", "ensemble/1", "ensemble", "minimax")
-"""Settings of `robust`, and of `along` behind a slash where it is not the default."""
+"""Settings of `robust`, and of `along` after a slash where it is not the default."""
 _STAND_S = 0.2
 _STRIDE, _COARSE_POINTS, _FINE_POINTS = 2, 800, 3000
 _COARSE_STEP = 8

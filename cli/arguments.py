@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
 
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
 
 __all__ = [
     "METHODS",
+    "BasisOption",
+    "BudgetOption",
+    "CompensationOptions",
     "DialectOption",
     "Input",
+    "KeyOption",
     "MachineOption",
-    "MaxMbOption",
+    "MethodOption",
     "PlateOption",
     "Refused",
     "ReportOption",
-    "WhereOption",
+    "RobustOption",
+    "ServerOption",
     "check_folder",
     "check_input",
     "check_output",
@@ -28,9 +36,9 @@ __all__ = [
 
 METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
-    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple behind "
-    "it undoes the machine's ripple too; or advise: leave all moves as they are and add firmware "
-    "commands for shaper and acceleration"
+    "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple "
+    "appended undoes the machine's ripple too; or advise: leave all moves as they are and add "
+    "firmware commands for shaper and acceleration"
 )
 """The methods of `compensate`, in words."""
 
@@ -60,28 +68,96 @@ ReportOption = Annotated[
         "--report", metavar="DIR", help="Folder for report.html and .json, layers.json and .bin."
     ),
 ]
-
-
-WhereOption = Annotated[
+MethodOption = Annotated[str, typer.Option("--method", help=METHODS)]
+RobustOption = Annotated[
     str,
     typer.Option(
-        help="What is compensated: all, visible (outer walls, top and bottom surfaces) or walls "
-        "(outer ones). The rest stays as sliced, and the file is smaller."
+        "--robust",
+        help="What fbf is designed for: auto (all plants that explain the measurement, as far as "
+        "they allow), off (the nominal plant), ensemble or minimax (the set).",
     ),
 ]
-MaxMbOption = Annotated[
+BasisOption = Annotated[
+    str, typer.Option("--basis", help="Basis of fbf: ce-opt, robust, bspline or dct.")
+]
+BudgetOption = Annotated[
     float | None,
     typer.Option(
-        "--max-mb",
-        metavar="MB",
-        help="The most that the written G-code may have: compensate less, down to the walls, until "
-        "it fits.",
+        "--budget-um",
+        help="Contour error that every feature may have (rms, worst plant of the set): print as "
+        "fast as that allows. [default: keep all speeds]",
     ),
 ]
+ServerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--server",
+        metavar="URL",
+        envvar="STILLPATH_SERVER",
+        help="Send the work to a service, for instance http://127.0.0.1:8000.",
+    ),
+]
+KeyOption = Annotated[
+    str | None,
+    typer.Option(
+        "--key",
+        metavar="KEY",
+        envvar="STILLPATH_KEY",
+        show_envvar=False,
+        help="Key of the service; better set STILLPATH_KEY, which other users cannot see.",
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class CompensationOptions:
+    """How files are compensated: the options of `compensate`, `batch` and `watch`."""
+
+    method: MethodOption = DEFAULT_METHOD
+    basis: BasisOption = DEFAULT_BASIS
+    robust: RobustOption = "auto"
+    along: Annotated[
+        float | None,
+        typer.Option(
+            help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
+            "takes longer. [default: 1]"
+        ),
+    ] = None
+    tolerance_um: Annotated[
+        float | None,
+        typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
+    ] = None
+    where: Annotated[
+        str,
+        typer.Option(
+            help="What is compensated: all, visible (outer walls, top and bottom surfaces) or "
+            "walls (outer ones). The rest stays as sliced, and the file is smaller."
+        ),
+    ] = "all"
+    max_mb: Annotated[
+        float | None,
+        typer.Option(
+            metavar="MB",
+            help="The most that the written G-code may have: compensate less, down to the walls, "
+            "until it fits.",
+        ),
+    ] = None
+    budget_um: BudgetOption = None
+    dialect: DialectOption = None
+    keep_times: Annotated[
+        bool,
+        typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),
+    ] = False
+
+    def chosen(self, plate: int | None = None) -> Options:
+        """Return the options of a job, checked."""
+        given = asdict(self)
+        times = "kept" if given.pop("keep_times") else None
+        return chosen_options(**given, times=times, plate=plate)
 
 
 class Refused(Exception):
-    """The request cannot be met as it was put."""
+    """The command cannot be carried out as given."""
 
 
 def check_input(source: Path) -> None:
@@ -89,7 +165,7 @@ def check_input(source: Path) -> None:
     if source.is_dir():
         raise Refused(f"{source} is a folder, not a G-code file")
     if not source.exists():
-        raise Refused(f"there is no file {source}")
+        raise Refused(f"{source} does not exist")
     if not source.is_file():
         # The pipeline reads a file twice, and opening a pipe waits for somebody to write.
         raise Refused(f"{source} is a pipe or a device; save it as a file first")

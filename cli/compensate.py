@@ -8,22 +8,23 @@ from typing import Annotated, Any
 import typer
 
 from stillpath.cli.arguments import (
-    METHODS,
+    CompensationOptions,
     DialectOption,
     Input,
+    KeyOption,
     MachineOption,
-    MaxMbOption,
     PlateOption,
     Refused,
     ReportOption,
-    WhereOption,
+    ServerOption,
     check_folder,
     check_input,
     check_output,
     chosen_options,
 )
 from stillpath.cli.machines import open_machines
-from stillpath.cli.remote import KeyOption, ServerOption, compensate_on_server
+from stillpath.cli.option_groups import grouped
+from stillpath.cli.remote import compensate_on_server
 
 __all__ = ["register"]
 
@@ -31,12 +32,13 @@ __all__ = ["register"]
 def register(app: typer.Typer) -> None:
     """Add compensate and simulate to a command line."""
     for command in (compensate, simulate):
-        app.command()(command)
+        app.command()(grouped(command))
 
 
 def compensate(
     source: Input,
     machine: MachineOption,
+    *,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="OUT", help="The file to write.")
     ] = None,
@@ -46,43 +48,8 @@ def compensate(
             "--in-place", help="Overwrite IN, as slicers expect of post-processing scripts."
         ),
     ] = False,
-    method: Annotated[str, typer.Option(help=METHODS)] = "fbf",
-    basis: Annotated[
-        str, typer.Option(help="Basis of fbf: ce-opt, robust, bspline or dct.")
-    ] = "ce-opt",
-    robust: Annotated[
-        str,
-        typer.Option(
-            help="What fbf looks at: auto (all that explains the measurement, no more than that "
-            "bears), off (the nominal plant), ensemble or minimax (its set)."
-        ),
-    ] = "auto",
-    along: Annotated[
-        float | None,
-        typer.Option(
-            help="Weight of errors along the path against those across it, .01 to 1. Less than 1 "
-            "takes longer. [default: 1]"
-        ),
-    ] = None,
-    tolerance_um: Annotated[
-        float | None,
-        typer.Option(help="How far the written path may be from the computed one. [default: 2]"),
-    ] = None,
-    where: WhereOption = "all",
-    max_mb: MaxMbOption = None,
-    budget_um: Annotated[
-        float | None,
-        typer.Option(
-            help="Contour error that every feature may have (rms, worst plant of the set): print "
-            "as fast as that allows. [default: keep all speeds]"
-        ),
-    ] = None,
+    how: CompensationOptions,
     plate: PlateOption = None,
-    dialect: DialectOption = None,
-    keep_times: Annotated[
-        bool,
-        typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),
-    ] = False,
     report: ReportOption = None,
     server: ServerOption = None,
     key: KeyOption = None,
@@ -90,23 +57,11 @@ def compensate(
     """Write a compensated file, and print what was measured on it."""
     if in_place == (output is not None):
         raise Refused("give either -o OUT or --in-place")
-    options = chosen_options(
-        method=method,
-        basis=basis,
-        robust=robust,
-        along=along,
-        tolerance_um=tolerance_um,
-        budget_um=budget_um,
-        where=where,
-        max_mb=max_mb,
-        plate=plate,
-        dialect=dialect,
-        times="kept" if keep_times else None,
-    )
+    options = how.chosen(plate)
     check_input(source)
     target = check_output(output or source)
     if output is not None and target.exists() and target.samefile(source):
-        raise Refused(f"{output} is the input; name another file, or say --in-place instead of -o")
+        raise Refused(f"{output} is the input; name another file, or use --in-place instead of -o")
     check_folder(report)
     if server:
         compensate_on_server(

@@ -62,7 +62,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     if any(c.contour_range_um for c in result.channels):
         table.add_row(
-            "contour rms, of all plants",
+            "contour rms, all plants",
             *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
         )
     table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
@@ -87,8 +87,8 @@ def print_result(result: Result, console: Console | None = None) -> None:
             console.print(_advice_line(result.advice), markup=False)
     if any(channel.name == "after" for channel in result.channels) and result.advice is None:
         console.print(
-            f"reverted to the sliced lines: {len(result.put_back)} of {result.pieces} pieces, "
-            f"{100 * result.put_back_extruding_share:.2f} % of the extruding time; left alone by "
+            f"reverted to the sliced lines: {len(result.put_back)} of {result.pieces} pieces "
+            f"({100 * result.put_back_extruding_share:.2f} % of the extruding time); left alone by "
             f"rule: {left_alone(result)}"
         )
     if result.slicer_time_s is not None:

@@ -3,81 +3,130 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
+from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
+    from stillpath.applications.controllers.design import Designed
     from stillpath.applications.controllers.options import ControllerOptions
 
 __all__ = ["register"]
 
-Method = Annotated[
-    str | None,
-    typer.Option(
-        help="fmsdob, fmsdob-adaptive, inverse-dob, dob, mmp, rc-wide, rc-quasi or rc-multirate."
-    ),
-]
 MachineOption = Annotated[
     str | None,
     typer.Option("--machine", "-m", help="A name of `stillpath loops`, or a JSON file's path."),
 ]
-Settings = Annotated[
+SettingsFile = Annotated[
     Path | None,
     typer.Option(
         "--options",
         metavar="FILE",
         exists=True,
         dir_okay=False,
-        help="Settings as a JSON document (docs/controllers.md); options given here go before.",
+        help="Settings as a JSON document (docs/controllers.md); other options override it.",
     ),
 ]
-Many = "Hz, separated by commas."
+_MANY = "Hz, separated by commas."
+
+
+@dataclass(frozen=True, slots=True)
+class SettingOptions:
+    """Settings of a controller: fields of `ControllerOptions`."""
+
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="fmsdob, fmsdob-adaptive, inverse-dob, dob, mmp, rc-wide, rc-quasi or "
+            "rc-multirate."
+        ),
+    ] = None
+    targets_hz: Annotated[str | None, typer.Option(help=f"Tones: {_MANY}")] = None
+    bandwidth_hz: Annotated[float | None, typer.Option(help="Width of each notch.")] = None
+    shape: Annotated[str | None, typer.Option(help="pointwise or hermite.")] = None
+    detuning: Annotated[float | None, typer.Option(help="Notches end at 1 - detuning.")] = None
+    tones: Annotated[int | None, typer.Option(help="fmsdob-adaptive: how many.")] = None
+    cutoff_hz: Annotated[float | None, typer.Option(help="dob: cutoff of its filter.")] = None
+    nominal: Annotated[str | None, typer.Option(help="dob: machine whose plant it takes.")] = None
+    fundamental_hz: Annotated[
+        float | None,
+        typer.Option("--fundamental-hz", "--period-hz", help="rc: fundamental of the error."),
+    ] = None
+    nyquist_pairs: Annotated[int | None, typer.Option(help="rc: zero pairs of the filter.")] = None
+    notches_hz: Annotated[str | None, typer.Option(help=f"rc: left alone. {_MANY}")] = None
+    fast: Annotated[
+        str | None, typer.Option(help="rc-multirate: the machine, identified at the fast rate.")
+    ] = None
+    alpha: Annotated[float | None, typer.Option(help="mmp, rc: pole radius.")] = None
+    uncertainty: Annotated[
+        float | None, typer.Option(help="Relative plant error to survive at every frequency.")
+    ] = None
+    duration_s: Annotated[float | None, typer.Option(help="Length of the time response.")] = None
+
+    def given(self) -> dict[str, Any]:
+        """Return the settings that were given, numbers and machines read."""
+        given = asdict(self) | {
+            "targets_hz": _numbers("--targets-hz", self.targets_hz),
+            "nominal": _reference(self.nominal),
+            "notches_hz": _numbers("--notches-hz", self.notches_hz),
+            "fast": _reference(self.fast),
+        }
+        return {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class OutputOptions:
+    """What is written of a controller."""
+
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="DIR", help="For controller.html, .json and .h."),
+    ] = None
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Coefficients, to be loaded.")
+    ] = None
+    c_header: Annotated[
+        Path | None, typer.Option("--c-header", metavar="FILE", help="The same as C.")
+    ] = None
+
+    def check(self) -> None:
+        """Refuse what cannot be written, before anything is computed."""
+        for file in (self.json_file, self.c_header):
+            if file is not None:
+                check_output(file)
+        check_folder(self.report)
+
+    def write(self, made: Designed) -> None:
+        """Write what was asked for."""
+        from stillpath.applications.controllers.page import write_controller
+        from stillpath.reports.pages import write_texts
+
+        if self.report is not None:
+            write_controller(made, self.report)
+        if self.json_file is not None:
+            text = json.dumps(made.report.controller, indent=2) + "\n"
+            write_texts(self.json_file.parent, {self.json_file.name: text})
+        if self.c_header is not None:
+            write_texts(self.c_header.parent, {self.c_header.name: made.controller.to_c_header()})
 
 
 def register(app: typer.Typer) -> None:
     """Add controller and loops to a command line."""
     for command in (controller, loops):
-        app.command()(command)
+        app.command()(grouped(command))
 
 
 def controller(
     machine: MachineOption = None,
-    method: Method = None,
-    options: Settings = None,
-    targets_hz: Annotated[str | None, typer.Option(help=f"Tones: {Many}")] = None,
-    bandwidth_hz: Annotated[float | None, typer.Option(help="Width of each notch.")] = None,
-    shape: Annotated[str | None, typer.Option(help="pointwise or hermite.")] = None,
-    detuning: Annotated[float | None, typer.Option(help="Notches end at 1 - detuning.")] = None,
-    tones: Annotated[int | None, typer.Option(help="fmsdob-adaptive: how many.")] = None,
-    cutoff_hz: Annotated[float | None, typer.Option(help="dob: of its filter.")] = None,
-    nominal: Annotated[str | None, typer.Option(help="dob: machine whose plant it takes.")] = None,
-    fundamental_hz: Annotated[
-        float | None, typer.Option("--fundamental-hz", "--period-hz", help="rc: of the error.")
-    ] = None,
-    nyquist_pairs: Annotated[int | None, typer.Option(help="rc: zero pairs of the filter.")] = None,
-    notches_hz: Annotated[str | None, typer.Option(help=f"rc: left alone. {Many}")] = None,
-    fast: Annotated[
-        str | None, typer.Option(help="rc-multirate: the machine, identified at the fast rate.")
-    ] = None,
-    alpha: Annotated[float | None, typer.Option(help="mmp, rc: pole radius.")] = None,
-    uncertainty: Annotated[
-        float | None, typer.Option(help="Relative plant error to survive at every frequency.")
-    ] = None,
-    duration_s: Annotated[float | None, typer.Option(help="Of the time response.")] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="DIR", help="For controller.html, .json and .h."),
-    ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Coefficients, to be loaded.")
-    ] = None,
-    c_header: Annotated[
-        Path | None, typer.Option("--c-header", metavar="FILE", help="The same as C.")
-    ] = None,
+    *,
+    options: SettingsFile = None,
+    settings: SettingOptions,
+    output: OutputOptions,
     show_list: Annotated[bool, typer.Option("--list", help="As `stillpath loops`.")] = False,
 ) -> None:
     """Design an add-on controller for a closed-loop machine."""
@@ -86,43 +135,15 @@ def controller(
         return
     if machine is None:
         raise typer.BadParameter("--machine is missing; `stillpath loops` lists what there is")
-    given: dict[str, Any] = {
-        "method": method,
-        "targets_hz": _numbers("--targets-hz", targets_hz),
-        "bandwidth_hz": bandwidth_hz,
-        "shape": shape,
-        "detuning": detuning,
-        "tones": tones,
-        "cutoff_hz": cutoff_hz,
-        "nominal": _reference(nominal),
-        "fundamental_hz": fundamental_hz,
-        "nyquist_pairs": nyquist_pairs,
-        "notches_hz": _numbers("--notches-hz", notches_hz),
-        "fast": _reference(fast),
-        "alpha": alpha,
-        "uncertainty": uncertainty,
-        "duration_s": duration_s,
-    }
-    chosen = _options(options, {key: value for key, value in given.items() if value is not None})
-    for file in (json_file, c_header):
-        if file is not None:
-            check_output(file)
-    check_folder(report)
+    chosen = _options(options, settings.given())
+    output.check()
 
     from stillpath.applications.controllers.design import design_controller
-    from stillpath.applications.controllers.page import write_controller
     from stillpath.cli.controller_tables import print_controller
     from stillpath.models.loops import load_loop
-    from stillpath.reports.pages import write_texts
 
     made = design_controller(chosen.loop or load_loop(machine), chosen)
-    if report is not None:
-        write_controller(made, report)
-    if json_file is not None:
-        text = json.dumps(made.report.controller, indent=2) + "\n"
-        write_texts(json_file.parent, {json_file.name: text})
-    if c_header is not None:
-        write_texts(c_header.parent, {c_header.name: made.controller.to_c_header()})
+    output.write(made)
     print_controller(made.report)
 
 

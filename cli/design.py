@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from stillpath.cli.arguments import MachineOption, check_folder
+from stillpath.cli.arguments import BasisOption, MachineOption, RobustOption, check_folder
 from stillpath.cli.machines import open_machines
+from stillpath.compensation.defaults import DEFAULT_BASIS
 
 __all__ = ["register"]
 
@@ -21,8 +22,8 @@ def register(app: typer.Typer) -> None:
 def design(
     machine: MachineOption,
     axis: Annotated[str, typer.Option(help="x or y.")],
-    basis: Annotated[str, typer.Option(help="ce-opt, robust, bspline or dct.")] = "ce-opt",
-    robust: Annotated[str, typer.Option(help="auto, off, ensemble or minimax.")] = "off",
+    basis: BasisOption = DEFAULT_BASIS,
+    robust: RobustOption = "off",
     report: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
     ] = None,
@@ -31,11 +32,11 @@ def design(
     check_folder(report)
     found = open_machines().to_look_at(machine, files=True).machine
 
-    from stillpath.applications.design.design import design_report
+    from stillpath.applications.design.design import DesignSettings, design_report
     from stillpath.applications.design.page import write_design
     from stillpath.cli.design_tables import print_design
 
-    made = design_report(found, axis, basis=basis, robust=robust)
+    made = design_report(found, axis, DesignSettings(basis=basis, robust=robust))
     if report is not None:
         write_design(made, report)
     print_design(made)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
-from stillpath.cli.machines import By, Message, open_documents, open_machines, who
+from stillpath.cli.machines import RevisionNote, open_documents, open_machines, who
+from stillpath.cli.option_groups import grouped
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
@@ -22,6 +25,9 @@ if TYPE_CHECKING:
     from stillpath.models.provenance import SourceFile
     from stillpath.pipeline.progress import ProgressCallback
 
+    Store = Callable[[Machine, Sequence[SourceFile]], Revision | None]
+    """Makes a revision of a machine that was measured, if it has a name."""
+
 __all__ = ["register"]
 
 Files = Annotated[
@@ -32,157 +38,196 @@ Files = Annotated[
         "the nozzle was), or any label; files with the same label are repeats.",
     ),
 ]
-Name = Annotated[
-    str | None,
-    typer.Option("--machine", "-m", help="Your machine: made, or given a new revision."),
-]
-Base = Annotated[
-    str | None,
-    typer.Option(help="What a new machine starts from: a name of `stillpath machines`, or a file."),
-]
-Output = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", metavar="OUT", help="Write the machine to a JSON file too."),
-]
 Report = Annotated[
     Path | None, typer.Option("--report", metavar="DIR", help="Folder for identification.html.")
 ]
+Axis: TypeAlias = Literal["x", "y", "a", "b"] | None
 AxisOption = Annotated[
-    Literal["x", "y", "a", "b"] | None,
+    Axis,
     typer.Option(help="Axis, if neither files nor their names say it. a, b: CoreXY's (--ripple)."),
 ]
-PerHz = Annotated[float | None, typer.Option(help="accel_per_hz of [resonance_tester].")]
-Low = Annotated[float | None, typer.Option(help="min_freq of [resonance_tester], Hz.")]
-High = Annotated[float | None, typer.Option(help="max_freq of [resonance_tester], Hz.")]
-Rate = Annotated[float | None, typer.Option(help="hz_per_sec of [resonance_tester].")]
-Sweep = Annotated[float | None, typer.Option(help="sweeping_accel; 0: none.")]
-Firmware = Annotated[
-    str | None, typer.Option(metavar="YYYY-MM-DD", help="Of the Klipper version that measured.")
-]
-Sensor = Annotated[
-    Literal["x", "y", "z"] | None, typer.Option(help="Sensor axis along the tested axis.")
-]
-Turned = Annotated[
-    bool, typer.Option("--sensor-turned", help="It was mounted differently for X and for Y.")
-]
-Columns = Annotated[
-    str | None,
-    typer.Option(metavar="T,U,Y", help="Columns of time, command and measurement of a drive."),
-]
-Repair = Annotated[
-    bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
-]
-Firm = Annotated[
-    bool,
-    typer.Option(
-        "--frame-firm",
-        help="The frame stands firm (bolted down, heavy): what the sensor feels is what prints.",
-    ),
-]
-DcGain = Annotated[
-    float | None, typer.Option(help="DC gain that a model may have: steps per mm are off by it.")
-]
-Sampling = Annotated[
-    float | None, typer.Option(help="Sampling time, s, of a discrete model that does not say.")
-]
-Ripple = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="NAME:PITCH[:1,2,3][@output]",
-        help="Learn ripple instead of plants: a part that repeats, its pitch in mm and harmonics. "
-        "FILEs are passes with time_s, position_mm and measured_mm or accel_mm_s2.",
-    ),
-]
-Gain = Annotated[
-    float, typer.Option(help="Share by which passes move ripple that is known already.")
-]
-Remaining = Annotated[
-    bool, typer.Option("--remaining", help="The passes ran with the known ripple undone.")
-]
-Homing = Annotated[float, typer.Option(metavar="MM", help="How exactly homing repeats.")]
+
+
+@dataclass(frozen=True, slots=True)
+class TargetOptions:
+    """The machine that is made or changed, and what it is made from."""
+
+    machine: Annotated[
+        str | None,
+        typer.Option("--machine", "-m", help="Your machine: made, or given a new revision."),
+    ] = None
+    base: Annotated[
+        str | None,
+        typer.Option(
+            help="What a new machine starts from: a name of `stillpath machines`, or a file."
+        ),
+    ] = None
+    title: Annotated[str | None, typer.Option(help="What people call the machine.")] = None
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT", help="Write the machine to a JSON file too."),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReaderOptions:
+    """What the files of measurements do not say: fields of `ReadSettings`, and `columns`."""
+
+    accel_per_hz_mm_s: Annotated[
+        float | None,
+        typer.Option("--accel-per-hz", help="accel_per_hz of [resonance_tester]."),
+    ] = None
+    f_start_hz: Annotated[
+        float | None, typer.Option("--min-freq", help="min_freq of [resonance_tester], Hz.")
+    ] = None
+    f_end_hz: Annotated[
+        float | None, typer.Option("--max-freq", help="max_freq of [resonance_tester], Hz.")
+    ] = None
+    hz_per_s: Annotated[
+        float | None, typer.Option("--hz-per-sec", help="hz_per_sec of [resonance_tester].")
+    ] = None
+    sweeping_accel_mm_s2: Annotated[
+        float | None, typer.Option("--sweeping-accel", help="sweeping_accel; 0: none.")
+    ] = None
+    firmware_date: Annotated[
+        str | None, typer.Option(metavar="YYYY-MM-DD", help="Of the Klipper version that measured.")
+    ] = None
+    sensor_axis: Annotated[
+        Literal["x", "y", "z"] | None, typer.Option(help="Sensor axis along the tested axis.")
+    ] = None
+    sensor_turned: Annotated[
+        bool, typer.Option("--sensor-turned", help="It was mounted differently for X and for Y.")
+    ] = False
+    frame_firm: Annotated[
+        bool,
+        typer.Option(
+            "--frame-firm",
+            help="The frame stands firm (bolted down, heavy): what the sensor feels is what "
+            "prints.",
+        ),
+    ] = False
+    columns: Annotated[
+        str | None,
+        typer.Option(metavar="T,U,Y", help="Columns of time, command and measurement of a drive."),
+    ] = None
+    repair_rounding: Annotated[
+        bool, typer.Option("--repair-rounding", help="Move printed coefficients to DC gain 1.")
+    ] = False
+    dc_gain: Annotated[
+        float | None,
+        typer.Option(help="DC gain that a model may have: steps per mm are off by it."),
+    ] = None
+    sampling_s: Annotated[
+        float | None, typer.Option(help="Sampling time, s, of a discrete model that does not say.")
+    ] = None
+
+    def chosen(self, axis: Axis) -> ReadSettings:
+        """Return the settings of the readers, checked."""
+        from pydantic import ValidationError
+
+        from stillpath.models.identification.readers import ReadSettings
+        from stillpath.service.wrong_options import wrong_option
+
+        given = asdict(self)
+        given |= {"axis": axis, **_columns(given.pop("columns"))}
+        try:
+            return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
+        except ValidationError as error:
+            raise ModelError(wrong_option(error, _CALLED)) from None
+
+
+@dataclass(frozen=True, slots=True)
+class RippleOptions:
+    """Which ripple is learnt, and how."""
+
+    ripple: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME:PITCH[:1,2,3][@output]",
+            help="Learn ripple instead of plants: a part that repeats, its pitch in mm and "
+            "harmonics. FILEs are passes with time_s, position_mm and measured_mm or accel_mm_s2.",
+        ),
+    ] = None
+    gain: Annotated[
+        float, typer.Option(help="Share by which passes move ripple that is known already.")
+    ] = 0.5
+    remaining: Annotated[
+        bool, typer.Option("--remaining", help="The passes ran with the known ripple undone.")
+    ] = False
+    homing_repeatability: Annotated[
+        float, typer.Option(metavar="MM", help="How exactly homing repeats.")
+    ] = 0.0
 
 
 def register(app: typer.Typer) -> None:
     """Add identify to a command line."""
-    app.command("identify")(run)
+    app.command("identify")(grouped(run))
 
 
 def run(
     files: Files,
-    machine: Name = None,
-    base: Base = None,
-    title: Annotated[str | None, typer.Option(help="Of the machine.")] = None,
-    output: Output = None,
+    *,
+    target: TargetOptions,
     report: Report = None,
     axis: AxisOption = None,
-    accel_per_hz: PerHz = None,
-    min_freq: Low = None,
-    max_freq: High = None,
-    hz_per_sec: Rate = None,
-    sweeping_accel: Sweep = None,
-    firmware_date: Firmware = None,
-    sensor_axis: Sensor = None,
-    sensor_turned: Turned = False,
-    frame_firm: Firm = False,
-    columns: Columns = None,
-    repair_rounding: Repair = False,
-    dc_gain: DcGain = None,
-    sampling_s: Sampling = None,
+    readers: ReaderOptions,
     max_order: Annotated[int, typer.Option(min=1, max=8, help="Most modes to try.")] = 4,
-    ripple: Ripple = None,
-    gain: Gain = 0.5,
-    remaining: Remaining = False,
-    homing_repeatability: Homing = 0.0,
-    by: By = None,
-    message: Message = "",
+    ripple: RippleOptions,
+    note: RevisionNote,
 ) -> None:
     """Make a machine of measurements. Resonance tests, recorded drives, responses, models.
 
     Without --machine and --output nothing is stored: the figures are printed.
     """
-    settings = _settings(
-        axis=None if ripple else axis,
-        accel_per_hz_mm_s=accel_per_hz,
-        f_start_hz=min_freq,
-        f_end_hz=max_freq,
-        hz_per_s=hz_per_sec,
-        sweeping_accel_mm_s2=sweeping_accel,
-        firmware_date=firmware_date,
-        sensor_axis=sensor_axis,
-        sensor_turned=sensor_turned,
-        frame_firm=frame_firm,
-        repair_rounding=repair_rounding,
-        dc_gain=dc_gain,
-        sampling_s=sampling_s,
-        **_columns(columns),
-    )
-    if output is not None:
-        check_output(output)
+    settings = readers.chosen(None if ripple.ripple else axis)
+    if target.output is not None:
+        check_output(target.output)
     check_folder(report)
     machines = open_machines()
-    start, expected = _start(machines, machine, base)
-    if ripple:
-        from stillpath.applications.identification.ripple import learn_from_files
+    start, expected = _start(machines, target.machine, target.base)
+    store = partial(_stored, machines, target, note, expected)
+    if ripple.ripple:
+        _learn_ripple(files, start, target, axis, ripple, store)
+    else:
+        _identify_plants(files, start, target, settings, max_order, store, report)
 
-        learnt = learn_from_files(
-            files,
-            start,
-            axis,
-            ripple,
-            gain=gain,
-            remaining=remaining,
-            homing_repeatability_mm=homing_repeatability,
-            name=machine,
-            title=title,
-        )
-        made = _stored(
-            machines, machine, learnt.machine, learnt.sources, who(by), message, expected
-        )
-        _write(output, learnt.machine)
-        typer.echo(learnt.summary)
-        _tell(made)
-        return
 
+def _learn_ripple(
+    files: list[str],
+    start: Machine,
+    target: TargetOptions,
+    axis: Axis,
+    chosen: RippleOptions,
+    store: Store,
+) -> None:
+    from stillpath.applications.identification.ripple import learn_from_files
+
+    learnt = learn_from_files(
+        files,
+        start,
+        axis,
+        chosen.ripple or [],
+        gain=chosen.gain,
+        remaining=chosen.remaining,
+        homing_repeatability_mm=chosen.homing_repeatability,
+        name=target.machine,
+        title=target.title,
+    )
+    made = store(learnt.machine, learnt.sources)
+    _write(target.output, learnt.machine)
+    typer.echo(learnt.summary)
+    _print_revision(made)
+
+
+def _identify_plants(
+    files: list[str],
+    start: Machine,
+    target: TargetOptions,
+    settings: ReadSettings,
+    max_order: int,
+    store: Store,
+    report: Path | None,
+) -> None:
     from stillpath.applications.identification.archive import Archive
     from stillpath.applications.identification.page import write_identification
     from stillpath.applications.identification.run import identify_files, read_inputs
@@ -194,21 +239,20 @@ def run(
             read_inputs(files),
             start,
             settings,
-            name=machine,
-            title=title,
+            name=target.machine,
+            title=target.title,
             max_order=max_order,
-            progress=_told(progress),
+            progress=_with_times(progress),
         )
-    sources = found.report.sources
-    made = _stored(machines, machine, found.machine, sources, who(by), message, expected)
+    made = store(found.machine, found.report.sources)
     if made is not None:
         # Where the service looks for them.
         Archive(open_documents("identifications")).keep(found.report)
     if report is not None:
         write_identification(found.report, report)
-    _write(output, found.machine)
+    _write(target.output, found.machine)
     print_identification(found.report)
-    _tell(made)
+    _print_revision(made)
 
 
 def _write(output: Path | None, machine: Machine) -> None:
@@ -230,18 +274,6 @@ _CALLED = {
     "measured_column": "columns",
 }
 """Settings of readers that are called otherwise on the command line."""
-
-
-def _settings(**given: Any) -> ReadSettings:
-    from pydantic import ValidationError
-
-    from stillpath.models.identification.readers import ReadSettings
-    from stillpath.service.wrong_options import wrong_option
-
-    try:
-        return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
-    except ValidationError as error:
-        raise ModelError(wrong_option(error, _CALLED)) from None
 
 
 def _columns(text: str | None) -> dict[str, str]:
@@ -274,33 +306,32 @@ def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Mach
 
 def _stored(
     machines: Resolver,
-    name: str | None,
+    target: TargetOptions,
+    note: RevisionNote,
+    expected: int,
     machine: Machine,
     sources: Sequence[SourceFile],
-    author: str,
-    message: str,
-    expected: int,
 ) -> Revision | None:
     """Make a revision, before anything else is written: the store may refuse."""
-    if name is None:
+    if target.machine is None:
         return None
     return machines.store.add_revision(
-        name,
+        target.machine,
         machine,
-        author=author,
-        message=message or f"identified from {', '.join(s.name for s in sources)}",
+        author=who(note.by),
+        message=note.message or f"identified from {', '.join(s.name for s in sources)}",
         sources=sources,
         expected=expected,
     )
 
 
-def _tell(made: Revision | None) -> None:
+def _print_revision(made: Revision | None) -> None:
     if made is not None:
         name = made.machine.name
         typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
 
 
-def _told(progress: ProgressCallback) -> Callable[[str, float], None]:
+def _with_times(progress: ProgressCallback) -> Callable[[str, float], None]:
     from stillpath.pipeline.progress import Progress
 
     began = time.monotonic()

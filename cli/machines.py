@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import typer
 from typer.core import TyperGroup
 
+from stillpath.cli.option_groups import grouped
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
     from stillpath.models.machine import Machine
     from stillpath.service.settings import Settings
 
-__all__ = ["app", "data_dir", "open_documents", "open_machines", "who"]
+__all__ = ["RevisionNote", "app", "data_dir", "open_documents", "open_machines", "who"]
 
 _LARGEST_LOG_BYTES = 10_000_000
 
@@ -53,6 +55,25 @@ By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you
 Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
 
 
+@dataclass(frozen=True, slots=True)
+class RevisionNote:
+    """Who makes a revision, and why."""
+
+    by: By = None
+    message: Message = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NewMachine:
+    """What a machine is called, and its resonances until they are measured."""
+
+    name: Annotated[str, typer.Option("--name", help="The machine's name.")]
+    title: Annotated[str, typer.Option(help="What people call it.")] = ""
+    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None
+    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None
+    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07
+
+
 def open_machines() -> Resolver:
     """Return the machines of this user, by the environment's settings."""
     from stillpath.applications.machines.resolve import Resolver
@@ -78,7 +99,7 @@ def open_documents(name: str) -> Documents:
 
         settings = _service_settings()
         if engine.database_url(settings).get_backend_name() != "sqlite":
-            # Without a pool nothing is left open behind a command.
+            # Without a pool nothing is left open after a command.
             return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
     return DocumentFolder(data_dir() / name)
 
@@ -196,7 +217,7 @@ def rollback(
 ) -> None:
     """Bring an earlier revision back, as a new one."""
     store = open_machines().store
-    _told(store.roll_back(name, to, author=who(by), message=message))
+    _print_revision(store.roll_back(name, to, author=who(by), message=message))
 
 
 @app.command()
@@ -237,7 +258,7 @@ def import_(
     from stillpath.applications.machines.transfer import import_file
 
     store = open_machines().store
-    _told(import_file(store, file, author=who(by), message=message, name=name))
+    _print_revision(import_file(store, file, author=who(by), message=message, name=name))
 
 
 @app.command()
@@ -250,7 +271,7 @@ def put(
 
     machine = load_machine(file)
     store = open_machines().store
-    _told(
+    _print_revision(
         store.add_revision(
             machine.name,
             machine,
@@ -294,7 +315,7 @@ def set_firmware(
         sources=[source],
         expected=None if as_name is None else 0,
     )
-    _told(revision)
+    _print_revision(revision)
     for line in _refused(machine):
         typer.echo(line)
 
@@ -341,7 +362,7 @@ def motors(
         author=who(by),
         message=message or f"motors tried up to {best.accel_mm_s2:.0f} mm/s2",
     )
-    _told(revision)
+    _print_revision(revision)
 
 
 @app.command()
@@ -354,7 +375,7 @@ def delete(name: Name) -> None:
 @app.command()
 def restore(name: Name) -> None:
     """Bring back the machine that was deleted last under a name."""
-    _told(open_machines().store.restore(name))
+    _print_revision(open_machines().store.restore(name))
 
 
 @app.command()
@@ -391,13 +412,10 @@ def check(
 
 
 @app.command("from-config")
+@grouped
 def from_config(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Klipper's printer.cfg.")],
-    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
-    title: Annotated[str, typer.Option(help="What people call it.")] = "",
-    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
-    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
-    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
+    made: NewMachine,
     by: By = None,
 ) -> None:
     """Make a machine from a printer.cfg: limits and travel, with plants still to be measured."""
@@ -406,32 +424,31 @@ def from_config(
     from stillpath.applications.machines.revision import source_file
 
     config = read_printer_config(file)
-    machine = machine_from_config(config, name, title=title, f_hz=(fx, fy), zeta=zeta)
+    machine = machine_from_config(
+        config, made.name, title=made.title, f_hz=(made.fx, made.fy), zeta=made.zeta
+    )
     revision = open_machines().store.add_revision(
-        name,
+        made.name,
         machine,
         author=who(by),
         message=f"from {file.name}; plants typed in",
         sources=[source_file(file.name, file.read_bytes())],
         expected=0,
     )
-    _told(revision)
+    _print_revision(revision)
     for line in not_followed(config):
         typer.echo(f"note: {line}")
 
 
 @app.command("from-m503")
+@grouped
 def from_m503(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What Marlin answers to M503.")],
-    name: Annotated[str, typer.Option("--name", help="The machine's name.")],
+    made: NewMachine,
     travel: Annotated[
         str, typer.Option(metavar="XxYxZ", help="How far the axes reach, mm: 235x235x250.")
     ],
     kinematics: Annotated[str, typer.Option(help="cartesian or corexy.")] = "cartesian",
-    title: Annotated[str, typer.Option(help="What people call it.")] = "",
-    fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None,
-    fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None,
-    zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07,
     fields: Annotated[
         list[str] | None,
         typer.Option(
@@ -451,23 +468,23 @@ def from_m503(
     machine = marlin_settings.machine_from_m503(
         content.decode(errors="replace"),
         file.name,
-        name,
+        made.name,
         travel_mm=marlin_settings.read_travel(travel),
         kinematics=kinematics,
-        title=title,
-        f_hz=(fx, fy),
-        zeta=zeta,
+        title=made.title,
+        f_hz=(made.fx, made.fy),
+        zeta=made.zeta,
         fields=fields or (),
     )
     revision = open_machines().store.add_revision(
-        name,
+        made.name,
         machine,
         author=who(by),
         message=f"M503 in {file.name}; plants typed in",
         sources=[source_file(file.name, content)],
         expected=0,
     )
-    _told(revision)
+    _print_revision(revision)
     said = {field.partition("=")[0].strip() for field in fields or ()}
     assumed = [
         f"{field}={str(value).lower()}"
@@ -553,7 +570,7 @@ def _m503(file: Path) -> bytes:
         raise ModelError(f"cannot read {file}: {error.strerror}") from None
 
 
-def _told(revision: Revision) -> None:
+def _print_revision(revision: Revision) -> None:
     typer.echo(f"{revision.machine.name}: revision {revision.number} ({revision.machine.revision})")
 
 

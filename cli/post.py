@@ -31,7 +31,7 @@ def compensate_in_place(
     name : str
         What the report calls the file; slicers hand over temporary ones.
     tell : callable
-        Is told the stage and the share that is done; may raise to stop the work.
+        Is report the stage and the share that is done; may raise to stop the work.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def compensate_in_place(
     from stillpath.reports import render_report
     from stillpath.service.wrong_options import wrong_option
 
-    def told(progress: Progress) -> None:
+    def report(progress: Progress) -> None:
         tell(progress.stage, progress.fraction)
 
     try:
@@ -63,7 +63,7 @@ def compensate_in_place(
         from stillpath.service.compiling import compiling_reported
 
         tell("starting", None)
-        with compiling_reported(told) as progress:
+        with compiling_reported(report) as progress:
             result = compensate_file(path, path, found.machine, chosen, progress=progress)
     except ValidationError as error:
         raise Refused(wrong_option(error)) from None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stillpath.cli.remote import KeyOption, ServerOption
+from stillpath.cli.arguments import KeyOption, ServerOption
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:

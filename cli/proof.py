@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,56 +10,75 @@ import typer
 
 from stillpath.cli.arguments import MachineOption, check_folder, check_output
 from stillpath.cli.machines import By, Message, open_machines, who
+from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import Resolver
     from stillpath.applications.proof.program import PrintSettings
     from stillpath.applications.proof.ring_figures import RingReport
+    from stillpath.models.machine import Machine
 
 __all__ = ["register"]
 
 Output = Annotated[
     Path, typer.Option("--output", "-o", metavar="OUT", dir_okay=False, help="The file to write.")
 ]
-NozzleTemp = Annotated[float, typer.Option("--nozzle-temp", help="°C, 150 to 350.")]
-BedTemp = Annotated[float, typer.Option("--bed-temp", help="°C, 0 to 150.")]
-Fan = Annotated[float, typer.Option("--fan-percent", help="Part cooling above the base.")]
-Flow = Annotated[
-    float, typer.Option("--max-flow", help="What the hotend melts, mm3/s; bounds the speed.")
-]
-Centre = Annotated[
-    str | None,
-    typer.Option("--at", metavar="X,Y", help="Middle of the print. [default: of the travel]"),
-]
 StartGcode = Annotated[
     Path | None,
     typer.Option(exists=True, dir_okay=False, help="Lines instead of homing and heating."),
 ]
-EndGcode = Annotated[
-    Path | None,
-    typer.Option(exists=True, dir_okay=False, help="Lines instead of switching off and parking."),
-]
+
+
+@dataclass(frozen=True, slots=True)
+class PrintOptions:
+    """How a proof is printed: temperatures, cooling, flow, place, and the lines around it."""
+
+    nozzle_temp: Annotated[float, typer.Option(help="°C, 150 to 350.")] = 210.0
+    bed_temp: Annotated[float, typer.Option(help="°C, 0 to 150.")] = 60.0
+    fan_percent: Annotated[float, typer.Option(help="Part cooling above the base.")] = 100.0
+    max_flow: Annotated[
+        float, typer.Option(help="What the hotend melts, mm3/s; bounds the speed.")
+    ] = 12.0
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y", help="Middle of the print. [default: of the travel]"),
+    ] = None
+    start_gcode: StartGcode = None
+    end_gcode: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Lines instead of switching off and parking."
+        ),
+    ] = None
+
+    def chosen(self) -> PrintSettings:
+        """Return the settings of the print."""
+        from stillpath.applications.proof.program import PrintSettings
+
+        return PrintSettings(
+            nozzle_temp_c=self.nozzle_temp,
+            bed_temp_c=self.bed_temp,
+            fan_percent=self.fan_percent,
+            max_flow_mm3_s=self.max_flow,
+            centre_mm=None if self.at is None else _point(self.at),
+            start_gcode=_text(self.start_gcode),
+            end_gcode=_text(self.end_gcode),
+        )
 
 
 def register(app: typer.Typer) -> None:
     """Add coupon, tower, ring-test, motor-test and verify to a command line."""
     for command in (coupon, tower, ring_test, motor_test, verify):
-        app.command()(command)
+        app.command()(grouped(command))
 
 
 def coupon(
     machine: MachineOption,
     output: Output,
-    nozzle_temp: NozzleTemp = 210.0,
-    bed_temp: BedTemp = 60.0,
-    fan_percent: Fan = 100.0,
-    max_flow: Flow = 12.0,
-    at: Centre = None,
-    start_gcode: StartGcode = None,
-    end_gcode: EndGcode = None,
+    how: PrintOptions,
 ) -> None:
     """Write a first print: half as planned, half compensated."""
-    settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
+    settings = how.chosen()
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.coupon import write_coupon
@@ -74,17 +94,12 @@ def tower(
     machine: MachineOption,
     axis: Annotated[Literal["x", "y"], typer.Option(help="Whose ringing is wanted.")],
     output: Output,
+    *,
     bands: Annotated[int, typer.Option(help="Bands of rising acceleration, 2 to 12.")] = 6,
-    nozzle_temp: NozzleTemp = 210.0,
-    bed_temp: BedTemp = 60.0,
-    fan_percent: Fan = 100.0,
-    max_flow: Flow = 12.0,
-    at: Centre = None,
-    start_gcode: StartGcode = None,
-    end_gcode: EndGcode = None,
+    how: PrintOptions,
 ) -> None:
     """Write a ringing tower: half as planned, half compensated."""
-    settings = _settings(nozzle_temp, bed_temp, fan_percent, max_flow, at, start_gcode, end_gcode)
+    settings = how.chosen()
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.applications.proof.tower import write_tower
@@ -190,27 +205,37 @@ def verify(
     from stillpath.applications.proof.ring_motion import is_ring_test
 
     if is_ring_test(printed):
-        from stillpath.applications.proof.confirming import verify_ring
-        from stillpath.cli.proof_tables import print_ring
-        from stillpath.reports.pages import write_texts
-
-        told = verify_ring(printed, logs, found)
-        if report is not None:
-            write_texts(report, {"ring-test.json": told.model_dump_json(indent=1)})
-        print_ring(told)
+        said = _verify_ring(printed, logs, found, report)
         if remember:
-            _remember(machines, machine, told, who(by), message)
+            _remember(machines, machine, said, who(by), message)
         return
+    if len(logs) > 1:
+        raise typer.BadParameter("of a print, one log is compared at a time")
+    _verify_print(printed, logs[0], found, report)
 
+
+def _verify_ring(
+    printed: Path, logs: list[Path], machine: Machine, report: Path | None
+) -> RingReport:
+    from stillpath.applications.proof.confirming import verify_ring
+    from stillpath.cli.proof_tables import print_ring
+    from stillpath.reports.pages import write_texts
+
+    made = verify_ring(printed, logs, machine)
+    if report is not None:
+        write_texts(report, {"ring-test.json": made.model_dump_json(indent=1)})
+    print_ring(made)
+    return made
+
+
+def _verify_print(printed: Path, log: Path, machine: Machine, report: Path | None) -> None:
     from stillpath.applications.proof.page import write_readback
     from stillpath.applications.proof.readback import verify_log
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_readback
 
-    if len(logs) > 1:
-        raise typer.BadParameter("of a print, one log is compared at a time")
     with progress_shown("stillpath") as progress:
-        made = verify_log(printed, logs[0], found, progress=progress)
+        made = verify_log(printed, log, machine, progress=progress)
     if report is not None:
         write_readback(made, report)
     print_readback(made)
@@ -235,28 +260,6 @@ def _remember(machines: Resolver, name: str, report: RingReport, author: str, me
         sources=tuple(dict.fromkeys(s for c in said.values() for s in c.sources)),
     )
     typer.echo(f"{name} revision {made.number}: content {made.machine.revision}")
-
-
-def _settings(
-    nozzle_temp: float,
-    bed_temp: float,
-    fan_percent: float,
-    max_flow: float,
-    at: str | None,
-    start_gcode: Path | None,
-    end_gcode: Path | None,
-) -> PrintSettings:
-    from stillpath.applications.proof.program import PrintSettings
-
-    return PrintSettings(
-        nozzle_temp_c=nozzle_temp,
-        bed_temp_c=bed_temp,
-        fan_percent=fan_percent,
-        max_flow_mm3_s=max_flow,
-        centre_mm=None if at is None else _point(at),
-        start_gcode=_text(start_gcode),
-        end_gcode=_text(end_gcode),
-    )
 
 
 def _text(file: Path | None) -> str | None:

@@ -12,32 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
+from stillpath.cli.arguments import KeyOption, ServerOption
+
 if TYPE_CHECKING:
     from stillpath.pipeline.options import Options
     from stillpath.service.api.schemas import JobView
     from stillpath.service.client import Client
 
-__all__ = ["KeyOption", "ServerOption", "compensate_on_server", "register"]
+__all__ = ["compensate_on_server", "register"]
 
-ServerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--server",
-        metavar="URL",
-        envvar="STILLPATH_SERVER",
-        help="Let a service do it, for instance http://127.0.0.1:8000.",
-    ),
-]
-KeyOption = Annotated[
-    str | None,
-    typer.Option(
-        "--key",
-        metavar="KEY",
-        envvar="STILLPATH_KEY",
-        show_envvar=False,
-        help="Of the service; better in the environment (STILLPATH_KEY), where nobody sees it.",
-    ),
-]
 Id = Annotated[str, typer.Argument(metavar="JOB", help="As `stillpath jobs list` names it.")]
 Output = Annotated[
     Path | None,
@@ -208,12 +191,12 @@ def _progress() -> Iterator[_Tell]:
 
 
 def _reports(tell: _Tell) -> Callable[[JobView], None]:
-    def told(job: JobView) -> None:
+    def report(job: JobView) -> None:
         waits = job.state.value == "queued" and job.queue_position
         stage = f"waiting behind {job.queue_position} jobs" if waits else job.stage
         tell(stage, job.progress, job.eta_s)
 
-    return told
+    return report
 
 
 def _print_figures(report: dict[str, Any]) -> None:

@@ -3,22 +3,77 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
+from stillpath.cli.option_groups import grouped
 
 if TYPE_CHECKING:
     from stillpath.applications.controllers.options import Disturbance
+    from stillpath.applications.scanning.scan import ScanSettings
 
 __all__ = ["register"]
 
 
+@dataclass(frozen=True, slots=True)
+class DrawingOptions:
+    """How the file is drawn: fields of `ScanSettings`."""
+
+    um_per_unit: Annotated[
+        float | None, typer.Option(help="How far the beam moves per unit of the machine.")
+    ] = None
+    prefilter: Annotated[
+        Literal["zpetc", "fbf", "none"], typer.Option(help="From the path to the command.")
+    ] = "zpetc"
+    cutoff_hz: Annotated[float | None, typer.Option(help="zpetc: zero-phase low-pass on top.")] = (
+        None
+    )
+    jump_mm_s: Annotated[
+        float, typer.Option(min=1e-3, max=1e6, help="Speed with the beam off.")
+    ] = 2000.0
+    settle_ms: Annotated[
+        float, typer.Option(min=0.0, max=1e3, help="Wait at the end of a jump.")
+    ] = 0.5
+    disturbance: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            exists=True,
+            dir_okay=False,
+            help="In the machine's unit, as JSON. [default: the controller's]",
+        ),
+    ] = None
+    enters: Annotated[
+        Literal["output", "input"] | None, typer.Option(help="Where the disturbance enters.")
+    ] = None
+    disturbance_um: Annotated[
+        float,
+        typer.Option(min=0.0, max=1e6, help="rms that the controller's disturbance would leave."),
+    ] = 10.0
+
+    def chosen(self) -> ScanSettings:
+        """Return the settings, the disturbance read."""
+        from stillpath.applications.scanning.scan import ScanSettings
+        from stillpath.gcode.hatches import Timing
+
+        return ScanSettings(
+            um_per_unit=self.um_per_unit,
+            prefilter=self.prefilter,
+            cutoff_hz=self.cutoff_hz,
+            timing=Timing(self.jump_mm_s, 1e-3 * self.settle_ms),
+            disturbance=None if self.disturbance is None else _read(self.disturbance),
+            enters=self.enters,
+            disturbance_um=self.disturbance_um,
+        )
+
+
 def register(app: typer.Typer) -> None:
     """Add scan to a command line."""
-    app.command()(scan)
+    app.command()(grouped(scan))
 
 
 def scan(
@@ -32,6 +87,7 @@ def scan(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="OUT", help="The command: OUT.csv or OUT.npz.")
     ],
+    *,
     controller: Annotated[
         Path | None,
         typer.Option(
@@ -41,37 +97,7 @@ def scan(
             help="Add-on, as `stillpath controller --json` wrote it.",
         ),
     ] = None,
-    um_per_unit: Annotated[
-        float | None, typer.Option(help="How far the beam moves per unit of the machine.")
-    ] = None,
-    prefilter: Annotated[
-        Literal["zpetc", "fbf", "none"], typer.Option(help="From the path to the command.")
-    ] = "zpetc",
-    cutoff_hz: Annotated[
-        float | None, typer.Option(help="zpetc: zero-phase low-pass on top.")
-    ] = None,
-    jump_mm_s: Annotated[
-        float, typer.Option(min=1e-3, max=1e6, help="Speed with the beam off.")
-    ] = 2000.0,
-    settle_ms: Annotated[
-        float, typer.Option(min=0.0, max=1e3, help="Wait at the end of a jump.")
-    ] = 0.5,
-    disturbance: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            exists=True,
-            dir_okay=False,
-            help="In the machine's unit, as JSON. [default: the controller's]",
-        ),
-    ] = None,
-    enters: Annotated[
-        Literal["output", "input"] | None, typer.Option(help="Where the disturbance enters.")
-    ] = None,
-    disturbance_um: Annotated[
-        float,
-        typer.Option(min=0.0, max=1e6, help="rms that the controller's disturbance would leave."),
-    ] = 10.0,
+    drawing: DrawingOptions,
     report: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="For scan.html and scan.json.")
     ] = None,
@@ -86,22 +112,12 @@ def scan(
 
     from stillpath.applications.controllers.loading import load_controller
     from stillpath.applications.scanning.page import write_command, write_scan
-    from stillpath.applications.scanning.scan import ScanSettings, scan_file
+    from stillpath.applications.scanning.scan import scan_file
     from stillpath.cli.scan_tables import print_scan
-    from stillpath.gcode.hatches import Timing
     from stillpath.models.loops import load_loop
 
-    settings = ScanSettings(
-        um_per_unit=um_per_unit,
-        prefilter=prefilter,
-        cutoff_hz=cutoff_hz,
-        timing=Timing(jump_mm_s, 1e-3 * settle_ms),
-        disturbance=None if disturbance is None else _read(disturbance),
-        enters=enters,
-        disturbance_um=disturbance_um,
-    )
     add_on = None if controller is None else load_controller(controller)
-    made = scan_file(source, load_loop(machine), settings, add_on)
+    made = scan_file(source, load_loop(machine), drawing.chosen(), add_on)
     if report is not None:
         write_scan(made.report, report)
     write_command(made, output.resolve())

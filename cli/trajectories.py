@@ -8,16 +8,20 @@ from typing import Annotated
 import typer
 
 from stillpath.cli.arguments import (
+    BudgetOption,
     DialectOption,
     Input,
     MachineOption,
+    MethodOption,
     PlateOption,
     Refused,
+    RobustOption,
     check_input,
     check_output,
     chosen_options,
 )
 from stillpath.cli.machines import open_machines
+from stillpath.compensation.defaults import DEFAULT_METHOD
 
 __all__ = ["register"]
 
@@ -41,11 +45,9 @@ def trajectories(
     stop: Annotated[
         float | None, typer.Option("--to", metavar="S", help="Second of the print. [default: end]")
     ] = None,
-    method: Annotated[str, typer.Option(help="As `compensate` has it; none: as sliced.")] = "fbf",
-    robust: Annotated[str, typer.Option(help="As `compensate` has it.")] = "off",
-    budget_um: Annotated[
-        float | None, typer.Option("--budget-um", help="As `compensate` has it.")
-    ] = None,
+    method: MethodOption = DEFAULT_METHOD,
+    robust: RobustOption = "off",
+    budget_um: BudgetOption = None,
     plate: PlateOption = None,
     dialect: DialectOption = None,
 ) -> None:
@@ -61,8 +63,6 @@ def trajectories(
         method=method, robust=robust, budget_um=budget_um, plate=plate, dialect=dialect
     )
 
-    from stillpath.cli.machines import open_machines
-
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.cli.console import progress_shown
@@ -75,8 +75,7 @@ def trajectories(
             found.machine,
             options,
             format="npz" if chosen == "npz" else "csv",
-            start_s=start,
-            stop_s=stop,
+            window_s=(start, stop),
             progress=progress,
         )
     typer.echo(f"{rows} rows, {rows / 1000:.3f} s")

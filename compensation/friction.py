@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import Compensator
-from stillpath.compensation.holds import stand_still
 from stillpath.compensation.overlay import Overlay
+from stillpath.compensation.rests import stand_still
 from stillpath.models.friction import bend_of
 from stillpath.models.machine import Machine
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError, Memoryless
-from stillpath.compensation.holds import stand_still
 from stillpath.compensation.inversion import Inversion, invert
+from stillpath.compensation.rests import stand_still
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, plant_set
 

@@ -65,7 +65,7 @@ class LiftedWindow:
     advance : ndarray, shape (nz - 2, nz - 2)
         States after `update` samples without a command.
     reach : ndarray, shape (nz - 2, window)
-        States behind the window, from its samples of the command; the last m columns are the same
+        States after the window, from its samples of the command; the last m columns are the same
         for m samples.
     """
 

@@ -23,6 +23,7 @@ from scipy.linalg import qr, solve_triangular
 from stillpath.compensation._least_squares_kernels import BLOCK
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.lifted_window import LiftedWindow
 
 __all__ = ["MAX_CONDITION", "MAX_SPECTRAL_RADIUS", "PreviewDesign", "running_gram"]
@@ -87,7 +88,7 @@ class PreviewDesign:
         self,
         lifted: LiftedWindow,
         n: int,
-        basis: str = "ce-opt",
+        basis: str = DEFAULT_BASIS,
         price: float = 0.0,
         psi: Array | None = None,
     ) -> None:

@@ -88,7 +88,7 @@ class AxisTask:
     weight : ndarray, shape (n,)
         Weight of the errors in windows that hold a rest.
     stops : ndarray of int64, shape (k, 2)
-        Ranges [a, b) of samples in which the command stands, those before and behind the piece
+        Ranges [a, b) of samples in which the command stands, those before and after the piece
         included.
     bounds : Bounds
     rms_limit_mm_s2 : float
@@ -274,7 +274,7 @@ class PreviewAxis:
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Let the axis follow a command that was not ours, up to the sample behind its last."""
+        """Let the axis follow a command that was not ours, up to the sample after its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])

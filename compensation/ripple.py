@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from scipy.signal import firwin
 
 from stillpath.compensation.base import Compensator, DesignError, Memoryless
-from stillpath.compensation.holds import stand_still
 from stillpath.compensation.inversion import Inversion, invert
 from stillpath.compensation.overlay import Overlay
+from stillpath.compensation.rests import stand_still
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, plant_set
 from stillpath.models.ripple import MachineRipple, RippleTable

@@ -141,7 +141,7 @@ class ScheduledCompensator:
         weights = self._grid.weights(y_d_mm)
         shares = {p: w for p, w in zip(self._points, weights, strict=True) if np.any(w)}
         self._used = tuple(shares)
-        commands = {p: self._told(p).compensate(y_d_mm, extruding, rests) for p in shares}
+        commands = {p: self._with_past(p).compensate(y_d_mm, extruding, rests) for p in shares}
         if len(commands) == 1:
             self._last = commands[self._used[0]]
         else:
@@ -164,7 +164,7 @@ class ScheduledCompensator:
             self._made[point].ease(self._share)
         return self._made[point]
 
-    def _told(self, point: OperatingPoint) -> Compensator:
+    def _with_past(self, point: OperatingPoint) -> Compensator:
         """Return a compensator that knows how the machine vibrates."""
         one = self._compensator(point)
         if point not in self._knowing:

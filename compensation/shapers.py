@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation._shaper_kernels import add_delayed
 from stillpath.compensation.base import DesignError, Memoryless
-from stillpath.compensation.holds import stand_still
+from stillpath.compensation.rests import stand_still
 from stillpath.models import shaper_pulses as firmware
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine

@@ -115,7 +115,7 @@ class Extremes(NamedTuple):
 
     @classmethod
     def of(cls, command: Array, last: float, previous: float, *, stops: bool = False) -> Extremes:
-        """Look at a command that follows two others, and whether it stops behind its end."""
+        """Look at a command that follows two others, and whether it stops after its end."""
         return cls(*extremes(command, last, previous, stops))
 
 

@@ -15,7 +15,7 @@ F_HOMING = 12  # offset that stays through homing (Klipper's SET_GCODE_OFFSET)
 F_SPEED = 16  # mm/s
 F_SPEED_FACTOR = 17  # mm/s per mm/min of F
 F_EXTRUDE_FACTOR = 18
-F_UNIT_MM = 19  # 1, or 25.4 behind G20
+F_UNIT_MM = 19  # 1, or 25.4 after G20
 F_LOW = 20  # travel of x y z
 F_HIGH = 23
 F_UNIT_E_MM = 26  # mm of filament per unit of E (inches, cubic millimetres)
@@ -68,7 +68,7 @@ I_ORIGIN_RULE = 33
 I_ZERO_FEED = 34  # an F of 0 or less is passed over
 I_FACTOR_DEFAULT = 35  # M220 and M221 without S set 100 %
 I_FIRST_WINS = 36  # of repeated words
-I_EXPONENTS = 37  # an E right behind a digit belongs to the number
+I_EXPONENTS = 37  # an E right after a digit belongs to the number
 I_LONGEST = 38  # characters of a command that are read
 I_AXES_FACTORS = 39  # M220 and M221 hold for moves of an axis only
 I_ONE_COMMAND = 40  # a second G or M in a line is no command of its own
@@ -130,11 +130,11 @@ class ExtruderRule(IntEnum):
     """When E is relative."""
 
     WITH_AXES = 0
-    """Behind M83, and behind G91 (Klipper)."""
+    """After M83, and after G91 (Klipper)."""
     FOLLOWS_AXES = 1
     """As the last of G90, G91, M82, M83 says (Marlin)."""
     APART = 2
-    """Behind M83 only (RepRapFirmware)."""
+    """After M83 only (RepRapFirmware)."""
 
 
 class ArcRule(IntEnum):
@@ -162,4 +162,4 @@ class OriginRule(IntEnum):
     OFFSET = 1
     """Moves the origin; without words nothing (Marlin)."""
     POSITION = 2
-    """Tells the machine where its axes are, behind a stop (RepRapFirmware)."""
+    """Tells the machine where its axes are, after a stop (RepRapFirmware)."""

@@ -24,7 +24,7 @@ def home(state: MachineState, command: Command) -> int:
 def retract(state: MachineState, command: Command) -> int:
     """G10 and G11: a move of E, and a hop of Z, that the G-code's coordinates do not see.
 
-    RepRapFirmware has them as M103 and M101 too. Repeated ones are passed over. Z is lifted behind
+    RepRapFirmware has them as M103 and M101 too. Repeated ones are passed over. Z is lifted after
     the retraction and lowered before filament comes back (Marlin fwretract.cpp 2.0.x;
     RepRapFirmware GCodes.cpp RetractFilament 3.5).
     """

@@ -33,7 +33,7 @@ class Detection:
     certainty : float
         From 0 (nothing tells) to 1.
     reasons : tuple of str
-        What speaks for it, and behind "but" what speaks for another one.
+        What speaks for it, and after "but" what speaks for another one.
     """
 
     dialect: str
@@ -59,7 +59,7 @@ def _sign(dialect: str, weight: float, pattern: bytes, reason: str) -> _Sign:
 
 
 _MOVES = re.compile(rb"^(?:G[01] .*\n)+", re.MULTILINE)
-# Commands stand at the start of a line, behind blanks and a line number.
+# Commands stand at the start of a line, after blanks and a line number.
 _LINE = rb"^[ \t]*(?:N\d+[ \t]+)?"
 _SIGNS = (
     # What the slicer calls its flavour, and the printer it sliced for.

@@ -117,7 +117,7 @@ class Dialect:
     first_wins: bool = False
     """Of repeated words the first counts, not the last."""
     exponents: bool = False
-    """An E right behind a digit belongs to the number."""
+    """An E right after a digit belongs to the number."""
     longest_command: int = 65_536
     """Characters of a command line, the comment not counted."""
     cut_long_commands: bool = False

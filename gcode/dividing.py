@@ -127,7 +127,7 @@ def _lines(piece: Piece, start: int, end: int, begin: int, until: int) -> Verbat
 
 
 def _state(piece: Piece, at_byte: int) -> tuple[Limits, ModalState]:
-    """Return limits and modes behind the last line that starts before a byte of the file."""
+    """Return limits and modes after the last line that starts before a byte of the file."""
     found = piece.limits_before, piece.modal_before
     latest = -1
     for table in (piece.moves, piece.events):

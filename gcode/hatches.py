@@ -46,7 +46,7 @@ class Hatches:
         F; 0 for G0, which jumps as fast as the machine does.
     beam : ndarray of bool, shape (n,)
     dwell_s : ndarray, shape (n,)
-        Standing time behind the move (G4).
+        Standing time after the move (G4).
     line : ndarray of int64, shape (n,)
     passed_over : tuple of str
         Commands that mean nothing here.

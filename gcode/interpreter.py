@@ -1,9 +1,9 @@
 """From bytes to moves and events, as the firmware of a dialect reads them.
 
 `Interpreter` takes a file in pieces of any size. The kernel (`_lex_kernels.run`) carries out the
-plain lines; lines it hands back are carried out here and it goes on behind them. Every byte of
+plain lines; lines it hands back are carried out here and it goes on after them. Every byte of
 the file belongs to exactly one line, and every line is one event, or one or more moves, or moves
-and behind them the event that stops the machine.
+and after them the event that stops the machine.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ class Interpreter:
         return self._read(text)
 
     def _read(self, text: bytes) -> list[ProgramBlock]:
-        """Read whole lines; behind them is the padding."""
+        """Read whole lines; after them is the padding."""
         # Only meanwhile: snapshots that hold themselves would wait for the garbage collector.
         self.state.carry_out = self._command
         try:

@@ -39,7 +39,7 @@ class Command:
     name : str
         ``G1``, ``M117``, ``SET_VELOCITY_LIMIT``, ``if``; empty for a blank line or a comment.
     words : mapping of str to str
-        Text behind each letter; empty where there is no number.
+        Text after each letter; empty where there is no number.
     text : str
         The whole line as it was read.
     dropped : str
@@ -223,7 +223,7 @@ def _next_command(code: str, dialect: Dialect, text: str, dropped: str) -> tuple
 
 
 def _value(code: str, p: int, dialect: Dialect) -> tuple[str, int, bool]:
-    """Read what stands behind a letter: text, where it ends, whether it is an expression."""
+    """Read what stands after a letter: text, where it ends, whether it is an expression."""
     q = p
     while q < len(code) and code[q] == " ":
         q += 1
@@ -276,7 +276,7 @@ def extended_parameters(text: str, name: str, *, line: int | None = None) -> Map
 def _pairs(text: str, name: str) -> Mapping[str, str]:
     rest = text[text.upper().find(name) + len(name) :]
     if not text.upper().startswith(name):
-        # Behind a line number there may be a checksum.
+        # After a line number there may be a checksum.
         star = rest.rfind("*")
         if star >= 0 and rest[star + 1 :].isdigit():
             rest = rest[:star]

@@ -36,7 +36,7 @@ class VerbatimPart:
     limits, modal : lists
         Tables of the rows' `limits_id` and `modal_id`.
     limits_before, limits_after : Limits
-        Planner limits in force before the first line, and behind the last.
+        Planner limits in force before the first line, and after the last.
     modal_before, modal_after : ModalState
         Modes before the first and after the last line.
     """

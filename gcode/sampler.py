@@ -76,7 +76,7 @@ def sample_phases(
     Returns
     -------
     position_mm : ndarray, shape (4, n) or (2, n)
-        x y z e, or x y. Before the first phase its start, behind a phase its end.
+        x y z e, or x y. Before the first phase its start, after a phase its end.
     row : ndarray of int64, shape (n,)
         Row of `phases` in force.
 

@@ -138,7 +138,7 @@ class Splitter:
         return [self._tables[0][k] for k in limits], [self._tables[1][k] for k in modal]
 
     def _first_barrier(self, events: Events, most: int) -> int | None:
-        """Return the first of `most` moves behind which a piece cannot go on; None: there is none.
+        """Return the first of `most` moves after which a piece cannot go on; None: there is none.
 
         A stop ends a piece, G92 unless it is of one plain E, M221, or a stream's other limits. What
         lies before the first move does not.
@@ -182,7 +182,7 @@ class Splitter:
         raw |= xy & (length > self._longest_s * moves.speed_mm_s)
         feed = np.abs(travel[:, 3])
         raw |= xy & (feed > WILD_FEED_MM) & (feed > WILD_RATIO * length)
-        # Behind an object mark the firmware may jump: that travel runs as the slicer wrote it.
+        # After an object mark the firmware may jump: that travel runs as the slicer wrote it.
         marks = events.move_index[events.kind == EventKind.OBJECT]
         if self._after_mark:
             marks = np.concatenate([[0], marks])
@@ -366,7 +366,7 @@ def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
 
 
 def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, bool]:
-    """Row behind which to end a piece, and whether the plan stops there by itself.
+    """Row after which to end a piece, and whether the plan stops there by itself.
 
     The best place is a rest before filament is fed again (nothing oozes there), then any
     extruder-only move, then a Z move, then the slowest corner of the last ten seconds.

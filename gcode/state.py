@@ -80,7 +80,7 @@ class MachineState:
     f, i : ndarray
         Numbers; slots in `gcode._slots`.
     buffer, span : ndarray, (int, int)
-        The text that is being read, and where the line in hand begins (behind blanks and its
+        The text that is being read, and where the line in hand begins (after blanks and its
         number) and ends in it.
     carry_out : function
         Carries out another command of the same line (the interpreter's).

@@ -141,7 +141,7 @@ def build_timeline(
             start[i] = now
             row_start[rows] = now + lead_s + offset[:-1]
             now = dt_s * np.ceil((now + lead_s + offset[-1] + tail_s) / dt_s - _GRID_EPS)
-            # However short: a stretch has a sample of its own behind the rest.
+            # However short: a stretch has a sample of its own after the rest.
             now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now
     samples = int(np.ceil(now / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)

@@ -60,7 +60,7 @@ def complaint(entry: Mapping[str, Any], *, repeat: bool = True) -> str:
     Returns
     -------
     str
-        To be put behind the name of the field: ``must be at least 0.5 µm (given: -1)``.
+        To be put after the name of the field: ``must be at least 0.5 µm (given: -1)``.
     """
     context = {name: _number(value) for name, value in entry.get("ctx", {}).items()}
     kind = str(entry.get("type", ""))
@@ -79,7 +79,7 @@ def complaint(entry: Mapping[str, Any], *, repeat: bool = True) -> str:
 
 
 def _unit(place: tuple[int | str, ...]) -> str:
-    """Return the unit that the last name of a place says, behind a blank."""
+    """Return the unit that the last name of a place says, after a blank."""
     name = next((str(part) for part in reversed(place) if isinstance(part, str)), "")
     return next((f" {unit}" for end, unit in _UNITS.items() if name.endswith(end)), "")
 

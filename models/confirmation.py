@@ -22,7 +22,7 @@ Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 
 
 class Confirmation(Document):
-    """Predicted and measured vibration of one axis behind stops, as compensated.
+    """Predicted and measured vibration of one axis after stops, as compensated.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Confirmation(Document):
     measured_um, scatter_um : float
         The same measured, the noise floor taken off, with its standard error from repeats.
     uncompensated_um : float
-        Measured behind the same stops as planned.
+        Measured after the same stops as planned.
     ratio : float
         `measured_um` over `uncompensated_um`.
     sources : tuple of SourceFile

@@ -330,7 +330,7 @@ def _check(blocks: tuple[Block, ...]) -> None:
 
 
 def _ordered(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Put blocks that need their input at once behind those who write it."""
+    """Put blocks that need their input at once after those who write it."""
     done = [b for b in blocks if not b.direct]
     waiting = [b for b in blocks if b.direct]
     while waiting:

@@ -16,7 +16,7 @@ T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
 _ALL_BITS = 6
-"""Of a long print, every second block behind the first 64 tells enough, every fourth behind the
+"""Of a long print, every second block after the first 64 tells enough, every fourth after the
 first 128, and so on; each counts for all that it stands for."""
 _TOGETHER = 16
 """Blocks are transformed so many at a time, as to prepare for it takes longer than a block."""
@@ -106,8 +106,8 @@ class BandContent:
                 if beyond > NOTABLE_UM:
                     found.append(
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
-                        f"{high_hz:g} Hz, where its model was not measured (band_hz): figures are "
-                        "a guess there. Measure up to higher frequencies, or print with less "
+                        f"{high_hz:g} Hz, where its model was not measured (band_hz): the figures "
+                        "are a guess there. Measure up to higher frequencies, or print with less "
                         "acceleration."
                     )
             if trust_hz is not None:
@@ -115,15 +115,15 @@ class BandContent:
                 if beyond > NOTABLE_UM:
                     found.append(
                         f"Axis {axis}: {beyond:.1f} um rms of the planned motion lie above "
-                        f"{trust_hz:.3g} Hz, from where its model is not to be trusted "
-                        "(trust_below_hz; the phase was not measured): a raw accelerometer log "
-                        "would tell."
+                        f"{trust_hz:.3g} Hz, where its model cannot be trusted "
+                        "(trust_below_hz): the phase was not measured. A raw accelerometer log "
+                        "would tell it."
                     )
         return found
 
 
 def _span(before: NDArray[T], behind: NDArray[T], start: int, stop: int) -> NDArray[T]:
-    """Return the samples start..stop - 1 of two arrays, the second being behind the first."""
+    """Return the samples start..stop - 1 of two arrays, the second being after the first."""
     held = before.shape[-1]
     if start >= held:
         return behind[..., start - held : stop - held]

@@ -8,20 +8,16 @@ motion.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import io
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
 
 from stillpath.compensation.base import DesignError
-from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
@@ -40,10 +36,11 @@ from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import caution_for, prediction_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
-from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
+from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.last_check.comparing import LastCheck
-from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
-from stillpath.pipeline.measuring.measure import Measurement, channel_names
+from stillpath.pipeline.measuring.layer_files import LayerWriter
+from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
@@ -60,7 +57,7 @@ from stillpath.pipeline.piece_compensator import (
     as_executed,
     deviation,
 )
-from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports
 from stillpath.pipeline.reading import dialect_for, doubts, passed_over
 from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge, narrower
@@ -124,8 +121,8 @@ def compensate_file(
     if options.method == "advise":
         if trace is not None:
             raise GcodeError(
-                "an advised file has moves of its own times: ask for the trajectories of the "
-                "written file, not compensated"
+                "method advise gives the moves times of their own: ask for the trajectories of the "
+                "written file instead"
             )
         from stillpath.pipeline.advising.advise import advise_file
 
@@ -138,57 +135,53 @@ def compensate_file(
             progress=progress,
             layers=layers,
         )
-    unpacking, packing = (
-        progress_to(progress, "unpacking", 0.0),
-        progress_to(progress, "packing", 1.0),
-    )
-    with (
-        contextlib.ExitStack() as files,
-        replacing(target) as temporary,
-        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
-    ):
-        with (
-            rewriting(container, temporary, name=target, told=packing) as text,
-            tempfile.TemporaryFile(dir=target.parent) as spool,
-        ):
-            facts = container.facts()
-            writer = None
-            if layers is not None:
-                writer = files.enter_context(
-                    written_layers(layers, channel_names(compensated=True))
-                )
-            go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
-            # Within a budget a file may be written more than once: only the last time is traced.
-            traced = None if _Job.has_budget(options) else trace
-            budget: SpeedBudget | None = None
-            while True:
-                job = go(writer, traced, budget)
-                try:
-                    result = job.run(source.name, facts)
-                except TooLarge:
-                    options = _fitting(options, source.name)
-                    go = partial(_Job, container.text, spool, machine, options, cache_dir, progress)
-                    spool.seek(0)
-                    spool.truncate()
-                    writer = writer.anew() if writer is not None else None
-                    continue
-                budget = job.gentler
-                if budget is None and traced is trace:
-                    break
-                if budget is None:
-                    budget, traced = job.same, trace
-                spool.seek(0)
-                spool.truncate()
-                writer = writer.anew() if writer is not None else None
-            spool.seek(0)
-            result = job.deliver(result, text)
-            if options.times == "new":
-                container.delay(job.delay_s)
-        sizes = {
-            "original_bytes": source.stat().st_size,
-            "written_bytes": temporary.stat().st_size,
-        }
-        return result.model_copy(update=sizes)
+    opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
+    with opened as file:
+        order = _Order(machine, options, cache_dir, progress)
+        job, result = _final_job(file, order, source.name, trace)
+        file.spool.seek(0)
+        result = job.deliver(result, file.text)
+        if options.times == "new":
+            file.container.delay(job.delay_s)
+    return result.model_copy(update=file.sizes)
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """What a file is compensated with."""
+
+    machine: Machine
+    options: Options
+    cache_dir: Path | None = None
+    progress: ProgressCallback | None = None
+
+
+def _final_job(
+    file: FileRewriting,
+    order: _Order,
+    name: str,
+    trace: Callable[[Trace], None] | None,
+) -> tuple[_Job, Result]:
+    """Run jobs until what one writes fits `max_mb` and keeps the budget; return that one."""
+    # Within a budget a file may be written more than once: only the last time is traced.
+    traced = None if _Job.has_budget(order.options) else trace
+    budget: SpeedBudget | None = None
+    layers = file.layers
+    while True:
+        job = _Job(file.container.text, file.spool, order, layers, traced, budget)
+        try:
+            result = job.run(name, file.container.facts())
+        except TooLarge:
+            order = replace(order, options=_fitting(order.options, name))
+        else:
+            budget = job.gentler
+            if budget is None and traced is trace:
+                return job, result
+            if budget is None:
+                budget, traced = job.same, trace
+        file.spool.seek(0)
+        file.spool.truncate()
+        layers = layers.anew() if layers is not None else None
 
 
 def _fitting(options: Options, name: str) -> Options:
@@ -196,8 +189,8 @@ def _fitting(options: Options, name: str) -> Options:
     less = narrower(options)
     if less is None:
         raise GcodeError(
-            f"{name} does not fit into max_mb {options.max_mb:g} even if its outer walls alone are "
-            "compensated: allow more, or take a larger tolerance_um"
+            f"{name} exceeds max_mb {options.max_mb:g} even if only its outer walls are "
+            "compensated: allow more, or choose a larger tolerance_um"
         )
     return less
 
@@ -234,41 +227,23 @@ class _Job:
         self,
         source: BinaryIO,
         target: BinaryIO,
-        machine: Machine,
-        options: Options,
-        cache_dir: Path | None,
-        progress: ProgressCallback | None,
-        layers: LayerWriter | None,
-        trace: Callable[[Trace], None] | None,
-        budget: SpeedBudget | None,
+        order: _Order,
+        layers: LayerWriter | None = None,
+        trace: Callable[[Trace], None] | None = None,
+        budget: SpeedBudget | None = None,
     ) -> None:
+        machine, options = order.machine, order.options
         self._layers = layers
         self._source, self._target = source, target
         self._machine, self._options = machine, options
-        self._reports = ProgressReports(progress)
+        self._reports = ProgressReports(order.progress)
         self._clock = StageClock()
         self._changes = options.method != "none"
         self._adapter = adapter(machine)
         self._rounds = max(self._adapter.step_mm[:2]) > 0.0
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
-        # A method that cannot be designed says so before the reference shaper takes its seconds.
-        tuned_first = options.method.startswith("shaper:")
-        if self._changes and not tuned_first:
-            self._say("designing", 0.0)
-            with self._clock.stage("design"):
-                self._work = PieceCompensator(machine, options)
-        self._say("tuning the shaper to compare with", 0.0)
-        with self._clock.stage("reference shaper"):
-            self._shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-            chosen = caution_for(
-                machine, options, self._shaper, cache_dir or default_cache_dir(), DT_S
-            )
-        self._caution = chosen[0] if chosen else None
-        self._choice = chosen[1] if chosen else None
-        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
-        if tuned_first or self._caution is not None:
-            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
+        self._design(order.cache_dir or default_cache_dir())
         dialect = dialect_for(machine, options.dialect)
         self._length = LengthGuard(source, machine, dialect)
         self._reader = Interpreter(machine, dialect=dialect)
@@ -278,23 +253,7 @@ class _Job:
         self._operation = Operation(machine)
         self._budget = budget
         self._pairs: BudgetMeasurement | None = None
-        take_layer = layers.add if layers else None
-        size = source.seek(0, io.SEEK_END)
-        if self.has_budget(options):
-            self._pairs = BudgetMeasurement(
-                machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
-            )
-            self._measurement: Measurement = self._pairs
-        else:
-            self._measurement = Measurement(
-                machine,
-                DT_S,
-                self._shaper,
-                compensated=True,
-                take_layer=take_layer,
-                trace=trace,
-                size=size,
-            )
+        self._measurement = self._measuring(trace)
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._adapter, stamp(machine, options))
@@ -304,6 +263,44 @@ class _Job:
         self._sum.warnings += doubts(source, machine, options.dialect)
         if options.budget_um is not None and not self._changes:
             self._sum.warnings.append("The method none changes nothing: the budget was not used.")
+
+    def _design(self, cache_dir: Path) -> None:
+        """Tune the reference shaper and design the command."""
+        machine, options = self._machine, self._options
+        # A method that cannot be designed says so before the reference shaper takes its seconds.
+        tuned_first = options.method.startswith("shaper:")
+        if self._changes and not tuned_first:
+            self._say("designing", 0.0)
+            with self._clock.stage("design"):
+                self._work = PieceCompensator(machine, options)
+        self._say("tuning the shaper to compare with", 0.0)
+        with self._clock.stage("reference shaper"):
+            self._shaper = cached_shaper(machine, cache_dir, DT_S)
+            chosen = caution_for(machine, options, self._shaper, cache_dir, DT_S)
+        self._caution = chosen[0] if chosen else None
+        self._choice = chosen[1] if chosen else None
+        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
+        if tuned_first or self._caution is not None:
+            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
+
+    def _measuring(self, trace: Callable[[Trace], None] | None) -> Measurement:
+        """Return the measurement of the written file; with a budget, of every pace as well."""
+        take_layer = self._layers.add if self._layers else None
+        size = self._source.seek(0, io.SEEK_END)
+        if self.has_budget(self._options):
+            self._pairs = BudgetMeasurement(
+                self._machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
+            )
+            return self._pairs
+        return Measurement(
+            self._machine,
+            DT_S,
+            self._shaper,
+            compensated=True,
+            take_layer=take_layer,
+            trace=trace,
+            size=size,
+        )
 
     @staticmethod
     def has_budget(options: Options) -> bool:
@@ -342,7 +339,7 @@ class _Job:
             self._operation.passed(item.moves)
             self._say("compensating", self._source.tell() / size)
         if self._sum.moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
+            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
             self._wait(switching_s(self._checker.push(text)))
@@ -432,7 +429,7 @@ class _Job:
             except Unfit as error:
                 reason = str(error)
             except GcodeError as error:  # its line is one of what was written
-                reason = f"the firmware would refuse what was made of it: {error.message}"
+                reason = f"the firmware would refuse the compensated lines: {error.message}"
         else:
             self._sum.time_s -= switched_s
             self._put_back(piece, original_s, reason)
@@ -674,6 +671,15 @@ class _Job:
     def _say(self, stage: str, fraction: float) -> None:
         self._reports.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
 
+    def _shaper_warnings(self) -> Iterator[str]:
+        if self._writer.shaper_unknown:
+            yield (
+                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
+                "is switched off and stays off; set it again after the print."
+            )
+        if self._writer.shaper_note is not None:
+            yield self._writer.shaper_note
+
     def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
         """Yield a warning where the firmware's shaper, without compensation, would do better."""
         ours, shaper = rms_um["after"], rms_um["shaper"]
@@ -701,17 +707,11 @@ class _Job:
 
     def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
         total, measured = self._sum, self._measurement
-        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
-        if self._changes and self._writer.shaper_unknown:
-            warnings.append(
-                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
-                "is switched off and stays off; set it again after the print."
-            )
-        if self._changes and self._writer.shaper_note is not None:
-            warnings.append(self._writer.shaper_note)
         channels = self._channels()
+        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
         notes = [*self._standing, *self._operation.notes()]
         if self._changes:
+            warnings += self._shaper_warnings()
             warnings += total.left_alone()
             warnings += self._outdone({c.name: _counting_rms_um(c) for c in channels})
             notes += total.left_out(self._options.where)
@@ -720,7 +720,7 @@ class _Job:
             names, sums = self._reader.feature_names, self._pairs.sums()
             budget = self._budget.figures(sums, names, total.original_s, total.time_s)
             warnings += self._budget.warnings(sums, names)
-            notes = [*notes, self._pairs.note]
+            notes.append(self._pairs.note)
         return Result(
             version=__version__,
             machine=self._machine.name,

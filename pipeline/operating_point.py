@@ -16,7 +16,7 @@ __all__ = ["Operation"]
 
 _ALL_KNOWN = 7
 _LONGEST_RETRACTION_MM = 20.0
-"""Filament that is pulled back further has left the hotend: a change of filament or tool, behind
+"""Filament that is pulled back further has left the hotend: a change of filament or tool, after
 which the firmware may load on its own, and nothing is owed to what was pulled back."""
 
 
@@ -97,7 +97,7 @@ class Operation:
         return notes
 
     def _laid(self, moves: Moves) -> tuple[float, float | None]:
-        """Filament that the moves lay down, and the extruder's furthest position behind them."""
+        """Filament that the moves lay down, and the extruder's furthest position after them."""
         if self._kg_per_mm == 0.0 or len(moves) == 0:
             return 0.0, self._furthest_mm
         e_mm = moves.end_mm[:, 3]

@@ -16,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
 from stillpath.compensation.registry import COMPENSATORS
 from stillpath.models.machine import Machine
 from stillpath.version import __version__
@@ -42,7 +43,7 @@ _METHOD = rf"^(advise|({'|'.join(_PLAIN)})(\+ripple)?)$"
 def _known(method: str) -> str:
     if re.fullmatch(_METHOD, method) is None:
         raise ValueError(
-            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple behind it, "
+            f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple appended, "
             "and advise"
         )
     return method
@@ -61,7 +62,7 @@ class Options(BaseModel):
     """Settings of one compensation job; the same settings give the same bytes.
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
-    with a firmware shaper's name; with `+ripple` behind it the machine's ripple is undone as well.
+    with a firmware shaper's name; with `+ripple` appended the machine's ripple is undone as well.
     `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`).
     `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
     the set of plants that explain the measurement, with as much of a shaper's smoothing as no
@@ -80,8 +81,8 @@ class Options(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    method: MethodName = "fbf"
-    basis: BasisName = "ce-opt"
+    method: MethodName = DEFAULT_METHOD
+    basis: BasisName = DEFAULT_BASIS
     robust: RobustMode = "auto"
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = None
     plate: Annotated[int, Field(ge=1)] | None = None

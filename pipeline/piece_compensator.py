@@ -55,7 +55,7 @@ _SOFT_S = (2e-3, 4e-3, 8e-3)
 
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
-"""Filament is smoothed over so many times its mm per mm, before and behind, and no further."""
+"""Filament is smoothed over so many times its mm per mm, before and after, and no further."""
 _EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
@@ -425,7 +425,7 @@ def deviation(piece: CompensatedPiece, executed: Phases) -> NDArray[np.float64]:
         timeline.dt_s,
         first,
         encoded.group_start_s - timeline.start_s - origin_s,
-        # In a rest, time waits where the stretch behind it begins.
+        # In a rest, time waits where the stretch after it begins.
         np.append(encoded.group_start_s[1:], np.inf) - origin_s,
     )
 

@@ -10,7 +10,7 @@ __all__ = ["Cancelled", "Progress", "ProgressCallback", "ProgressReports", "prog
 
 
 _SURE = 0.02
-"""Share behind which the time still needed can be told."""
+"""Share after which the time still needed can be told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class ProgressReports:
 def progress_to(
     callback: ProgressCallback | None, stage: str, fraction: float
 ) -> Callable[[float], None]:
-    """Return a callback for a stage before or behind the work that `fraction` counts.
+    """Return a callback for a stage before or after the work that `fraction` counts.
 
     What it is given, the share of the stage itself, only shows that there is life.
     """

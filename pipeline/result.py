@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import BaseModel, ConfigDict
 
 __all__ = [
+    "NOTHING_COMPENSATED",
     "AdviceFigures",
     "AdvisedFeature",
     "AdvisedShaper",
@@ -34,7 +37,7 @@ class ErrorFigures(_Figures):
     contour_rms_um: float
     """Distance to the planned path, root mean square over time [um]."""
     contour_max_um: float
-    """Distance to the planned path, largest [um]; while the nozzle stands behind the end of a line
+    """Distance to the planned path, largest [um]; while the nozzle stands after the end of a line
     and rings, 0.1 s at most, it counts for that line."""
     tracking_rms_um: float
     """Distance to where the nozzle was planned to be at that moment, root mean square [um]."""
@@ -154,7 +157,7 @@ class BudgetClass(_Figures):
     """The same with the best firmware shaper at the same budget."""
     contour_rms_um: float
     """Contour error of what it extrudes, root mean square of the worst plant of the machine's set
-    [um]; for travel of what is extruded in the 50 ms behind one, where it may be two budgets (it
+    [um]; for travel of what is extruded in the 50 ms after one, where it may be two budgets (it
     counts for its feature as well)."""
     seconds: float
     """Time in which that was measured [s]."""
@@ -292,7 +295,7 @@ class Result(_Figures):
     put_back_extruding_share: float
     """Their share of the extruding time, 0 to 1."""
     left_alone_s: float = 0.0
-    """Time of the moves that keep their own lines by rule [s]: those behind homing or an object's
+    """Time of the moves that keep their own lines by rule [s]: those after homing or an object's
     mark, steep ones, and others whose place or state is not known; reverted pieces not counted."""
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
@@ -324,3 +327,18 @@ class Result(_Figures):
     """What is advised, by method `advise`."""
     last_check: LastCheckFigures | None = None
     """What the last check compared; null where nothing was compensated."""
+
+
+NOTHING_COMPENSATED: dict[str, Any] = {
+    "segments": 0,
+    "segments_per_s": 0.0,
+    "peak_segments_per_s": 0.0,
+    "emission_rms_um": 0.0,
+    "emission_max_um": 0.0,
+    "filament_error_mm": 0.0,
+    "compensated_s": 0.0,
+    "pieces": 0,
+    "put_back": [],
+    "put_back_extruding_share": 0.0,
+}
+"""Figures of a `Result` whose moves stay as they are."""

@@ -39,7 +39,7 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
 from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
-from stillpath.pipeline.result import Result, StageTime
+from stillpath.pipeline.result import NOTHING_COMPENSATED, Result, StageTime
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
 
@@ -141,8 +141,6 @@ def simulate_file(
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
     motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
-    extruding_s = 0.0
-    peak_velocity = 0.0
     with contextlib.ExitStack() as files:
         writer = None
         if layers is not None:
@@ -158,26 +156,7 @@ def simulate_file(
             size=source.stat().st_size,
         )
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
-
-        def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
-            for samples, point in ready:
-                measurement.operate_at(point)
-                measurement.add(samples)
-
-        for part in motion:
-            if part.jumped:
-                add(stream.flush())
-                measurement.jump()
-            with clock.stage("measure"):
-                samples = part.motion()
-                moves = part.own_moves()
-                add(stream.push(samples, part.shaping, operation.at(moves)))
-                operation.passed(moves)
-            extruding_s += DT_S * float(np.sum(samples.extruding))
-            if len(samples) > 1:
-                step = np.hypot(*np.diff(samples.path_mm))
-                peak_velocity = max(peak_velocity, float(step.max()) / DT_S)
-        add(stream.flush())
+        seen = _measure(motion, stream, measurement, operation, clock)
         measurement.finish()
         if writer is not None:
             writer.finish(motion.feature_names)
@@ -200,19 +179,9 @@ def simulate_file(
         slicer_time_s=motion.facts.estimate_s,
         original_bytes=size,
         written_bytes=size,
-        segments=0,
-        segments_per_s=0.0,
-        peak_segments_per_s=0.0,
-        peak_velocity_mm_s=peak_velocity,
         peak_accel_mm_s2=0.0,
-        emission_rms_um=0.0,
-        emission_max_um=0.0,
-        filament_error_mm=0.0,
-        compensated_s=0.0,
-        extruding_s=extruding_s,
-        pieces=0,
-        put_back=[],
-        put_back_extruding_share=0.0,
+        peak_velocity_mm_s=seen.peak_velocity_mm_s,
+        extruding_s=seen.extruding_s,
         warnings=[*motion.warnings, *measurement.warnings()],
         notes=notes,
         layers=measurement.layers(),
@@ -221,7 +190,51 @@ def simulate_file(
         spectra=measurement.spectra(),
         layer_views=measurement.layer_views(),
         stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+        **NOTHING_COMPENSATED,
     )
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What is added up while motion is measured."""
+
+    extruding_s: float = 0.0
+    peak_velocity_mm_s: float = 0.0
+
+    def add(self, samples: MotionSamples) -> None:
+        self.extruding_s += DT_S * float(np.sum(samples.extruding))
+        if len(samples) > 1:
+            step = np.hypot(*np.diff(samples.path_mm))
+            self.peak_velocity_mm_s = max(self.peak_velocity_mm_s, float(step.max()) / DT_S)
+
+
+def _measure(
+    motion: _Motion,
+    stream: ShapedMotion | LiveMotion,
+    measurement: Measurement,
+    operation: Operation,
+    clock: StageClock,
+) -> _Seen:
+    """Measure a whole motion as the firmware's shaper, or the filter in Klipper, passes it on."""
+    seen = _Seen()
+
+    def add(ready: Iterator[tuple[MotionSamples, OperatingPoint]]) -> None:
+        for samples, point in ready:
+            measurement.operate_at(point)
+            measurement.add(samples)
+
+    for part in motion:
+        if part.jumped:
+            add(stream.flush())
+            measurement.jump()
+        with clock.stage("measure"):
+            samples = part.motion()
+            moves = part.own_moves()
+            add(stream.push(samples, part.shaping, operation.at(moves)))
+            operation.passed(moves)
+        seen.add(samples)
+    add(stream.flush())
+    return seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,7 +291,7 @@ class TextMotion:
         What the machine stands longer is left out of the samples.
     shaping : Shaping
         The firmware's shaper before the first line.
-    told : callable, optional
+    progress : callable, optional
         Is given the share of the file that is read and the time that it takes, now and then.
     each : callable, optional
         Is given every block of the program before its motion.
@@ -301,12 +314,12 @@ class TextMotion:
         *,
         longest_stand_s: float = np.inf,
         shaping: Shaping = OFF,
-        told: Callable[[float, float], None] = lambda _share, _time_s: None,
+        progress: Callable[[float, float], None] = lambda _share, _time_s: None,
         each: Callable[[ProgramBlock], None] = lambda _block: None,
     ) -> None:
         self._file, self._machine, self._dialect = file, machine, dialect
         self._longest_stand_s = longest_stand_s
-        self._told, self._each = told, each
+        self._progress, self._each = progress, each
         self._left_out_s = self._end_s = 0.0
         self._held: list[tuple[int, Moves]] = []
         self._jumps: list[int] = []
@@ -345,7 +358,7 @@ class TextMotion:
                 for samples, path_mm in self._sampled(self._shortened(phases), final=False):
                     yield from self._parts(samples, path_mm)
             self.time_s = planner.time_s
-            self._told(file.tell() / size, self.time_s)
+            self._progress(file.tell() / size, self.time_s)
             if not data:
                 break
         phases = planner.flush()
@@ -354,7 +367,7 @@ class TextMotion:
             yield from self._parts(samples, path_mm)
         self.time_s = planner.time_s
         if moves == 0:
-            raise GcodeError("the file contains no moves: is it G-code, its lines ended by LF?")
+            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
 
     def _hold(self, block: ProgramBlock) -> None:
         if len(block.moves):
@@ -482,7 +495,7 @@ class _Motion:
 
     def __iter__(self) -> Iterator[MotionPart]:
         unpacking = progress_to(self._progress, "unpacking", 0.0)
-        with open_text(self._source, plate=self._plate, told=unpacking) as container:
+        with open_text(self._source, plate=self._plate, progress=unpacking) as container:
             self.facts = container.facts()
             doubtful = doubts(container.text, self._machine, self._asked)
             motion = TextMotion(
@@ -491,7 +504,7 @@ class _Motion:
                 self._dialect,
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,
-                told=partial(self._reports.say, "planning"),
+                progress=partial(self._reports.say, "planning"),
             )
             self.feature_names = motion.reader.feature_names
             yield from motion

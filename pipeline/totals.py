@@ -77,8 +77,8 @@ class Totals:
         if where != "all":
             yield (
                 f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "
-                f"{self.left_out_extruding_s:.0f} s of them extrude. Figures of the whole print "
-                "count them too"
+                f"{self.left_out_extruding_s:.0f} s of them extruding. The figures of the whole "
+                "print include them"
             )
 
     def left_alone(self) -> Iterator[str]:
@@ -93,8 +93,8 @@ class Totals:
             )
         elif passed_s > _WARN_SHARE * self.extruding_s:
             yield (
-                f"{passed_s / self.extruding_s:.0%} of the extruding time lies in moves that keep "
-                f"their own lines and is not compensated, from line {self.passed_line} on: they "
+                f"{passed_s / self.extruding_s:.0%} of the extruding time is not compensated, from "
+                f"line {self.passed_line} on: its moves keep their own lines, because they "
                 "climb faster than Z can follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), "
                 "take long for their length, or start where the position is not known"
             )

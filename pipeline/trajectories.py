@@ -1,13 +1,13 @@
 """What the nozzle does, sample by sample: commanded and simulated motion as a table.
 
-The pipeline is gone once more, on the sliced file, up to the end of what is asked for.
+The pipeline runs again on the sliced file, up to the end of what is asked for.
 """
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -21,27 +21,21 @@ from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
-from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.simulate import simulate_file
 
 __all__ = ["TrajectoryFormat", "write_trajectories"]
 
 TrajectoryFormat = Literal["csv", "npz"]
 
-_SHOWN = ("before", "after")
-
 
 def write_trajectories(
     source: Path,
     target: Path,
     machine: Machine,
-    options: Options | None,
+    options: Options,
     *,
     format: TrajectoryFormat = "csv",  # noqa: A002 - what everybody calls it
-    start_s: float = 0.0,
-    stop_s: float | None = None,
-    plate: int | None = None,
-    dialect: DialectName | None = None,
+    window_s: tuple[float, float | None] = (0.0, None),
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> int:
@@ -58,16 +52,14 @@ def write_trajectories(
         ``before_contour_um``, ``after_contour_um``, its distance to the planned path; ``line`` and
         ``layer`` of the sliced file (-1: before the first layer); ``extruding``, 0 or 1.
     machine : Machine
-    options : Options or None
-        Those of the job; with None the file stays as sliced, and no column is called ``after``.
-        Of an advised file the motion is that of the written one, and so are its lines; no column
-        is called ``before``.
+    options : Options
+        Those of the job. Of an advised file the motion is that of the written one, and so are its
+        lines; no column is called ``before``.
     format : {"csv", "npz"}
         Text (some 110 bytes a row, lengths to 0.1 um), or NumPy arrays.
-    start_s, stop_s : float
-        Of the time axis of reports: the written file's, stands beyond 2 s left out. None: the end.
-    plate, dialect
-        As `Options` has them, where there are no options.
+    window_s : (start, stop)
+        Of the time axis of reports: the written file's, stands beyond 2 s left out. A stop of None
+        is the end.
     cache_dir, progress
         As `compensate_file` has them.
 
@@ -79,35 +71,31 @@ def write_trajectories(
     Raises
     ------
     GcodeError
-        Nothing lies between `start_s` and `stop_s`; or as `compensate_file` has it.
+        Nothing lies in the window; or as `compensate_file` has it.
     DesignError, ModelError
     OSError
     """
+    start_s, stop_s = window_s
     if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
         raise GcodeError(
-            f"from {start_s:g} s to {stop_s or 0.0:g} s is no time; it begins at 0 or later and "
-            "ends behind its start"
+            f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
+            "or later, and end after its start"
         )
-    names = _SHOWN if options is not None else _SHOWN[:1]
-    if options is not None and options.method == "advise":
-        names = _SHOWN[1:]
+    advised = options.method == "advise"
+    names = ("after",) if advised else ("before", "after")
     with (
         _table(target, format, names) as table,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-trajectories-") as folder,
     ):
         window = _Window(table, names, start_s, stop_s)
-        try:
-            if options is not None and options.method == "advise":
-                written = Path(folder, "advised.gcode")
+        written = Path(folder, "written.gcode")
+        with contextlib.suppress(_Passed):
+            if advised:
                 compensate_file(source, written, machine, options, cache_dir=cache_dir)
-                source, plate, dialect = written, None, options.dialect
-                options = None
-            if options is None:
                 simulate_file(
-                    source,
+                    written,
                     machine,
-                    plate=plate,
-                    dialect=dialect,
+                    dialect=options.dialect,
                     cache_dir=cache_dir,
                     progress=progress,
                     trace=window.add,
@@ -115,15 +103,13 @@ def write_trajectories(
             else:
                 compensate_file(
                     source,
-                    Path(folder, "written.gcode"),
+                    written,
                     machine,
                     options,
                     cache_dir=cache_dir,
                     progress=progress,
                     trace=window.add,
                 )
-        except _Passed:
-            pass
         if window.rows == 0:
             raise GcodeError(
                 f"nothing moves from {start_s:g} s on: the print ends at {window.end_s:.3f} s"
@@ -178,7 +164,7 @@ class _Passed(Exception):
     """All that was asked for is written."""
 
 
-@contextmanager
+@contextlib.contextmanager
 def _table(target: Path, form: str, names: tuple[str, ...]) -> Iterator[Table]:
     lengths = ["x_mm", "y_mm", "z_mm"]
     if "after" in names:

@@ -34,12 +34,12 @@ def compiling_reported(callback: ProgressCallback) -> Iterator[ProgressCallback]
         Is told of both. What it raises in the middle of a compiler is raised when the work next
         says where it is.
     """
-    told = _Told(callback)
+    told = _CompileListener(callback)
     with install_listener("numba:compile", told):
         yield told
 
 
-class _Told(Listener):
+class _CompileListener(Listener):
     def __init__(self, callback: ProgressCallback) -> None:
         self._callback = callback
         self._latest = Progress("starting", 0.0, 0.0, 0.0, None)

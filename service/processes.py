@@ -72,7 +72,7 @@ def limit_memory(max_bytes: int) -> None:
 def quiet_tracker() -> None:
     """Start Python's tracker of semaphores with nothing to say; before any thread.
 
-    It tidies up behind processes that were killed, which is all there is to do, and would write
+    It tidies up after processes that were killed, which is all there is to do, and would write
     about it, with tracebacks, among our logs.
     """
     if sys.platform == "win32":

@@ -48,7 +48,7 @@ class _Blocks:
     """The response of modes to many samples, a block of them at a time.
 
     A block's positions are linear in its commands and in the states at its start, and so are the
-    states behind it: what is left of the recurrence goes from block to block, and the rest are
+    states after it: what is left of the recurrence goes from block to block, and the rest are
     products of matrices.
     """
 

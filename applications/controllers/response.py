@@ -43,7 +43,15 @@ from stillpath.models.disturbances import (
 from stillpath.models.loops import Loop, LoopSpec
 from stillpath.simulation.closed_loop import ClosedLoop, simulate
 
-__all__ = ["Trace", "adapted", "answer", "disturbance_of", "settling_ticks", "time_figures", "told"]
+__all__ = [
+    "Trace",
+    "adapted",
+    "answer",
+    "disturbance_of",
+    "disturbance_text",
+    "settling_ticks",
+    "time_figures",
+]
 
 Array = NDArray[np.float64]
 
@@ -192,7 +200,7 @@ def time_figures(
     shown = runs[0]["y"] if trace is None else trace.after
     end = _last_periods(disturbance, nominal.dt_s, len(d))
     return TimeFigures(
-        disturbance=told(disturbance),
+        disturbance=disturbance_text(disturbance),
         enters=enters,
         duration_s=len(d) * nominal.dt_s,
         before=_response(before[0], nominal.dt_s, end),
@@ -215,7 +223,7 @@ def settling_ticks(radius: float) -> float:
     return math.log(1e-3) / math.log(max(radius, 1e-6))
 
 
-def told(disturbance: Disturbance) -> str:
+def disturbance_text(disturbance: Disturbance) -> str:
     """Return the disturbance in words."""
     if isinstance(disturbance, Wideband):
         return f"random, {len(disturbance.peaks)} humps in its spectrum"

@@ -8,13 +8,14 @@ Ramani (paper 003), equation numbers beside each figure.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.applications.design.figures import (
     AxisFigures,
+    Curve,
     DesignReport,
     Frequencies,
     LiftedFigures,
@@ -29,6 +30,7 @@ from stillpath.applications.design.figures import (
 from stillpath.applications.design.robustness import Trial
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES, ZERO
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import ROBUST, PreviewFbf
 from stillpath.compensation.lifted import LiftedSet, integrated, lift, lifted_set
 from stillpath.compensation.lifted_window import LiftedWindow, lifted_window
@@ -44,11 +46,12 @@ from stillpath.compensation.preview_axis import Designs, designs, functions_with
 from stillpath.compensation.shapers import SHAPERS
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSet, plant_set
-from stillpath.pipeline.caution import measured_set
+from stillpath.pipeline.caution import design_mode
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, tune_each
+from stillpath.pipeline.options import Options
 from stillpath.version import __version__
 
-__all__ = ["AXES", "ERRORS_PERCENT", "design_report"]
+__all__ = ["AXES", "ERRORS_PERCENT", "DesignSettings", "design_report"]
 
 Array = NDArray[np.float64]
 
@@ -58,16 +61,28 @@ ERRORS_PERCENT = tuple(range(-20, 21, 2))
 _FREQUENCIES_HZ = tuple(np.geomspace(5.0, 200.0, 160).round(3).tolist())
 
 
+@dataclass(frozen=True, slots=True)
+class DesignSettings:
+    """What `compensation.fbf.PreviewFbf` is given.
+
+    `robust` may also be ``auto``: the mode that jobs take by default, before a shaper's smoothing
+    comes in. `dt_s` is the sampling time; `window_s` the preview window, of which `update_s` is
+    committed before the next one starts.
+    """
+
+    basis: str = DEFAULT_BASIS
+    robust: str = "off"
+    along: float | None = None
+    dt_s: float = 1e-3
+    window_s: float = 0.3
+    update_s: float = 0.15
+
+
 def design_report(
     machine: Machine,
     axis: str,
+    settings: DesignSettings = DesignSettings(),
     *,
-    basis: str = "ce-opt",
-    robust: str = "off",
-    along: float | None = None,
-    dt_s: float = 1e-3,
-    window_s: float = 0.3,
-    update_s: float = 0.15,
     errors_percent: Sequence[float] = ERRORS_PERCENT,
     shapers: Sequence[str] = SHAPERS,
     motion: tuple[Array, NDArray[np.bool_]] | None = None,
@@ -80,11 +95,7 @@ def design_report(
     machine : Machine
     axis : str
         x or y.
-    basis, robust, along : str, str, float or None
-        What `compensation.fbf.PreviewFbf` is told; `auto` is what jobs take by default of it, as it
-        is before a shaper's smoothing comes in.
-    dt_s, window_s, update_s : float
-        Sampling time, preview window, and how much of it is committed.
+    settings : DesignSettings, optional
     errors_percent : sequence of float
         Errors of this axis' frequencies at which every command is tried.
     shapers : sequence of str
@@ -101,40 +112,31 @@ def design_report(
         For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
         error: the report says which and why.
     """
-    if robust == "auto":
-        robust = "ensemble" if any(map(measured_set, machine.axes.values())) else "off"
-    _check_names(axis, basis, robust)
-    row = AXES.index(axis)
-    plants = plant_set(machine.axes["x" if axis == "x" else "y"], dt_s)
-    settings = {"basis": basis, "along": along, "window_s": window_s, "update_s": update_s}
-    designers, missing = _designers(machine, dt_s, settings)
+    _check_names(axis, settings)
+    dt_s, row = settings.dt_s, AXES.index(axis)
+    spec = machine.axes["x" if axis == "x" else "y"]
+    plants = plant_set(spec, dt_s)
+    designers, missing = _designers(machine, settings)
+    robust = _robust_mode(machine, settings, designers)
     # Without a set all robust modes are one.
     mode = robust if robust in designers or len(plants.members) > 1 else "off"
-    window = round(window_s / dt_s)
+    window = round(settings.window_s / dt_s)
     if mode in designers:
         lifted = designers[mode].lifted[row]
     else:
-        lifted = lifted_window(plants.members, plants.weights, window, round(update_s / dt_s))
+        update = round(settings.update_s / dt_s)
+        lifted = lifted_window(plants.members, plants.weights, window, update)
     # What the product refuses as a whole, no rung of it can be used for.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
-    most = functions_within(machine.axes["x" if axis == "x" else "y"].band_hz, dt_s)
-    ladder = _ladder(plants, lifted, basis, dt_s, whole, most)
-    names = [f"n {rung.n}, price {rung.price:g}" for rung in ladder]
+    most = functions_within(spec.band_hz, dt_s)
+    ladder = _ladder(plants, lifted, settings.basis, dt_s, whole, most)
 
     trial = Trial(machine, axis, dt_s, motion, errors_percent)
     missing += trial.notes
-    curves, chosen = [trial.uncompensated()], None
-    for name, designer in designers.items():
-        try:
-            curves.append(trial.compensated(designer, name, names))
-        except DesignError as error:
-            missing.append(f"fbf {name}: {error}")
-            continue
-        if name == mode:
-            chosen = designer.rungs[row]
+    own = _own_curves(trial, designers, ladder, missing)
     if tuned is None:
         tuned = tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers)
-    curves += [trial.shaped(tuned[kind]) for kind in shapers]
+    curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
     guarded = lifted.weights if mode == "minimax" else plants.weights
     limit = next((d.accel_limit_mm_s2(trial.y_d_mm) for d in designers.values()), None)
     path_peak, path_rms = trial.path_acceleration()
@@ -145,50 +147,86 @@ def design_report(
             "machine_title": machine.title,
             "machine_revision": machine.revision,
             "axis": axis,
-            "basis": basis,
+            "basis": settings.basis,
             "robust": robust,
-            "along": designers[mode].along if mode in designers else along or 1.0,
+            "along": designers[mode].along if mode in designers else settings.along or 1.0,
             "sampling_s": dt_s,
-            "window_s": window_s,
-            "update_s": update_s,
+            "window_s": settings.window_s,
+            "update_s": settings.update_s,
             "plant": _plant(plants, designers.get("minimax"), row),
             "frequencies": _frequencies(machine, axis, dt_s),
             "lifted": _singular_values(lifted.plants, lifted.weights, window),
             "metrics": _metrics(plants, guarded, window),
             "ladder": ladder,
-            "chosen": chosen,
+            "chosen": designers[mode].rungs[row] if mode in own else None,
             "path_peak_accel_mm_s2": path_peak,
             "path_rms_accel_mm_s2": path_rms,
             "accel_limit_mm_s2": limit,
             "robustness": Robustness(
-                errors_percent=trial.errors_percent, curves=tuple(curves), missing=tuple(missing)
+                errors_percent=trial.errors_percent, curves=curves, missing=tuple(missing)
             ),
         }
     )
 
 
-def _check_names(axis: str, basis: str, robust: str) -> None:
+def _check_names(axis: str, settings: DesignSettings) -> None:
     for what, given, known in (
         ("axis", axis, AXES),
-        ("basis", basis, tuple(BASES)),
-        ("robust mode", robust, ROBUST),
+        ("basis", settings.basis, tuple(BASES)),
+        ("robust mode", settings.robust, ("auto", *ROBUST)),
     ):
         if given not in known:
             raise DesignError(f"no {what} is called {given!r}; there are {', '.join(known)}")
 
 
 def _designers(
-    machine: Machine, dt_s: float, settings: Mapping[str, Any]
+    machine: Machine, settings: DesignSettings
 ) -> tuple[dict[str, PreviewFbf], list[str]]:
     """Return the compensators of all robust modes that differ, and why others are missing."""
     sets = any(len(axis.weighted_members()) > 1 for axis in machine.axes.values())
     made, missing = {}, []
     for mode in ROBUST if sets else ROBUST[:1]:
         try:
-            made[mode] = PreviewFbf(machine, dt_s, robust=mode, **settings)
+            made[mode] = PreviewFbf(
+                machine,
+                settings.dt_s,
+                robust=mode,
+                basis=settings.basis,
+                along=settings.along,
+                window_s=settings.window_s,
+                update_s=settings.update_s,
+            )
         except DesignError as error:
             missing.append(f"fbf {mode}: {error}")
     return made, missing
+
+
+def _robust_mode(
+    machine: Machine, settings: DesignSettings, designers: Mapping[str, PreviewFbf]
+) -> str:
+    """Return the mode that is asked for; of ``auto``, the one that jobs take."""
+    if settings.robust != "auto":
+        return settings.robust
+    mode = design_mode(machine, Options(robust="auto"))
+    # As jobs do: where a set refuses itself, the plants in the middle are designed for.
+    return mode if mode in designers else "off"
+
+
+def _own_curves(
+    trial: Trial,
+    designers: Mapping[str, PreviewFbf],
+    ladder: Sequence[RungFigures],
+    missing: list[str],
+) -> dict[str, Curve]:
+    """Return the curve of every mode; those that refuse the motion are added to `missing`."""
+    rungs = [f"n {rung.n}, price {rung.price:g}" for rung in ladder]
+    curves = {}
+    for mode, designer in designers.items():
+        try:
+            curves[mode] = trial.compensated(designer, mode, rungs)
+        except DesignError as error:
+            missing.append(f"fbf {mode}: {error}")
+    return curves
 
 
 def _plant(plants: PlantSet, guarded: PreviewFbf | None, row: int) -> AxisFigures:

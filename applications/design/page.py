@@ -6,8 +6,9 @@ hash of its style and forbids all else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from stillpath.applications.design.figures import (
@@ -155,38 +156,46 @@ def _style(curve: Curve, summary: Summary) -> str:
 
 
 def _all_figures(report: DesignReport, summary: Summary) -> list[_Figure]:
-    lifted, metrics = report.lifted, report.metrics
-    counts = range(1, lifted.samples + 1)
-    marks = [Mark(summary.rung.n, f"n {summary.rung.n} taken")] if summary.rung else []
+    draw_figure = partial(_figure, report, summary)
+    return [*_plant_figures(report, draw_figure), *_error_figures(report, draw_figure)]
+
+
+def _figure(
+    report: DesignReport,
+    summary: Summary,
+    title: str,
+    note: str,
+    y_title: str,
+    *lines: Line,
+    log: bool = True,
+) -> _Figure:
+    """Return a figure over the number of functions n, the one that is taken marked."""
 
     def tick(n: float) -> str:
         return f"{n:g}\n{n / (2 * report.window_s):.0f} Hz" if n else "0"
 
-    def figure(
-        title: str,
-        note: str,
-        y_title: str,
-        *lines: Line,
-        log: bool = True,
-        also: Sequence[Mark] = (),
-    ) -> _Figure:
-        chart = Chart(
-            about=f"{title}: {y_title} against the number of functions n. The table below holds "
-            "the figures.",
-            x_title="n",
-            y_title=y_title,
-            lines=lines,
-            tick=tick,
-            log=log,
-            marks=[*marks, *also],
-        )
-        columns = [f"{y_title.split(',')[0]} {line.name}".strip() for line in lines]
-        return _Figure(title, note, lines, columns, draw(chart, *_SMALL))
+    chart = Chart(
+        about=f"{title}: {y_title} against the number of functions n. The table below holds "
+        "the figures.",
+        x_title="n",
+        y_title=y_title,
+        lines=lines,
+        tick=tick,
+        log=log,
+        marks=[Mark(summary.rung.n, f"n {summary.rung.n} taken")] if summary.rung else [],
+    )
+    columns = [f"{y_title.split(',')[0]} {line.name}".strip() for line in lines]
+    return _Figure(title, note, lines, columns, draw(chart, *_SMALL))
 
+
+def _plant_figures(report: DesignReport, figure: Callable[..., _Figure]) -> list[_Figure]:
+    """Return what the plant asks of any command: singular values and effort."""
+    lifted, metrics = report.lifted, report.metrics
+    counts = range(1, lifted.samples + 1)
     alone = report.robust == "off" or len(report.plant.members) < 2
     seen = "the nominal plant" if alone else "the weighted set"
     position, increments = (_nonzero(s) for s in (lifted.position, lifted.increments))
-    out = [
+    return [
         figure(
             "Singular values, position command",
             f"of {seen}, lifted over the window (3.22)",
@@ -212,39 +221,40 @@ def _all_figures(report: DesignReport, summary: Summary) -> list[_Figure]:
             Line(counts, metrics.effort_increments, "plain"),
         ),
     ]
+
+
+def _error_figures(report: DesignReport, figure: Callable[..., _Figure]) -> list[_Figure]:
+    """Return the expected error, and of a set how sure each function is."""
+    metrics = report.metrics
+    counts = range(1, report.lifted.samples + 1)
     lines = [Line(counts, metrics.error, "plain main", "Jₑ")]
     for metric, style in zip(metrics.robust, ("after", "shaper"), strict=False):
         n = range(1, len(metric.error) + 1)
         name = _model(metric)
         lines.append(Line(n, metric.error, style, f"Jₑ,ᵣ {name}"))
         lines.append(Line(n, metric.uncertainty_part, f"{style} d2", f"unc. {name}"))
-    note = "n functions of any basis (2.26)"
-    if metrics.robust:
-        note = (
-            "J<sub>e</sub> (2.26) is also the nominal part of J<sub>e,r</sub>; the squares of both "
-            "parts add up (4.9)"
-        )
-    out.append(figure("Expected error", note, "error, white paths", *lines, log=False))
-    if metrics.robust:
-        out.append(
-            figure(
-                "Uncertainty, function by function",
-                "singular values of the relative uncertainty (4.11); below 1 a function helps",
-                "σ(Δ)",
-                *(
-                    Line(
-                        range(1, len(m.singular_values) + 1),
-                        m.singular_values,
-                        style,
-                        _model(m),
-                    )
-                    for m, style in zip(metrics.robust, ("after", "shaper"), strict=False)
-                ),
-                Line((1, lifted.samples), (1.0, 1.0), "soft d1"),
-                log=False,
-            )
-        )
-    return out
+    if not metrics.robust:
+        note = "n functions of any basis (2.26)"
+        return [figure("Expected error", note, "error, white paths", *lines, log=False)]
+    note = (
+        "J<sub>e</sub> (2.26) is also the nominal part of J<sub>e,r</sub>; the squares of both "
+        "parts add up (4.9)"
+    )
+    spread = [
+        Line(range(1, len(m.singular_values) + 1), m.singular_values, style, _model(m))
+        for m, style in zip(metrics.robust, ("after", "shaper"), strict=False)
+    ]
+    return [
+        figure("Expected error", note, "error, white paths", *lines, log=False),
+        figure(
+            "Uncertainty, function by function",
+            "singular values of the relative uncertainty (4.11); below 1 a function helps",
+            "σ(Δ)",
+            *spread,
+            Line((1, report.lifted.samples), (1.0, 1.0), "soft d1"),
+            log=False,
+        ),
+    ]
 
 
 def _model(metric: RobustMetric) -> str:

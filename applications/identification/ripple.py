@@ -15,7 +15,7 @@ from stillpath.models.ripple import RippleAxis, RippleSide
 
 __all__ = ["LearntRipple", "learn_from_files", "parse_basis"]
 
-_FORM = "NAME:PITCH, NAME:PITCH:1,2,3 or either with @output behind it"
+_FORM = "NAME:PITCH, NAME:PITCH:1,2,3 or either with @output appended"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from stillpath.applications.identification.figures import IdentificationReport
 from stillpath.applications.identification.report import identification_report
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.conditioned import followed
+from stillpath.models.identification.conditioned import schedulable
 from stillpath.models.identification.conditions import Condition
 from stillpath.models.identification.identify import Measured, Progress, identify
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -153,7 +153,7 @@ def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) ->
     schedule = AxisSchedule(mass=mass, grid=grid) if mass or grid else None
     about = found.plants.provenance
     if schedule is not None and about is not None:
-        plants, varied = followed(found.plants, about.kind)
+        plants, varied = schedulable(found.plants, about.kind)
         found, notes = replace(found, plants=plants), [*notes, *varied]
     return replace(found, schedule=schedule, notes=tuple(notes), warnings=tuple(warnings))
 

@@ -94,7 +94,7 @@ def age_warnings(machine: Machine, now: datetime, max_age_days: float) -> list[s
         if known.kind == "typed in":
             found.append(f"{start}: its plants were typed in, not measured; measure the machine")
         elif known.measured_on is None:
-            found.append(f"{start}: nobody knows when it was measured; measure it again")
+            found.append(f"{start}: its measurement has no date; measure it again")
         elif (age := (now.date() - known.measured_on).days) > max_age_days:
             found.append(
                 f"{start}: measured on {known.measured_on}, {age} days ago (limit "
@@ -186,7 +186,7 @@ def machine_from_config(
 def not_followed(config: PrinterConfig) -> list[str]:
     """Return a line for each file that the configuration includes: nobody looked into it."""
     return [
-        f"[include {name}] in {config.name}: not followed; what stands there was not looked at"
+        f"[include {name}] in {config.name}: not followed; its contents were not checked"
         for name in config.includes
     ]
 

@@ -34,7 +34,6 @@ from stillpath.applications.machines.revision import (
 from stillpath.models.confirmation import Confirmation
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
-from stillpath.models.plants import PlantSetSpec
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import builtin_machines, explain
 
@@ -168,23 +167,6 @@ class MachineStore:
         fields = {"author": author, "message": message, "sources": tuple(sources)}
         return self._add(name, lambda _: (machine, fields), when=when, expected=expected)
 
-    def update_axis(
-        self,
-        name: str,
-        axes: Mapping[Literal["x", "y"], PlantSetSpec],
-        *,
-        author: str,
-        message: str = "",
-        sources: Sequence[SourceFile] = (),
-        when: datetime | None = None,
-    ) -> Revision:
-        """Give axes new plants and leave everything else of the machine as it is.
-
-        Also if somebody else changes the machine meanwhile: the plants go on top of that change.
-        """
-        fields = {"author": author, "message": message, "sources": tuple(sources)}
-        return self._update(name, "axes", axes, fields, when)
-
     def confirm(
         self,
         name: str,
@@ -199,8 +181,18 @@ class MachineStore:
 
         If that is a change of the plants, the confirmation names those it was of, and is stale.
         """
+        self._existing(name)
         fields = {"author": author, "message": message, "sources": tuple(sources)}
-        return self._update(name, "confirmations", confirmations, fields, when)
+
+        def confirmed(current: Revision | None) -> tuple[Machine, dict[str, Any]]:
+            if current is None:
+                raise _no_machine(name)
+            document = current.machine.model_dump()
+            entries = {axis: entry.model_dump() for axis, entry in confirmations.items()}
+            document["confirmations"] |= entries
+            return Machine.model_validate(document), fields
+
+        return self._add(name, confirmed, when=when)
 
     def roll_back(
         self,
@@ -293,26 +285,6 @@ class MachineStore:
         return self.current(name)
 
     # Private
-
-    def _update(
-        self,
-        name: str,
-        field: str,
-        by_axis: Mapping[Literal["x", "y"], BaseModel],
-        fields: dict[str, Any],
-        when: datetime | None,
-    ) -> Revision:
-        """Replace entries of a field that goes by axis, in the machine as it is."""
-        self._existing(name)
-
-        def changed(current: Revision | None) -> tuple[Machine, dict[str, Any]]:
-            if current is None:
-                raise _no_machine(name)
-            document = current.machine.model_dump()
-            document[field] |= {axis: entry.model_dump() for axis, entry in by_axis.items()}
-            return Machine.model_validate(document), fields
-
-        return self._add(name, changed, when=when)
 
     def _add(
         self,

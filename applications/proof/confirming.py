@@ -52,7 +52,7 @@ __all__ = ["verify_ring"]
 Array = NDArray[np.float64]
 
 _RINGS = 0.3
-"""Damping ratio above which nothing rings behind a stop."""
+"""Damping ratio above which nothing rings after a stop."""
 _HIGHEST_HZ = 200.0
 _MATCHED, _CORRELATED = 0.5, 0.8
 _GAINS = (0.6, 1.6)
@@ -77,7 +77,7 @@ _PHASE = (
 def verify_ring(
     printed: Path, logs: Sequence[Path], machine: Machine, *, today: date | None = None
 ) -> RingReport:
-    """Compare the vibration behind the stops of a ring test with the machine's plants.
+    """Compare the vibration after the stops of a ring test with the machine's plants.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ class _Axis:
     ) -> tuple[Verdict, str]:
         low, high = compensated.predicted_um
         said = (
-            f"measured {compensated.measured_um:.2g} ± {compensated.scatter_um:.1g} um behind "
+            f"measured {compensated.measured_um:.2g} ± {compensated.scatter_um:.1g} um after "
             f"{compensated.stops} compensated stops, predicted {low:.2g} to {high:.2g}; "
             f"{planned.measured_um:.2g} um as planned"
         )

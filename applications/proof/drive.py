@@ -50,7 +50,7 @@ class RingingMode:
         return -self.pole.real / abs(self.pole)
 
     def ringing_um(self, speed_mm_s: float, accel_mm_s2: float) -> float:
-        """Return the amplitude behind a stop from a speed, at the end of the braking.
+        """Return the amplitude after a stop from a speed, at the end of the braking.
 
         Braking is two opposite steps of acceleration v / a apart; their ringing adds up, or
         cancels where v / a is a whole number of periods.

@@ -47,7 +47,7 @@ class PrintSettings:
         Where the middle of the print lies; None: the middle of the travel.
     start_gcode, end_gcode : str, optional
         Instead of the lines that home and heat before the first of ours, and those that switch
-        off and park behind the last.
+        off and park after the last.
     """
 
     nozzle_temp_c: float = 210.0

@@ -60,12 +60,7 @@ def verify_log(
     ModelError
         The log cannot be read, or holds no accelerations.
     """
-    (recorded, *_) = read_measurements(log)
-    if not isinstance(recorded, AccelerationLog):
-        raise ModelError(
-            f"{log.name} holds no raw accelerations but a {type(recorded).__name__}; record with "
-            "ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) while the print runs"
-        )
+    recorded = _recorded(log)
     measured = log_signal(recorded)
     command = _planned(printed, machine, progress)
     specs = {a: machine.axes[a].nominal for a in ("x", "y")}
@@ -111,6 +106,16 @@ def verify_log(
         sensor=[[float(v) for v in column] for column in sensor.T],
         axes=judged,
     )
+
+
+def _recorded(log: Path) -> AccelerationLog:
+    (recorded, *_) = read_measurements(log)
+    if not isinstance(recorded, AccelerationLog):
+        raise ModelError(
+            f"{log.name} holds no raw accelerations but a {type(recorded).__name__}; record with "
+            "ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) while the print runs"
+        )
+    return recorded
 
 
 def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None) -> Signal:

@@ -44,7 +44,7 @@ class Recorder:
     instruction: tuple[str, ...] = (
         "This firmware logs no accelerations: fix a sensor with a logger of its own to the part",
         "that moves, at 1000 samples per second or more, and let it log from before the file until",
-        "behind it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
+        "after it, as `#time,accel_x,accel_y,accel_z` in s and mm/s2.",
     )
     """What a person is to do, for the first lines of the file."""
 
@@ -60,11 +60,11 @@ class Recorder:
         return ()
 
     def after(self, seconds: float) -> tuple[str, ...]:  # noqa: ARG002
-        """Lines behind a round that took `seconds`."""
+        """Lines after a round that took `seconds`."""
         return ()
 
     def last(self) -> tuple[str, ...]:
-        """Lines behind the last round, at rest."""
+        """Lines after the last round, at rest."""
         return ()
 
 

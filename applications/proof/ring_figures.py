@@ -18,7 +18,7 @@ class _Figures(BaseModel):
 
 
 class Half(_Figures):
-    """Vibration behind the stops of one half of an axis: rms over stops, in the band of the modes.
+    """Vibration after the stops of one half of an axis: rms over stops, in the band of the modes.
 
     `scatter_um` is the standard error, from repeats of the same stops; the noise floor is taken off
     all figures.

@@ -1,4 +1,4 @@
-"""What an accelerometer felt of a ring test: the vibration behind every stop that it saw.
+"""What an accelerometer felt of a ring test: the vibration after every stop that it saw.
 
 The log is placed by `matching`, and turned by least squares into the direction in which it moved
 while the file was about one axis. A stop counts if the log shows its braking.
@@ -35,7 +35,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 WINDOW_S = (0.01, 0.31)
-"""Behind a stop: the clock is known to a millisecond or so."""
+"""After a stop: the clock is known to a millisecond or so."""
 _MOUNT_BAND_HZ = (3.0, 20.0)
 _BRAKING_S = 0.06
 """What is looked at on both sides of the braking, to tell whether the log shows it."""
@@ -61,7 +61,7 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Power:
-    """Mean squares behind each stop, shape (stops,): acceleration in (mm/s^2)^2, way in um^2."""
+    """Mean squares after each stop, shape (stops,): acceleration in (mm/s^2)^2, way in um^2."""
 
     accel: Array
     way: Array
@@ -165,7 +165,7 @@ def read_axis(
 
 
 def residual(accel: Array, stops: Sequence[Stop], band: Band) -> Power:
-    """Return the vibration in a band behind each stop."""
+    """Return the vibration in a band after each stop."""
     return _power(accel, [stop.at_s + WINDOW_S[0] for stop in stops], band)
 
 

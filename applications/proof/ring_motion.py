@@ -63,7 +63,7 @@ class RingMotion:
     stops : tuple of Stop
     quiet_s : dict
         By axis from when until when it stands still long before it moves (the other one creeps, as
-        behind the stops).
+        after the stops).
     about : dict
         By axis which samples are about it.
     plants : dict

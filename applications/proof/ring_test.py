@@ -1,7 +1,7 @@
-"""A ring test: fast moves that stop dead, as planned and compensated, and a rest behind each.
+"""A ring test: fast moves that stop dead, as planned and compensated, and a rest after each.
 
 Nothing is printed and nothing is heated. While an axis rests the other one creeps: motion goes on
-as behind a corner of a print, so that compensation can act behind the stop as it does there. All
+as after a corner of a print, so that compensation can act after the stop as it does there. All
 rests differ, so that a log of one axis cannot be mistaken for one of the other, nor one stop for
 the next.
 """
@@ -134,7 +134,7 @@ class RingTest:
     def _stops(self, half: Literal["off", "on"]) -> float:
         """Write a to and fro of each axis at every speed; return about how long it lasts.
 
-        X and Y take turns: were one behind the other, a clock that runs wrong could not be told
+        X and Y take turns: were one after the other, a clock that runs wrong could not be told
         from an axis that is late.
         """
         seconds = 0.0

@@ -1,6 +1,6 @@
 """A hatch file on a scanner: its command with a prefilter, and what each track is left with.
 
-Variants of the prediction, all with the same disturbance: the path as sent, behind the prefilter,
+Variants of the prediction, all with the same disturbance: the path as sent, after the prefilter,
 and with the add-on controller too.
 """
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stillpath.applications.controllers.loading import LoadedController
 from stillpath.applications.controllers.options import Disturbance
-from stillpath.applications.controllers.response import answer, disturbance_of, told
+from stillpath.applications.controllers.response import answer, disturbance_of, disturbance_text
 from stillpath.applications.scanning.figures import ScanReport, TrackFigures, VariantFigures
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.preview_command import preview_command
@@ -52,7 +52,7 @@ class ScanSettings:
         How far the beam moves on the work per unit of the machine; needed unless that is mm or um.
     prefilter : "zpetc", "fbf" or "none"
     cutoff_hz : float, optional
-        Of a zero-phase low-pass behind zpetc.
+        Of a zero-phase low-pass after zpetc.
     timing : Timing
     disturbance : optional
         In the machine's unit. Left out, the controller's own, scaled to `disturbance_um`.
@@ -147,7 +147,7 @@ def scan_file(
         preview_samples=prefilter.preview,
         peak_gain=prefilter.peak,
         controller=None if controller is None else controller.method,
-        disturbance=None if disturbed is None else disturbed.told,
+        disturbance=None if disturbed is None else disturbed.text,
         enters=None if disturbed is None else disturbed.enters,
         duration_s=len(samples.t_s) * loop.dt_s,
         drawn_s=float(np.sum(samples.track >= 0)) * loop.dt_s,
@@ -163,7 +163,7 @@ def scan_file(
 class _Disturbed:
     d_um: Array
     enters: str
-    told: str
+    text: str
 
 
 class _Prefilter:
@@ -290,7 +290,7 @@ def _disturbance(
     generator = np.random.default_rng(_SEED)
     if settings.disturbance is not None:
         d = scale * sample(settings.disturbance, count, loop.dt_s, generator)
-        return _Disturbed(d, settings.enters or "output", told(settings.disturbance))
+        return _Disturbed(d, settings.enters or "output", disturbance_text(settings.disturbance))
     if controller is None or settings.disturbance_um == 0:
         return None
     kind, enters = disturbance_of(controller.options, loop)
@@ -300,7 +300,7 @@ def _disturbance(
     rms = float(np.sqrt(np.mean(left[count // 4 :] ** 2)))
     if rms == 0:
         raise DesignError("the controller's disturbance does not reach the output; give another")
-    return _Disturbed(d * settings.disturbance_um / rms, enters, told(kind))
+    return _Disturbed(d * settings.disturbance_um / rms, enters, disturbance_text(kind))
 
 
 def _variant(name: str, label: str, found: TrackErrors) -> VariantFigures:

@@ -1,6 +1,6 @@
 """Tones beyond a camera's Nyquist frequency: multirate predictor and forward-model observer.
 
-The plant is the printed closed servo of the galvo (10 kHz); the disturbance enters behind its
+The plant is the printed closed servo of the galvo (10 kHz); the disturbance enters after its
 encoder and only the camera (10/3 kHz) sees it. Noise enters at the camera. The Q bandwidth and the
 disturbed models of table 1 are not printed.
 """

@@ -122,7 +122,7 @@ def four_stages() -> Iterator[Row]:
     stages = {
         name: staged(name, y_d, ENCODER_MM) for name in ("PD", "+ observer", "+ ZPETC", "+ FIR")
     }
-    why = "the drive's transients of 125-150 Hz behind it are not printed"
+    why = "the drive's transients of 125-150 Hz after it are not printed"
     for name, paper, tolerance, note in (
         ("PD", 600, 30, "class; read off a figure"),
         ("+ observer", 600, 30, "class; read off a figure"),
@@ -230,7 +230,7 @@ def staged(name: str, y_d: Array, quantum_mm: float) -> Stage:
     error, moving = 1e3 * np.abs(y_d - got["y"]), slice(100, 260)
     return Stage(
         float(error.max()),
-        # Between the moves, and behind them.
+        # Between the moves, and after them.
         float(max(error[580], error[-1])),
         float(np.sqrt(np.mean(np.diff(got["u"])[moving] ** 2))),
         float(np.abs(got["u"]).max()),

@@ -44,11 +44,11 @@ def run_batch(
         In the order of `items`.
     """
 
-    def settled(_: Item, now: Outcome, known: Outcome) -> bool:
+    def is_done(_: Item, now: Outcome, known: Outcome) -> bool:
         return known.state == "done" and known.key == now.key and output.is_there(known)
 
     by_size = sorted(items, key=lambda item: -_size(item))
-    futures = {worker_pool.add(item, settled): item for item in by_size}
+    futures = {worker_pool.add(item, is_done): item for item in by_size}
     outcomes: dict[int, Outcome] = {}
     waiting = set(futures)
     while waiting:

@@ -47,7 +47,7 @@ class _Seen:
     since: float
     works: dict[str, _Work] | None = None
     """By machine; None until the file has stopped growing."""
-    told: str = field(default="", repr=False)
+    reported: str = field(default="", repr=False)
 
 
 class Watcher:
@@ -133,7 +133,7 @@ class Watcher:
             seen.works = {machine: _Work() for machine in machines}
         for machine, work in seen.works.items():
             if work.future is None and not work.is_over and now >= work.next_at:
-                work.future = self._pool.add(Item(path, place, machine), self._settled)
+                work.future = self._pool.add(Item(path, place, machine), self._is_done)
         return any(work.future is not None for work in seen.works.values())
 
     def _collect(self, path: Path, seen: _Seen, now: float, *, is_same: bool) -> bool:
@@ -153,14 +153,14 @@ class Watcher:
                 work.tries += 1
             elif outcome.state == "failed" and is_same:
                 self._output.note(outcome.output, outcome)
-            if work.error and work.error != seen.told and is_same:
+            if work.error and work.error != seen.reported and is_same:
                 self._tell(outcome)
         if came and is_same:
-            seen.told = "\n".join(dict.fromkeys(work.error for work in works if work.error))
-            self._say_why(path, seen.told)
+            seen.reported = "\n".join(dict.fromkeys(work.error for work in works if work.error))
+            self._say_why(path, seen.reported)
         return any(work.future is not None for work in works)
 
-    def _settled(self, _: Item, now: Outcome, known: Outcome) -> bool:
+    def _is_done(self, _: Item, now: Outcome, known: Outcome) -> bool:
         """Say that a file is done once, whatever has changed about machine, options or version."""
         same = known.source_sha256 == now.source_sha256
         return same and (known.state == "done" or known.trouble == "file")

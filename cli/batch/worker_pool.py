@@ -122,9 +122,9 @@ class WorkerPool:
         self._stopping = threading.Event()
         self._threads = ThreadPoolExecutor(jobs, thread_name_prefix="farm")
 
-    def add(self, item: Item, settled: IsFinished) -> Future[Outcome]:
+    def add(self, item: Item, is_done: IsFinished) -> Future[Outcome]:
         """Do an item when its turn comes; the future raises `Stopped` at most."""
-        return self._threads.submit(self._do, item, settled)
+        return self._threads.submit(self._do, item, is_done)
 
     def stop(self) -> None:
         """Break off what is being done, begin nothing new, and wait until it is quiet."""
@@ -132,7 +132,7 @@ class WorkerPool:
         self._threads.shutdown(cancel_futures=True)
         self._works.close()
 
-    def _do(self, item: Item, settled: IsFinished) -> Outcome:
+    def _do(self, item: Item, is_done: IsFinished) -> Outcome:
         if self._stopping.is_set():
             raise Stopped
         began = time.monotonic()
@@ -140,7 +140,7 @@ class WorkerPool:
         try:
             machine, outcome = self._planned(item)
             known = self._output.recorded(outcome.output)
-            if known is not None and settled(item, outcome, known):
+            if known is not None and is_done(item, outcome, known):
                 state = "failed" if known.state == "failed" else "done before"
                 return known.model_copy(update={"state": state, "source": outcome.source})
             outcome = self._made(item, machine, outcome)

@@ -32,7 +32,7 @@ _START_FORGETTING, _END_FORGETTING = 0.9, 0.995
 _DECAY_SAMPLES = 25
 _START_COVARIANCE = 1e4
 _LARGEST_POLE = 0.97
-# Shares of power that the zeros leave over when a tone has moved. Behind the poles, which lift the
+# Shares of power that the zeros leave over when a tone has moved. After the poles, which lift the
 # tone, it is some 1/600 of noise over tone when locked; of the signal itself it is the noise.
 _LEFT_BEHIND_POLES, _LEFT_OF_SIGNAL = 2e-3, 0.4
 

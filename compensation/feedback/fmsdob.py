@@ -201,7 +201,7 @@ def design_q(
         Fixed zeros of Q: keep it out of frequencies that must not change.
     through_band : bool
         Interpolate 1/(F Q_BP) with its slope instead of 1/F. The band pass turns the phase at
-        the targets, so a Hermite Q behind it is no wider than a pointwise one; this undoes the
+        the targets, so a Hermite Q after it is no wider than a pointwise one; this undoes the
         turn, and with it what the band pass had saved elsewhere.
 
     Raises

@@ -396,7 +396,7 @@ def periodic_residual(servo: Complex, factor: Complex, amplitudes: Sequence[floa
 def repetitive_coefficients(
     model: InternalModel, inverse: ServoInverse
 ) -> tuple[CoefficientSet, ...]:
-    """Return what a controller loads: the memory of a period, and the inverse behind it."""
+    """Return what a controller loads: the memory of a period, and the inverse after it."""
     return (
         CoefficientSet(
             "memory",

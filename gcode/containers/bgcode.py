@@ -80,7 +80,7 @@ class Block:
             how = Compression(self.compression)
         except ValueError:
             raise GcodeError(
-                f"{self.place} is compressed in way {self.compression}, which is not known "
+                f"{self.place} has the unknown compression {self.compression} "
                 "(0 none, 1 deflate, 2 and 3 heatshrink); export plain G-code instead"
             ) from None
         try:
@@ -106,8 +106,8 @@ class BinaryGcode:
         The file; only read, and only while constructing.
     text : BinaryIO
         Receives the G-code, at its present position.
-    told : callable
-        Is told the share of the file that was read, now and then.
+    progress : callable
+        Is progress the share of the file that was read, now and then.
 
     Raises
     ------
@@ -116,7 +116,7 @@ class BinaryGcode:
         encoding, or unpacks to more than is sane.
     """
 
-    def __init__(self, source: Path, text: BinaryIO, told: Callable[[float], None]) -> None:
+    def __init__(self, source: Path, text: BinaryIO, progress: Callable[[float], None]) -> None:
         self.delay_s = 0.0
         self._before: list[Block] = []
         self._after: list[Block] = []
@@ -135,7 +135,7 @@ class BinaryGcode:
                 first = first or block
                 written += text.write(_text_of(block, unpacker))
                 check_unpacked(written, largest)
-                told(file.tell() / size)
+                progress(file.tell() / size)
         if first is None:
             raise GcodeError("the binary file holds no G-code block; slice and export it again")
         self._compression = Compression(first.compression)
@@ -148,7 +148,7 @@ class BinaryGcode:
                 "and thumbnails: no slicer made it; export it again"
             )
 
-    def write(self, text: BinaryIO, target: BinaryIO, told: Callable[[float], None]) -> None:
+    def write(self, text: BinaryIO, target: BinaryIO, progress: Callable[[float], None]) -> None:
         """Write a binary file around a text, packed as the original was.
 
         Raises
@@ -160,7 +160,7 @@ class BinaryGcode:
         target.writelines(self._renewed(block) for block in self._before)
         for piece in _pieces(text):
             target.write(self._gcode_block(piece))
-            told(text.tell())
+            progress(text.tell())
         target.writelines(self._renewed(block) for block in self._after)
 
     def facts(self) -> SlicerFacts:
@@ -325,7 +325,7 @@ def _text_of(block: Block, unpacker: Unpacker) -> bytes:
     (encoding,) = block.parameters
     if encoding not in set(Encoding):
         raise GcodeError(
-            f"{block.place} is encoded in way {encoding}, which is not known (0 text, 1 and 2 "
+            f"{block.place} has the unknown encoding {encoding} (0 text, 1 and 2 "
             "MeatPack); export plain G-code instead"
         )
     data = block.content()

@@ -29,6 +29,6 @@ def check_unpacked(size: int, largest: int) -> None:
     """Raise `GcodeError` when a container unpacks to more than it may."""
     if size > largest:
         raise GcodeError(
-            f"the file unpacks to more than {largest >> 20} MiB, which is no sane print: it is "
+            f"the file unpacks to more than {largest >> 20} MiB, more than any print needs: it is "
             "damaged or made to fill the disk; export plain G-code to process it all the same"
         )

@@ -1,7 +1,7 @@
 """MeatPack: the fifteen commonest characters of G-code in four bits each.
 
 Sources: Marlin, src/feature/meatpack.{h,cpp} (2.1, 2022): signal bytes, commands, order of the
-characters of a pair, and that the second half of a pair is void behind a line end. libbgcode,
+characters of a pair, and that the second half of a pair is void after a line end. libbgcode,
 doc/specifications.md (26beabf): encodings 1 and 2 of binary G-code. What follows from its
 converter, observed on its output (0.2): in lines that begin with G the spaces before words are
 left out and come back when the text is unpacked, and empty lines are padding.

@@ -20,10 +20,10 @@ from stillpath.gcode.containers.threemf import ThreeMf
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
 
-__all__ = ["Container", "Told", "open_text", "rewriting"]
+__all__ = ["Container", "ShareCallback", "open_text", "rewriting"]
 
-Told = Callable[[float], None]
-"""Is told the share that is done, now and then; may raise to stop the work."""
+ShareCallback = Callable[[float], None]
+"""Is progress the share that is done, now and then; may raise to stop the work."""
 
 _COMPARED_BYTES = 1 << 20
 _NAMES = {Kind.TEXT: "plain G-code", Kind.BGCODE: "binary G-code", Kind.THREEMF: "a 3MF package"}
@@ -57,7 +57,7 @@ class Container:
         if self._packed is not None:
             self._packed.delay_s = seconds
 
-    def write(self, text: BinaryIO, target: Path, told: Told = lambda _: None) -> None:
+    def write(self, text: BinaryIO, target: Path, progress: ShareCallback = lambda _: None) -> None:
         """Write a text in the same kind of container, with the settings and all else of the old.
 
         If the text has not changed, the file does not change either.
@@ -68,7 +68,7 @@ class Container:
             Seekable; all of it is written.
         target : Path
             Is written in place: guard it.
-        told : callable, optional
+        progress : callable, optional
 
         Raises
         ------
@@ -85,7 +85,7 @@ class Container:
             size = max(text.seek(0, io.SEEK_END), 1)
             text.seek(0)
             with target.open("wb") as file:
-                self._packed.write(text, file, lambda done: told(done / size))
+                self._packed.write(text, file, lambda done: progress(done / size))
 
     def write_plain(self, text: BinaryIO, target: Path) -> None:
         """Write plain G-code, with what the container knows as comments where it has a form."""
@@ -103,7 +103,7 @@ def open_text(
     *,
     plate: int | None = None,
     folder: Path | None = None,
-    told: Told = lambda _: None,
+    progress: ShareCallback = lambda _: None,
 ) -> Iterator[Container]:
     """Open a print file of any kind for reading its G-code.
 
@@ -115,7 +115,7 @@ def open_text(
         Plate of a package with several.
     folder : Path, optional
         Where the text is spooled; the system's folder for temporary files by default.
-    told : callable, optional
+    progress : callable, optional
 
     Yields
     ------
@@ -139,9 +139,9 @@ def open_text(
         return
     with tempfile.TemporaryFile(dir=folder) as spool:
         packed = (
-            BinaryGcode(path, spool, told)
+            BinaryGcode(path, spool, progress)
             if kind is Kind.BGCODE
-            else ThreeMf(path, spool, told, plate)
+            else ThreeMf(path, spool, progress, plate)
         )
         spool.seek(0)
         yield Container(kind, path, spool, packed)
@@ -149,7 +149,7 @@ def open_text(
 
 @contextlib.contextmanager
 def rewriting(
-    container: Container, target: Path, *, name: Path, told: Told = lambda _: None
+    container: Container, target: Path, *, name: Path, progress: ShareCallback = lambda _: None
 ) -> Iterator[BinaryIO]:
     """Yield a file for the new text; when the block ends well, `target` holds it in its container.
 
@@ -161,7 +161,7 @@ def rewriting(
     name : Path
         What the target will be called. A name of plain G-code, where the source has another,
         asks for plain G-code.
-    told : callable, optional
+    progress : callable, optional
 
     Raises
     ------
@@ -178,7 +178,7 @@ def rewriting(
         if plain:
             container.write_plain(spool, target)
         else:
-            container.write(spool, target, told)
+            container.write(spool, target, progress)
 
 
 def _asks_for_plain(container: Container, name: Path) -> bool:

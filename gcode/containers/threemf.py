@@ -75,7 +75,7 @@ class ThreeMf:
     """
 
     def __init__(
-        self, source: Path, text: BinaryIO, told: Callable[[float], None], plate: int | None
+        self, source: Path, text: BinaryIO, progress: Callable[[float], None], plate: int | None
     ) -> None:
         self.delay_s = 0.0
         self._source = source
@@ -86,9 +86,9 @@ class ThreeMf:
             with archive.open(self._name) as member:
                 while data := member.read(_COPY_BYTES):
                     text.write(data)
-                    told(member.tell() / size)
+                    progress(member.tell() / size)
 
-    def write(self, text: BinaryIO, target: BinaryIO, told: Callable[[float], None]) -> None:
+    def write(self, text: BinaryIO, target: BinaryIO, progress: Callable[[float], None]) -> None:
         """Write a package around a text; its other members and plates are kept as they are."""
         digest, size = _md5(text)
         with _reading(self._source) as archive, zipfile.ZipFile(target, "w") as made:
@@ -99,7 +99,7 @@ class ThreeMf:
                     if ours:
                         while data := text.read(_COPY_BYTES):
                             member.write(data)
-                            told(text.tell())
+                            progress(text.tell())
                     elif info.filename == f"{self._name}.md5":
                         with archive.open(info) as original:
                             member.write(_renewed(original.read(_LARGEST_DIGEST_BYTES), digest))
@@ -242,7 +242,7 @@ def _like(info: zipfile.ZipInfo, size: int) -> zipfile.ZipInfo:
 
 
 def _renewed(old: bytes, digest: str) -> bytes:
-    """Return the digest in the form of the old one; behind it, say a line end is kept."""
+    """Return the digest in the form of the old one; after it, say a line end is kept."""
     form = re.match(rb"\s*([0-9A-Fa-f]{32})", old)
     lower = form is not None and form[1] != form[1].upper()
     made = digest if lower else digest.upper()

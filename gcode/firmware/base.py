@@ -232,7 +232,7 @@ class FirmwareAdapter(Protocol):
 
     @property
     def extruder_alone_stops(self) -> bool:
-        """X, Y and Z always come to rest before a move of the extruder alone, and behind it."""
+        """X, Y and Z always come to rest before a move of the extruder alone, and after it."""
 
     def initial_limits(self) -> Limits:
         """Limits before the first line of a file."""

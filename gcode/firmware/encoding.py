@@ -47,7 +47,7 @@ class Encoded:
     start_s : ndarray, shape (n,)
         When each move begins, counted as on the timeline.
     group_start_s : ndarray, shape (groups,)
-        When each group begins; rests move the groups behind them a little.
+        When each group begins; rests move the groups after them a little.
     row_start_s : ndarray, shape (rows of the piece,)
         When each original move begins on the timeline.
     rest_s : ndarray, shape (groups,)

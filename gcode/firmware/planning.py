@@ -112,8 +112,8 @@ def check_moves_end(phases: Phases, line: Callable[[int], int]) -> None:
         return
     row = int(np.argmax(lasts_s))
     raise GcodeError(
-        f"the move takes {_told(float(lasts_s[row]))} at {phases.cruise_mm_s[row]:.3g} mm/s, more "
-        f"than {_told(LONGEST_MOVE_S)}; correct its F, M220 or the limits in force",
+        f"the move takes {_in_words(float(lasts_s[row]))} at {phases.cruise_mm_s[row]:.3g} mm/s, "
+        f"more than {_in_words(LONGEST_MOVE_S)}; correct its F, M220 or the limits in force",
         line=line(int(phases.move_index[row])),
     )
 
@@ -127,8 +127,9 @@ def check_print_ends(time_s: float, line: int) -> None:
     """
     if not time_s <= LONGEST_PRINT_S:
         raise GcodeError(
-            f"up to here the print takes {_told(time_s)}, more than {_told(LONGEST_PRINT_S)}; "
-            "correct F, M220, dwells or the limits in force, or print it in parts",
+            f"up to here the print takes {_in_words(time_s)}, more than "
+            f"{_in_words(LONGEST_PRINT_S)}; correct F, M220, dwells or the limits in force, or "
+            "print it in parts",
             line=line,
         )
 
@@ -148,7 +149,7 @@ def between_stops(block: ProgramBlock) -> Iterator[tuple[int, int, float | None]
 
 
 def join_phases(parts: Sequence[Phases]) -> Phases:
-    """Put phases one behind the other."""
+    """Put phases one after the other."""
     parts = [part for part in parts if len(part)]
     if len(parts) == 1:
         return parts[0]
@@ -180,6 +181,6 @@ def empty_phases(n: int = 0) -> Phases:
     )
 
 
-def _told(time_s: float) -> str:
+def _in_words(time_s: float) -> str:
     minutes = time_s / 60.0
     return f"{minutes:.3g} min" if minutes < 120.0 else f"{minutes / 60.0:.6g} h"

@@ -126,7 +126,7 @@ class QueuePlanner(ABC):
         speed_mm_s: NDArray[np.float64],
         limits_id: NDArray[np.int32],
     ) -> tuple[int, int]:
-        """Enter moves behind the rows in use; return a problem (or -1) and the move's row."""
+        """Enter moves after the rows in use; return a problem (or -1) and the move's row."""
 
     @abstractmethod
     def _take(self, *, final: bool) -> Phases:

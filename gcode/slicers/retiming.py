@@ -33,7 +33,7 @@ _COMMAND = re.compile(rb"^[ \t\r\f\v]*(?:[^\s;]|; stillpath)[^\n]*\n?", re.MULTI
 _LOOKED_THROUGH_BYTES = 1 << 16
 _STOPS = (MarkKind.COLOR_CHANGE, MarkKind.PAUSE)
 _BEGINS, _TELLS = (np.isin(np.arange(256), list(found)) for found in (b";M \t", b"TPRemCE-"))
-"""Bytes with which a line that tells times may begin, and the first one behind its semicolon."""
+"""Bytes with which a line that tells times may begin, and the first one after its semicolon."""
 
 
 class Retiming:
@@ -44,7 +44,7 @@ class Retiming:
     Parameters
     ----------
     head, tail : bytes
-        Lines of ours to stand before the first command and behind the last one. The comments
+        Lines of ours to stand before the first command and after the last one. The comments
         around stay at the very ends of the file: slicers and hosts know it by them.
     keep_times : bool
         Change no time.

@@ -448,11 +448,11 @@ class Service:
 
     def _send(self, source: Path, options: Mapping[str, Any]) -> str:
         size = source.stat().st_size
-        # A job of our own: it is deleted behind us, also if others send the same file.
+        # A job of our own: it is deleted afterwards, also if others send the same file.
         name = options["name"][-255:]
         query = urlencode({**options, "name": name, "fresh": "true"}, errors="replace")
         with source.open("rb") as file:
-            body = _Told(file, size, lambda share: self._tell("sending", share))
+            body = _CountedFile(file, size, lambda share: self._tell("sending", share))
             job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
         if job.get("source_bytes") != size:
             self._forget(f"/v1/jobs/{job.get('id')}")
@@ -498,7 +498,7 @@ class Service:
         method: str,
         path: str,
         patience_s: float,
-        body: _Told | None = None,
+        body: _CountedFile | None = None,
         take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
         """Return what is taken of the answer; what may pass by itself is tried for some time."""
@@ -515,7 +515,11 @@ class Service:
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
 
     def _open(
-        self, method: str, path: str, body: _Told | None = None, timeout_s: float | None = None
+        self,
+        method: str,
+        path: str,
+        body: _CountedFile | None = None,
+        timeout_s: float | None = None,
     ) -> Any:
         """Return the open answer; raise `Failure` if it is no, `_Broken` if there is none."""
         headers = dict(self._headers)
@@ -601,7 +605,7 @@ class _Web(
         """Go nowhere else."""
 
 
-class _Told:
+class _CountedFile:
     """A file that tells which share of it has been read."""
 
     def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:

@@ -351,7 +351,7 @@ class Stillpath:
     async def _check_free(self, name: str, result: Path) -> None:
         now = await self._print_state()
         if now.get("state") in _BUSY and now.get("filename") == name:
-            raise Refused(f"{name} is being printed; compensate again behind the print")
+            raise Refused(f"{name} is being printed; compensate again after the print")
         if result.exists() and not _is_stamped(result):
             raise Refused(f"{name} is there and was not made by Stillpath; rename it")
 

@@ -25,7 +25,7 @@ from stillpath.models.schedule import (
 )
 from stillpath.models.store import explain
 
-__all__ = ["followed", "scheduled", "special", "usual"]
+__all__ = ["schedulable", "scheduled", "special", "usual"]
 
 _REPEATABLE = 0.0035
 """Relative standard deviation of a frequency from run to run: +-0.7 % within a session."""
@@ -87,7 +87,7 @@ def scheduled(
         grid = _grid(placed) if placed else None
     except ModelError as error:
         raise ModelError(f"axis {found.axis}: {error}") from None
-    plants, varied = followed(found.plants, kind)
+    plants, varied = schedulable(found.plants, kind)
     if grid is not None:
         notes = (*notes, _grid_note(placed))
     notes = (*notes, *varied)
@@ -169,7 +169,7 @@ def _node(condition: Condition, fit: Fit) -> GridNode:
     return GridNode.model_validate({**where, "plant": prompt(fit).model_dump()})
 
 
-def followed(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:
+def schedulable(plants: PlantSetSpec, kind: Kind) -> tuple[PlantSetSpec, tuple[str, ...]]:
     """Return members that can follow a schedule: those that scale, not those that are listed."""
     if not plants.members or isinstance(plants.members, ParametricMembers):
         return plants, ()

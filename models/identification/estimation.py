@@ -8,8 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.fft import next_fast_len, rfft, rfftfreq
-from scipy.signal import csd
+from scipy.fft import next_fast_len, rfft
 from scipy.signal.windows import tukey
 
 from stillpath.models.errors import ModelError
@@ -34,7 +33,6 @@ __all__ = [
     "estimate_aligned",
     "estimate_driven",
     "estimate_response",
-    "estimate_welch",
     "plateau_gain",
     "response_at",
 ]
@@ -56,7 +54,6 @@ _DRIFT_S = 0.05
 """Modes delay the upper half of the band by some 10 ms more or less than the lower one."""
 _LEVEL_UNKNOWN = "level not checked: nothing between 8 and 15 Hz follows the command"
 _WEAKEST_DRIVE = 1e-5
-_SEGMENTS = 12
 _MOST_POINTS = 4096
 _REST = 0.25
 
@@ -229,57 +226,6 @@ def estimate_driven(
     return _driven_response(logs, f_hz, found, label)
 
 
-def estimate_welch(
-    driven: DrivenLog | Sequence[DrivenLog],
-    *,
-    segment_s: float | None = None,
-    label: str = "",
-    progress: Progress | None = None,
-) -> FrequencyResponse:
-    """Return H1 = S_uy/S_uu by Welch's method: Hann windows, half overlapping.
-
-    H1 is right when the command is known and the noise is on the measurement. For drives that
-    last (noise, printing moves); a single sweep is better served by `estimate_driven`.
-
-    Parameters
-    ----------
-    segment_s : float, optional
-        Default: as long as 12 segments in all the logs allow, and 8192 samples at most.
-
-    Returns
-    -------
-    FrequencyResponse
-        At the bins with at least -50 dB of the strongest drive. sd^2 = |H|^2 (1 - coherence) /
-        (coherence K), K the number of independent segments (Bendat and Piersol, Random Data, 4th
-        ed., section 9.2; that of a complex error, twice that of the magnitude).
-    """
-    logs = _several(driven)
-    report = progress or _silent
-    rate_hz = _rate_hz(logs[0])
-    if any(abs(_rate_hz(log) / rate_hz - 1) > 1e-3 for log in logs):
-        raise ModelError(f"{logs[0].source}: logs of different rates; estimate them one by one")
-    samples = _segment_samples(logs, rate_hz, segment_s)
-    sums: list[NDArray[np.complex128]] = []
-    count = 0
-    for i, log in enumerate(logs):
-        segments = 2 * len(log.time_s) // samples - 1
-        pairs = ((log.command, log.command), (log.command, log.measured), (log.measured,) * 2)
-        spectra = [segments * _cross_spectrum(a, b, rate_hz, samples) for a, b in pairs]
-        sums = [a + b for a, b in zip(sums, spectra, strict=True)] if sums else spectra
-        count += segments
-        report("estimate", (i + 1) / len(logs))
-    uu, uy, yy = sums[0].real, sums[1], sums[2].real
-    f_hz = rfftfreq(samples, 1.0 / rate_hz)
-    used = (uu >= _WEAKEST_DRIVE * uu.max()) & (f_hz > 1.5 * rate_hz / samples) & (yy > 0)
-    response = uy[used] / uu[used]
-    coherence = np.clip(np.abs(uy[used]) ** 2 / (uu[used] * yy[used]), 1e-12, 1.0)
-    # Neighbouring Hann segments that half overlap have a squared correlation of 1/36.
-    independent = count / (1.0 + 2.0 / 36.0 * (1.0 - 1.0 / count))
-    sd = np.abs(response) * np.sqrt((1.0 - coherence) / (coherence * independent))
-    found = LocalResponse(response, np.asarray(sd, np.float64), coherence)
-    return _driven_response(logs, np.asarray(f_hz[used], np.float64), found, label)
-
-
 def _check_followed(response: FrequencyResponse, excitation: Excitation) -> None:
     coherent = response.coherence >= _LEAST_COHERENCE
     if np.mean(coherent) < _LEAST_FOLLOWED:
@@ -346,26 +292,6 @@ def _driven_grid(records: Sequence[Transformed], half_band_hz: float) -> Array:
 
 def _nyquist_hz(records: Sequence[Transformed]) -> float:
     return min(r.spacing_hz * (len(r.command) - 1) for r in records)
-
-
-def _segment_samples(logs: Sequence[DrivenLog], rate_hz: float, segment_s: float | None) -> int:
-    total = sum(len(log.time_s) for log in logs)
-    shortest = min(len(log.time_s) for log in logs)
-    many = min(2.0 * total / (_SEGMENTS + len(logs)), 2.0 * _MOST_POINTS)
-    samples = int(min(segment_s * rate_hz if segment_s else many, shortest))
-    if samples < 16:
-        raise ModelError(
-            f"{logs[0].source}: segments of {samples} samples are too short for a spectrum; "
-            "record longer, or choose longer segments"
-        )
-    return samples
-
-
-def _cross_spectrum(
-    first: Array, second: Array, rate_hz: float, samples: int
-) -> NDArray[np.complex128]:
-    spectrum = csd(first, second, rate_hz, window="hann", nperseg=samples, detrend="constant")[1]
-    return np.asarray(spectrum, complex)
 
 
 def _driven_response(

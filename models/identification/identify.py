@@ -40,7 +40,7 @@ from stillpath.models.identification.sets import (
     typed_in_set,
 )
 from stillpath.models.identification.spectrum_fit import refit_spectrum
-from stillpath.models.identification.trust import check_axes, check_told, keeps_time
+from stillpath.models.identification.trust import check_axes, check_informative, keeps_time
 from stillpath.models.identification.types import (
     AccelerationLog,
     AxisIdentification,
@@ -199,7 +199,7 @@ class _AxisWork:
         fit_warnings = _fit_warnings(found.fit, names) if found.fit else ()
         warnings = (*fit_warnings, *found.warnings, *warned)
         if found.fit is not None:
-            check_told(found.fit, found.measured, names, warnings)
+            check_informative(found.fit, found.measured, names, warnings)
         return replace(found, notes=told, warnings=warnings)
 
     def _from_model(self) -> AxisIdentification:

@@ -326,7 +326,7 @@ def _by_label(measured: Sequence[FrequencyResponse]) -> list[list[FrequencyRespo
 def _parts(
     progress: Callable[[float], None] | None,
 ) -> tuple[Callable[[float], None] | None, Callable[[float], None] | None]:
-    """Part progress between a fit and the draws behind it."""
+    """Part progress between a fit and the draws after it."""
     if progress is None:
         return None, None
     return lambda part: progress(0.5 * part), lambda part: progress(0.5 + 0.5 * part)

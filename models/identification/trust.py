@@ -15,7 +15,7 @@ from stillpath.models.identification.types import (
     Spectrum,
 )
 
-__all__ = ["check_axes", "check_told", "keeps_time"]
+__all__ = ["check_axes", "check_informative", "keeps_time"]
 
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
@@ -32,7 +32,7 @@ _MEASURE = (
 )
 
 
-def check_told(
+def check_informative(
     fit: Fit,
     measured: Sequence[FrequencyResponse | Spectrum],
     sources: Sequence[str],

@@ -7,17 +7,14 @@ written lines set it. Where a feature exceeds its bound there, it is made slower
 
 from __future__ import annotations
 
-import contextlib
 import io
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
 import numpy as np
 
-from stillpath.gcode.containers.opening import open_text, rewriting
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
@@ -26,7 +23,7 @@ from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
-from stillpath.pipeline.advising.choosing import Choice, choose
+from stillpath.pipeline.advising.choosing import AsSliced, Choice, choose
 from stillpath.pipeline.advising.earlier import EarlierErrors
 from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
 from stillpath.pipeline.advising.messages import (
@@ -37,8 +34,9 @@ from stillpath.pipeline.advising.messages import (
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
-from stillpath.pipeline.files import default_cache_dir, replacing
-from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
+from stillpath.pipeline.file_rewriting import file_rewriting
+from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.layer_files import LayerWriter
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement, channel_names
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
@@ -47,9 +45,10 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.pacing.samples import take_samples
 from stillpath.pipeline.piece_compensator import DT_S
-from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports
 from stillpath.pipeline.reading import dialect_for, doubts
 from stillpath.pipeline.result import (
+    NOTHING_COMPENSATED,
     AdviceFigures,
     AdvisedFeature,
     AdvisedShaper,
@@ -91,33 +90,14 @@ def advise_file(
     Parameters and errors are those of `pipeline.compensate.compensate_file`. The slicer's times
     in the file stay as they are, whatever `options.times` says: only lines of our own are added.
     """
-    unpacking, packing = (
-        progress_to(progress, "unpacking", 0.0),
-        progress_to(progress, "packing", 1.0),
-    )
-    with (
-        contextlib.ExitStack() as files,
-        replacing(target) as temporary,
-        open_text(source, plate=options.plate, folder=target.parent, told=unpacking) as container,
-    ):
-        writer = None
-        with (
-            rewriting(container, temporary, name=target, told=packing) as text,
-            tempfile.TemporaryFile(dir=target.parent) as spool,
-            EarlierErrors(target.parent, 2) as earlier,
-        ):
-            if layers is not None:
-                names = channel_names(compensated=True)
-                writer = files.enter_context(written_layers(layers, names))
-            job = _Job(container.text, spool, machine, options, cache_dir, progress)
-            result = job.run(source.name, container.facts(), earlier, writer)
-            spool.seek(0)
-            shutil.copyfileobj(spool, text, _BLOCK_BYTES)
-        sizes = {
-            "original_bytes": source.stat().st_size,
-            "written_bytes": temporary.stat().st_size,
-        }
-        return result.model_copy(update=sizes)
+    opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
+    with opened as file, EarlierErrors(target.parent, 2) as earlier:
+        container = file.container
+        job = _Job(container.text, file.spool, machine, options, cache_dir, progress)
+        result = job.run(source.name, container.facts(), earlier, file.layers)
+        file.spool.seek(0)
+        shutil.copyfileobj(file.spool, file.text, _BLOCK_BYTES)
+    return result.model_copy(update=file.sizes)
 
 
 class _Job:
@@ -167,20 +147,18 @@ class _Job:
         with self._clock.stage("choose"):
             self._source.seek(0)
             samples = take_samples(self._source, machine, self._dialect)
+            errors_um = {f: error.rms_um for f, error in was.items()}
             choice = choose(
                 samples,
-                names,
+                AsSliced(names, self._before, errors_um, reading.levels),
                 machine,
                 self._adviser,
-                self._before,
                 options.budget_um,
-                {f: error.rms_um for f, error in was.items()},
-                reading.levels,
                 lambda share: self._say("choosing", 0.3 + 0.3 * share),
                 shaped=shaped,
             )
         with self._clock.stage("verify"):
-            writer, now = self._settled(choice, was, asked.time_s, samples.first_layer)
+            writer, now = self._within_bounds(choice, was, asked.time_s, samples.first_layer)
         earlier.rewind()
         advised = Measurement(
             machine,
@@ -226,7 +204,7 @@ class _Job:
             ],
         )
 
-    def _settled(
+    def _within_bounds(
         self,
         choice: Choice,
         was: dict[int, ClassError],
@@ -291,7 +269,7 @@ class _Job:
             DT_S,
             longest_stand_s=STANDING_S,
             shaping=self._before,
-            told=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
+            progress=lambda share, at_s: self._say(stage, low + (high - low) * share, at_s),
             each=each,
         )
         operation, shaper = Operation(self._machine), ShapedMotion(DT_S)
@@ -376,19 +354,9 @@ class _Job:
             slicer_time_s=facts.estimate_s,
             original_bytes=0,
             written_bytes=0,
-            segments=0,
-            segments_per_s=0.0,
-            peak_segments_per_s=0.0,
             peak_velocity_mm_s=0.0,
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
-            emission_rms_um=0.0,
-            emission_max_um=0.0,
-            filament_error_mm=0.0,
-            compensated_s=0.0,
             extruding_s=sum(group.seconds for group in features),
-            pieces=0,
-            put_back=[],
-            put_back_extruding_share=0.0,
             warnings=[
                 *self._doubts,
                 *asked.warnings,
@@ -403,6 +371,7 @@ class _Job:
             layer_views=advised.layer_views(),
             advice=figures,
             stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            **NOTHING_COMPENSATED,
         )
 
 

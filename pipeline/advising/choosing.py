@@ -33,7 +33,7 @@ from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
 from stillpath.pipeline.pacing.samples import FileSamples
 from stillpath.pipeline.piece_compensator import DT_S
 
-__all__ = ["Choice", "choose", "ladder"]
+__all__ = ["AsSliced", "Choice", "choose", "ladder"]
 
 DAMPING = 0.1
 _LOW_MM_S2, _RATIO = 500.0, 1.2
@@ -51,7 +51,7 @@ _UNLIKE = 2.0
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
-Told = Callable[[float], None]
+ShareCallback = Callable[[float], None]
 
 
 @dataclass(slots=True)
@@ -129,48 +129,60 @@ class Choice:
         return True
 
 
+@dataclass(frozen=True, slots=True)
+class AsSliced:
+    """What a file does before anything is advised.
+
+    Attributes
+    ----------
+    names : sequence of str
+        Of the features.
+    shaping : Shaping
+        What the printer would shape with.
+    errors_um : mapping
+        What every feature errs in the whole file.
+    levels : sequence of (layer, OperatingPoint)
+        Where the machine is from which layer on; more than one where plants follow a schedule.
+    """
+
+    names: Sequence[str]
+    shaping: Shaping
+    errors_um: Mapping[int, float]
+    levels: Sequence[tuple[int, OperatingPoint]]
+
+
 def choose(
     samples: FileSamples,
-    names: Sequence[str],
+    sliced: AsSliced,
     machine: Machine,
     adviser: Adviser,
-    before: Shaping,
     budget_um: float | None,
-    whole_um: Mapping[int, float],
-    levels: Sequence[tuple[int, OperatingPoint]],
-    told: Told = lambda _share: None,
+    progress: ShareCallback = lambda _share: None,
     *,
     shaped: bool = True,
 ) -> Choice:
-    """Choose for a file.
+    """Choose shapers and accelerations for a file.
 
     Parameters
     ----------
     samples : FileSamples
-    names : sequence of str
-        Of the features.
+    sliced : AsSliced
     machine : Machine
     adviser : Adviser
-    before : Shaping
-        What the printer would shape with.
     budget_um : float, optional
         What every feature may err; None: what it erred before.
-    whole_um : mapping
-        What every feature erred in the whole file as sliced.
-    levels : sequence of (layer, OperatingPoint)
-        Where the machine is from which layer on; more than one where plants follow a schedule.
-    told : callable, optional
+    progress : callable, optional
         Is given the share that is done.
     shaped : bool
         A shaper may be advised.
     """
     members = members_of(machine, DT_S)
     as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
-    features = [f for f in as_sliced.features if _free(f, names)]
-    visible = {f for f in features if is_visible(names[f] if f >= 0 else "")}
-    was = {f: max(um, 1e-3) for f, um in as_sliced.errors(before).items()}
+    features = [f for f in as_sliced.features if _free(f, sliced.names)]
+    visible = {f for f in features if is_visible(sliced.names[f] if f >= 0 else "")}
+    was = {f: max(um, 1e-3) for f, um in as_sliced.errors(sliced.shaping).items()}
     limits = _Limits(
-        {f: _bound_um(was[f], whole_um.get(f, was[f]), budget_um) for f in features},
+        {f: _bound_um(was[f], sliced.errors_um.get(f, was[f]), budget_um) for f in features},
         has_budget=budget_um is not None,
     )
     choice = Choice(
@@ -182,37 +194,53 @@ def choose(
     if not features:
         return choice
     kinds = adviser.shapers if shaped else ()
-    candidates = _candidates(samples, machine, adviser, kinds, before, levels, visible, told)
+    candidates = _candidates(samples, machine, adviser, kinds, sliced, visible, progress)
     points = [sample.point for sample in samples.samples]
-    by_point = [_by_point(c, points, levels, machine) for c in candidates]
-    every = [_Found() for _ in candidates]
+    by_point = [_by_point(c, points, sliced.levels, machine) for c in candidates]
+
+    def trial_of(bounds: dict[int, Bound]) -> Trial:
+        return Trial(samples, bounds, machine, adviser, DT_S, members) if bounds else as_sliced
+
+    every = _try_rungs(trial_of, by_point, limits, choice, progress)
+    number, choice.rung = _best(every, limits, choice)
+    choice.helpless = {f for f in visible if not limits.reaching(every[number], f)}
+    choice.shapers = candidates[number].table(sliced.levels)
+    for _ in range(_MENDING_ROUNDS):
+        um = trial_of(choice.bounds()).errors(by_point[number])
+        over = {f: limits.ratio(um[f], f, k) for f, k in choice.rung.items()}
+        if not choice.mended({f: ratio for f, ratio in over.items() if ratio > 1.0}):
+            break
+    return choice
+
+
+def _try_rungs(
+    trial_of: Callable[[dict[int, Bound]], Trial],
+    by_point: Sequence[Mapping[OperatingPoint, Shaping] | Shaping],
+    limits: _Limits,
+    choice: Choice,
+    progress: ShareCallback,
+) -> list[_Found]:
+    """Try every shaper on the usual rungs, and on lower ones until one is fair to what shows."""
+    every = [_Found() for _ in by_point]
 
     def tried(rung: int | None) -> None:
-        trial = as_sliced
+        bounds: dict[int, Bound] = {}
         if rung is not None:
-            bounds = {f: _bound(choice.rungs[rung], visible=f in visible) for f in features}
-            trial = Trial(samples, bounds, machine, adviser, DT_S, members)
+            accel = choice.rungs[rung]
+            bounds = {f: _bound(accel, visible=f in choice.visible) for f in choice.rung}
+        trial = trial_of(bounds)
         for found, shapings in zip(every, by_point, strict=True):
             found.add(rung, trial.errors(shapings), trial.seconds)
-        told(0.5 + 0.5 * len(every[0].um) / (1 + len(choice.rungs)))
+        progress(0.5 + 0.5 * len(every[0].um) / (1 + len(choice.rungs)))
 
     usual = [k for k, accel in enumerate(choice.rungs) if accel >= _LOW_MM_S2]
     for rung in (None, *usual):
         tried(rung)
     for rung in reversed(range(len(choice.rungs) - len(usual))):
-        if any(all(limits.fair(found, f) for f in visible) for found in every):
+        if any(all(limits.fair(found, f) for f in choice.visible) for found in every):
             break
         tried(rung)
-    number, choice.rung = _best(every, limits, choice)
-    choice.helpless = {f for f in visible if not limits.reaching(every[number], f)}
-    choice.shapers = candidates[number].table(levels)
-    for _ in range(_MENDING_ROUNDS):
-        trial = Trial(samples, choice.bounds(), machine, adviser, DT_S, members)
-        um = trial.errors(by_point[number])
-        over = {f: limits.ratio(um[f], f, k) for f, k in choice.rung.items()}
-        if not choice.mended({f: ratio for f, ratio in over.items() if ratio > 1.0}):
-            break
-    return choice
+    return every
 
 
 def ladder(highest_mm_s2: float, machine: Machine) -> list[float]:
@@ -310,14 +338,14 @@ def _candidates(
     machine: Machine,
     adviser: Adviser,
     kinds: Sequence[str],
-    before: Shaping,
-    levels: Sequence[tuple[int, OperatingPoint]],
+    sliced: AsSliced,
     visible: set[int],
-    told: Told,
+    progress: ShareCallback,
 ) -> list[_Candidate]:
     """Return every type of shaper at its best frequencies, and what there was before."""
+    levels = sliced.levels
     count = len(levels)
-    made = [_Candidate([before] * count, ours=False)]
+    made = [_Candidate([sliced.shaping] * count, ours=False)]
     members = members_of(machine, DT_S)
     few = [members[0], *members[1 :: max(1, -(-(len(members) - 1) // _MEMBERS))]]
     tuned = np.unique(np.linspace(0, count - 1, min(count, _TUNED_LEVELS)).round().astype(int))
@@ -330,7 +358,7 @@ def _candidates(
             start = logs[kind][-1] if logs[kind] else None
             i, j = _tuned(trial, kind, at, len(few), start, same=adviser.same_for_both)
             logs[kind].append((i, j))
-            told(0.5 * (n + (m + 1) / len(kinds)) / len(tuned))
+            progress(0.5 * (n + (m + 1) / len(kinds)) / len(tuned))
     for kind, found in logs.items():
         axes = []
         for column in (0, 1):

@@ -4,8 +4,8 @@ Every line of our own stands by itself and carries `MARK`. Whoever deletes the l
 has the original, byte for byte.
 
 The file's own commands keep their meaning. Where it sets an acceleration, or a shaper, ours is set
-again behind; before lines that may do anything (homing, macros, pauses, a change of tool) the
-printer gets back what the file has set, and behind them ours again.
+again after; before lines that may do anything (homing, macros, pauses, a change of tool) the
+printer gets back what the file has set, and after them ours again.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class AdviceWriter:
         self._shaped = False
         self._own_shaper: dict[bytes, bytes] = {}
         """The file's own commands that set a shaper, the last of each form."""
-        # A line may hold others before it and behind.
+        # A line may hold others before it and after.
         self._sets_shaper = re.compile(
             rb"\b%s\b(?:(?![GMT]\d)[^;])*" % adviser.shaper_word.encode(), re.IGNORECASE
         )
@@ -264,7 +264,7 @@ def write_advised(
                 tail = out.tell() + end
             out.write(text)
     rest = b"".join(block.text for block in reader.flush())
-    # Behind a line without an end nothing can be added: the end comes before it.
+    # After a line without an end nothing can be added: the end comes before it.
     if header or behind_last_command(rest):
         tail = out.tell()
     out.write(rest)

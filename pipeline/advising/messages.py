@@ -19,7 +19,7 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
     none_known : bool
         The firmware takes none from a file.
     left : bool
-        Ours stays in force behind the file.
+        Ours stays in force after the file.
     """
     found = [
         f"The shaper {kind} (firmware.shaper in the machine) has no model: figures of the file "

@@ -47,7 +47,7 @@ def members_of(machine: Machine, dt_s: float) -> list[int | None]:
 
 @dataclass(frozen=True, slots=True)
 class _Motion:
-    """The sampled motion of all samples, one behind the other, rests between them."""
+    """The sampled motion of all samples, one after the other, rests between them."""
 
     path_mm: Array
     feature: NDArray[np.int32]

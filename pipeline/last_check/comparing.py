@@ -118,7 +118,7 @@ class LastCheck:
         """Lines of ours that leave place and modes as they are."""
         self._streaming = False
         self._begun: deque[Place] = deque(maxlen=16)
-        """Where the original was behind its last lines within the stream."""
+        """Where the original was after its last lines within the stream."""
         self._wanted: Wanted | None = None
         self._earlier: deque[bytes] = deque(maxlen=64)
         """Lines that were taken for the first of several with their text; perhaps they were not."""
@@ -141,7 +141,7 @@ class LastCheck:
         if cut:
             self._written.take(b"".join((*self._rest, data[:cut])))
             self._rest = []
-            self._follow()
+            self._compare_all()
         if cut < len(data):
             self._rest.append(data[cut:])
         self.cpu_s += time.process_time() - began
@@ -158,7 +158,7 @@ class LastCheck:
         if self._rest:
             self._written.take(b"".join((*self._rest, b"\n")))
             self._rest = []
-            self._follow()
+            self._compare_all()
         if expected := self._original.peek():
             raise self._missing(self._original.text.line, expected)
         if self._gap_line:
@@ -173,7 +173,7 @@ class LastCheck:
 
     # The written file
 
-    def _follow(self) -> None:
+    def _compare_all(self) -> None:
         written = self._written
         while not written.is_read:
             if self._streaming:
@@ -211,7 +211,7 @@ class LastCheck:
             start = written.data.rfind(b"\n", after, end) + 1
             code = written.data[max(start, after) : end]
             place = original.line - 1, written.line - 1
-            raise self._differs(found, self._before.state, "behind", code, *place)
+            raise self._differs(found, self._before.state, "after", code, *place)
         self._note(moves, unknown, before, before + known)
         if written.is_read or (lines and original.is_read):
             return
@@ -266,7 +266,7 @@ class LastCheck:
                 raise self._differs(
                     found,
                     wanted.before if is_before else self._before.state,
-                    "before" if is_before else "behind",
+                    "before" if is_before else "after",
                     wanted.code,
                     wanted.line,
                     written.line - (not is_before),
@@ -343,7 +343,7 @@ class LastCheck:
         self._kept += 1
 
     def _came_already(self) -> bool:
-        """Whether the line waited for was taken for an earlier one; go on behind it then."""
+        """Whether the line waited for was taken for an earlier one; go on after it then."""
         wanted = self._wanted
         if wanted is None or wanted.code not in self._earlier:
             return False
@@ -362,7 +362,7 @@ class LastCheck:
             state[at.FED] = NAN
 
     def _take(self, wanted: Wanted, *, compared: bool) -> None:
-        """Go on behind a line that was waited for."""
+        """Go on after a line that was waited for."""
         if compared:
             self._count(wanted.line)
         else:
@@ -386,7 +386,7 @@ class LastCheck:
             self._begun.append(original.place())
 
     def _leave(self, number: int) -> None:
-        """Leave a stream behind which the file goes on with a line of the original."""
+        """Leave a stream after which the file goes on with a line of the original."""
         original = self._original
         wanted = self._wanted or original.wanted()
         while wanted.line < number and wanted.code in self._earlier:
@@ -399,7 +399,7 @@ class LastCheck:
         if number == ALL:
             self._check(self._before.state, at.WORDS, b"the last stream", original.text.line)
             return
-        # Go back to before the line: what is wanted may lie behind it, and lines of ours that set
+        # Go back to before the line: what is wanted may lie after it, and lines of ours that set
         # modes or F may have been taken for such.
         original.look_ahead(wanted)
         original.perhaps.clear()
@@ -421,7 +421,7 @@ class LastCheck:
     # What is found
 
     def _check(
-        self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "behind"
+        self, before: NDArray[np.float64], mask: int, code: bytes, line: int, where: str = "after"
     ) -> None:
         """Compare a state of the original with where the written file is."""
         if np.isnan(before[at.FED] + self._after.state[at.FED]):

@@ -51,13 +51,13 @@ class Text:
         return self.at >= self.stop
 
     def take(self, data: bytes) -> None:
-        """Go on with other lines, behind those that were at hand."""
+        """Go on with other lines, after those that were at hand."""
         self.bytes_before += len(self.data)
         self.data, self.at, self.stop = data, 0, len(data)
         self.array = np.frombuffer(data, np.uint8)
 
     def peek(self) -> tuple[bytes, int]:
-        """Return the next line without its end, and where the one behind it begins."""
+        """Return the next line without its end, and where the one after it begins."""
         end = self.data.index(b"\n", self.at)
         line = self.data[self.at : end]
         if self.line == 1 and line.startswith(_BOM):
@@ -173,7 +173,7 @@ class Original:
         return b""
 
     def skip(self) -> None:
-        """Go on behind the next line."""
+        """Go on after the next line."""
         self.text.skip(self.text.data.index(b"\n", self.text.at) + 1)
 
     def harmless(self) -> bytes:
@@ -183,7 +183,7 @@ class Original:
         return line if self.reader.leaves_alone(line.strip()) else b""
 
     def wanted(self) -> Wanted:
-        """Carry out what a stream may stand for, and the line behind it, which must stay."""
+        """Carry out what a stream may stand for, and the line after it, which must stay."""
         if self._ahead is not None:
             wanted, place, perhaps = self._ahead
             if wanted.line >= self.text.line:
@@ -208,7 +208,7 @@ class Original:
         return Wanted()
 
     def look_ahead(self, wanted: Wanted) -> None:
-        """Remember what is wanted next, behind which the original is now.
+        """Remember what is wanted next, after which the original is now.
 
         Many streams may end before it, and the file should not be searched again for each.
         """
@@ -226,7 +226,7 @@ class Original:
                 self.skip()
 
     def _next(self, before_line: int, perhaps: deque[bytes]) -> tuple[bytes, int]:
-        """Carry out moves of X and Y, and go on to what is behind them.
+        """Carry out moves of X and Y, and go on to what is after them.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ class Original:
         Returns
         -------
         (bytes, int)
-            The line behind them, to be carried out, and -1; or one that stands still in X and Y and
+            The line after them, to be carried out, and -1; or one that stands still in X and Y and
             was carried out, with its words. Nothing at the end of the file, and before the line.
         """
         text, reader = self.text, self.reader

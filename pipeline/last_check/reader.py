@@ -71,7 +71,7 @@ class Reader:
     state : float array
         See `pipeline.last_check._reader_kernels`.
     lost : bytes
-        The last line behind which the position was not known.
+        The last line after which the position was not known.
     """
 
     def __init__(self, rules: Rules, shortest_mm: float = 0.0) -> None:
@@ -137,7 +137,7 @@ class Reader:
             return Kind.STAYS, 0
         rules = self.rules
         code = line.split(b";", 1)[0]
-        if rules.several and not self._holds(code):
+        if rules.several and not self._is_unconditional(code):
             return self._forget(code, modes=True), 0
         code = code.strip(b" \t\r")
         if rules.checks_sums and b"*" in code and code != code.upper():
@@ -161,7 +161,7 @@ class Reader:
             return self._harmless(code, name, rest), 0
         return self._command(code, name, rest), 0
 
-    def _holds(self, code: bytes) -> bool:
+    def _is_unconditional(self, code: bytes) -> bool:
         """Whether a line is carried out for certain: it does not stand under a condition."""
         indent = len(code) - len(code.lstrip(b" \t"))
         if self._condition >= 0 and indent > self._condition:

@@ -3,7 +3,7 @@
 Sources: Klipper klippy/gcode.py and klippy/extras/gcode_move.py, 2026-08; Marlin
 Marlin/src/gcode/parser.cpp, queue.cpp and gcode.cpp, bugfix-2.1.x; RepRapFirmware
 src/GCodes/GCodeBuffer/StringParser.cpp and GCodes2.cpp, 3.5. Words that are not certain to leave
-the head where it is are not among the harmless ones: behind them nothing is compared until the
+the head where it is are not among the harmless ones: after them nothing is compared until the
 file names a position.
 """
 
@@ -53,7 +53,7 @@ class Rules:
     positioning_sets_extruder : bool
         G90 and G91 are of E too (Marlin).
     relative_rules_extruder : bool
-        Behind G91 E is relative whatever M82 said (Klipper).
+        After G91 E is relative whatever M82 said (Klipper).
     divides_extruder : bool
         An arc gives each of its pieces a part of E, as if that were relative (Klipper).
     bare_set_position : bool
@@ -67,7 +67,7 @@ class Rules:
     checks_sums : bool
         A line with a wrong checksum is dropped (RepRapFirmware).
     exponents : bool
-        An E right behind a digit belongs to the number (RepRapFirmware).
+        An E right after a digit belongs to the number (RepRapFirmware).
     several : bool
         A line may hold several commands, and conditions (RepRapFirmware).
     longest : int

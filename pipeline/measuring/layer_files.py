@@ -1,4 +1,4 @@
-"""Layers of a print as files: layers.bin, tiles one behind the other, and layers.json about them.
+"""Layers of a print as files: layers.bin, tiles one after the other, and layers.json about them.
 
 The format stands in docs/layers.md.
 """

@@ -152,22 +152,22 @@ class LayerRecorder:
         here, begins = first_move + int(row[0]), self._moves is None
         if not begins and self._moves is not moves:
             # Moves that were too short for a sample end the moves before.
-            self._follow(self._nothing, here)
+            self._add_points(self._nothing, here)
         self._moves, self._first = moves, first_move
         if begins or jumped:
             self._number[kernels.MOVE] = here
             self._lift(samples)
         # Numbers go on where one item of the file ends and the next one begins.
         self._number[kernels.MOVE] = max(int(self._number[kernels.MOVE]), first_move)
-        self._follow(samples, 0)
+        self._add_points(samples, 0)
 
     def finish(self) -> None:
         """Say that the motion has ended."""
         if self._moves is not None:
-            self._follow(self._nothing, self._first + len(self._moves))
+            self._add_points(self._nothing, self._first + len(self._moves))
             self._close()
 
-    def _follow(self, samples: _Samples, until: int) -> None:
+    def _add_points(self, samples: _Samples, until: int) -> None:
         """Add the points of samples and of the moves before `until`."""
         moves = self._moves
         assert moves is not None

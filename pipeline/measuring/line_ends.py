@@ -1,4 +1,4 @@
-"""The largest contour errors behind the ends of lines.
+"""The largest contour errors after the ends of lines.
 
 A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
 it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
@@ -19,12 +19,12 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RINGING_S = 0.1
-"""So long ringing counts behind the end of a line."""
+"""So long ringing counts after the end of a line."""
 _STILL_MM = 1e-9
 
 
 class LineEnds:
-    """Find the largest errors behind the ends of lines, in all, by layer and by feature.
+    """Find the largest errors after the ends of lines, in all, by layer and by feature.
 
     Parameters
     ----------

@@ -129,7 +129,7 @@ class Responses:
             }
 
     def _release(self, ready: int) -> ResponseSamples:
-        # What is planned begins `reach` samples before what is held, and ends as many behind it.
+        # What is planned begins `reach` samples before what is held, and ends as many after it.
         span = slice(self._reach, self._reach + ready)
         sliced = self._planned[-2:]
         path, executed = self._planned[:2, span], self._executed[:, :ready]

@@ -21,7 +21,7 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 LANDING_S = 0.05
-"""What is extruded so soon behind a travel counts for the travel too, which shook the machine."""
+"""What is extruded so soon after a travel counts for the travel too, which shook the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class SetErrors:
         return {one: found.worst for one, found in self.sums().items()}
 
     def _landing(self, travels: Mask) -> Mask:
-        """Mark the samples soon behind a travel."""
+        """Mark the samples soon after a travel."""
         n = len(travels)
         at = np.where(travels, np.arange(n), -1 - self._since)
         since = np.arange(n) - np.maximum.accumulate(at)

@@ -22,13 +22,13 @@ _AIM, _WITHIN, _ROOM = 0.95, 0.98, 0.92
 _NO_WORSE = 1.1
 """What exceeds the budget at its own pace may become so many times worse."""
 _LANDING = 2.0
-"""So many budgets may what is extruded right behind a travel have; its feature has one for all."""
+"""So many budgets may what is extruded right after a travel have; its feature has one for all."""
 _LEAP = 8.0
 """A class is raised at most so many times at once."""
 _STEEPEST, _FLATTEST = 2.5, 0.2
 """Limits of the power of acceleration with which an error is taken to rise."""
 _SHAKEN = 0.7
-"""The same of what a class causes in those behind it."""
+"""The same of what a class causes in those after it."""
 _SAME = 1.02
 _WORTH = 0.002
 """Time that a raise must save for another one to be tried."""

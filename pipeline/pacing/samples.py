@@ -84,7 +84,7 @@ def take_samples(
     source: BinaryIO,
     machine: Machine,
     dialect: Dialect,
-    told: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> FileSamples:
     """Read a file to its end and take samples of all moves whose pace may change.
 
@@ -94,13 +94,13 @@ def take_samples(
         At its beginning.
     machine : Machine
     dialect : Dialect
-    told : callable, optional
+    progress : callable, optional
         Is given the bytes read so far.
     """
     operation = Operation(machine)
     places: dict[tuple[int, int], _Places] = {}
     first_layer = FirstLayer(-1)
-    for number, item in enumerate(_items(source, machine, dialect, told)):
+    for number, item in enumerate(_items(source, machine, dialect, progress)):
         first_layer = _seen(first_layer, item.moves)
         point = operation.at(item.moves)
         operation.passed(item.moves)
@@ -114,14 +114,14 @@ def take_samples(
 
 
 def _items(
-    source: BinaryIO, machine: Machine, dialect: Dialect, told: Callable[[float], None] | None
+    source: BinaryIO, machine: Machine, dialect: Dialect, progress: Callable[[float], None] | None
 ) -> Iterator[Piece | VerbatimPart]:
     reader, splitter = Interpreter(machine, dialect=dialect), Splitter(machine)
     while data := source.read(_BLOCK_BYTES):
         for block in reader.push(data):
             yield from splitter.push(block)
-        if told is not None:
-            told(float(source.tell()))
+        if progress is not None:
+            progress(float(source.tell()))
     for block in reader.flush():
         yield from splitter.push(block)
     yield from splitter.flush()

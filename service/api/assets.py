@@ -43,7 +43,7 @@ class Layers:
         self._lock = threading.Lock()
 
     def spans(self, output: str) -> list[tuple[int, int]]:
-        """Return first byte, and the one behind the last, of each tile under an output.
+        """Return first byte, and the one after the last, of each tile under an output.
 
         Raises
         ------

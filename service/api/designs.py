@@ -9,6 +9,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import HTMLResponse, Response
 
 from stillpath.applications.design.figures import DesignReport
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.pipeline.options import BasisName, RobustMode
 from stillpath.service.api.access import Reader
 from stillpath.service.api.computing import WAITING, Question, answer_of, answered
@@ -26,7 +27,7 @@ async def _asked(
     name: Name,
     caller: Reader,
     axis: Literal["x", "y"],
-    basis: BasisName = "ce-opt",
+    basis: BasisName = DEFAULT_BASIS,
     robust: RobustMode = "off",
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)

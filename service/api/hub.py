@@ -91,7 +91,7 @@ class Hub:
             self._wanted.set()
 
     async def watch(self, job_id: str, seen: str | None = None) -> AsyncGenerator[Snapshot, None]:
-        """Yield the job as it stands, then whenever it changes; ends behind its final state.
+        """Yield the job as it stands, then whenever it changes; ends after its final state.
 
         Parameters
         ----------

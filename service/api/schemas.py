@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
 from stillpath.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
@@ -95,13 +96,13 @@ class JobQuery(BaseModel):
         max_length=255, description="A name from `/v1/machines`.", examples=["ender3"]
     )
     method: MethodName = Field(
-        default="fbf",
+        default=DEFAULT_METHOD,
         description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
         "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
-        "3hump_ei) or `none`; with `+ripple` behind it the machine's ripple is undone as well. "
+        "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
         "`advise` leaves all moves as they are and adds firmware commands.",
     )
-    basis: BasisName = Field(default="ce-opt", description="Basis functions of `fbf`.")
+    basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
     robust: RobustMode = Field(
         default="auto",
         description="What `fbf` is designed for: all plants that explain the measurement, with as "
@@ -110,8 +111,8 @@ class JobQuery(BaseModel):
     )
     along: Annotated[float, Field(ge=0.01, le=1, allow_inf_nan=False)] | None = Field(
         default=None,
-        description="Weight of errors along the path against those across it, for `fbf`; less "
-        "than 1 takes longer.",
+        description="Weight of errors along the path against those across it, for `fbf`; "
+        "less than the default, 1, takes longer.",
     )
     tolerance_um: float = Field(
         default=DEFAULT_TOLERANCE_UM,

@@ -58,7 +58,7 @@ async def stored(
     filename : str, optional
         Under which a browser saves it.
     span : (int, int), optional
-        First byte, and the one behind the last, of what counts as the file.
+        First byte, and the one after the last, of what counts as the file.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def matches(header: str | None, tag: str) -> bool:
 
 
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
-    """Return the part that is asked for, as first byte and the one behind the last."""
+    """Return the part that is asked for, as first byte and the one after the last."""
     # Only GET knows ranges (RFC 9110, 14.2).
     asked = request.headers.get("range") if request.method == "GET" else None
     condition = request.headers.get("if-range")

@@ -48,7 +48,7 @@ async def read_trajectories(
     ] = 0.0,
     stop_s: Annotated[
         float | None,
-        Query(gt=0, le=1e7, allow_inf_nan=False, description="By default 60 s behind `start_s`."),
+        Query(gt=0, le=1e7, allow_inf_nan=False, description="By default 60 s after `start_s`."),
     ] = None,
 ) -> Response:
     """Return the motion before and after, planned and simulated, with the contour errors.
@@ -61,8 +61,8 @@ async def read_trajectories(
         raise Problem(
             422,
             "Bad parameter",
-            f"From start_s {start_s:g} to stop_s {stop_s:g} is no time of at most {_LONGEST_S:g} "
-            "s; ask for a part after the other.",
+            f"start_s {start_s:g} to stop_s {stop_s:g} must be a period of at most {_LONGEST_S:g} "
+            "s; ask for longer ones in parts.",
         )
     job = await find_done(request, job_id, caller)
     question = Question(

@@ -18,6 +18,7 @@ from pydantic_core import from_json
 
 from stillpath.applications.machines.checks import differences
 from stillpath.applications.machines.documents import Documents
+from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
@@ -156,7 +157,12 @@ class Checker:
         self._documents = documents
 
     def check(
-        self, printer: Printer, machine: Machine, *, method: str = "fbf", accept: bool = False
+        self,
+        printer: Printer,
+        machine: Machine,
+        *,
+        method: str = DEFAULT_METHOD,
+        accept: bool = False,
     ) -> PrinterCheck:
         """Ask a printer and compare it with the machine that files for it are made with.
 
@@ -242,7 +248,7 @@ class Checker:
             ) from None
 
 
-def findings(machine: Machine, asked: Asked, *, method: str = "fbf") -> list[Finding]:
+def findings(machine: Machine, asked: Asked, *, method: str = DEFAULT_METHOD) -> list[Finding]:
     """Return what speaks against printing a machine's file on a printer, unsafe things first."""
     firmware = machine.firmware
     if not isinstance(firmware, Klipper):
@@ -366,7 +372,7 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
         files = "stillpath-m600.cfg" if missing == ["M600"] else f"{files} and stillpath-m600.cfg"
     names = ", ".join(missing)
     text = (
-        f"{names} would move under a compensated stretch's limits: include {files} behind your own "
+        f"{names} would move under a compensated stretch's limits: include {files} after your own "
         "macros in printer.cfg, then send STILLPATH_CHECK"
     )
     yield Finding(place=names, text=text)

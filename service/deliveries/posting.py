@@ -108,7 +108,7 @@ def get(
     Parameters
     ----------
     longest_bytes : int
-        What comes behind that is not read.
+        What comes after that is not read.
     """
     return _exchange(
         "GET",

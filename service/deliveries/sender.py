@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import structlog
 from sqlalchemy import Engine
 
 from stillpath.applications.machines.resolve import PinnedMachine
+from stillpath.compensation.defaults import DEFAULT_METHOD
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
@@ -26,7 +28,7 @@ from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
 from stillpath.service.storage.base import Storage, StorageError
 
-__all__ = ["Sender"]
+__all__ = ["Sender", "SendingTimes"]
 
 _AT_ONCE = 4
 _STOP_S = 5.0
@@ -34,6 +36,31 @@ _GROWTH = 3.0
 _LONGEST_WAIT_S = 6 * 3600.0
 # Asking again would be answered in the same way.
 _IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
+
+
+@dataclass(frozen=True, slots=True)
+class SendingTimes:
+    """When deliveries are tried, and tried again.
+
+    Attributes
+    ----------
+    first_wait_s : float
+        Before the second attempt; each further one waits three times as long.
+    attempts : int
+    claim_s : float
+        A sender that has not been heard of for so long counts as dead.
+    poll_s : float
+        How often the table is looked at.
+    start_within_s : float
+        A print that cannot start so soon after its job was done is not started later, when nobody
+        may be there to watch; its file is uploaded all the same.
+    """
+
+    first_wait_s: float = 5.0
+    attempts: int = 10
+    claim_s: float = 60.0
+    poll_s: float = 1.0
+    start_within_s: float = 3600.0
 
 
 class Sender:
@@ -58,16 +85,7 @@ class Sender:
         From `service.deliveries.printers.load_printers`.
     checker : Checker, optional
         Without one, printers are not looked at.
-    first_wait_s : float
-        Before the second attempt; each further one takes three times as long.
-    attempts : int
-    claim_s : float
-        After how long without a word the sender of a delivery counts as dead.
-    poll_s : float
-        How often the table is looked at.
-    start_within_s : float
-        A print that cannot begin so soon after its job was done is not started later, when nobody
-        may be there to see it begin; its file is uploaded all the same.
+    times : SendingTimes, optional
     """
 
     def __init__(
@@ -78,12 +96,7 @@ class Sender:
         settings: Settings,
         printers: Mapping[str, Printer],
         checker: Checker | None = None,
-        *,
-        first_wait_s: float = 5.0,
-        attempts: int = 10,
-        claim_s: float = 60.0,
-        poll_s: float = 1.0,
-        start_within_s: float = 3600.0,
+        times: SendingTimes = SendingTimes(),
     ) -> None:
         self._engine = engine
         self._store = store
@@ -91,11 +104,7 @@ class Sender:
         self._settings = settings
         self._printers = printers
         self._checker = checker
-        self._first_wait_s = first_wait_s
-        self._attempts = attempts
-        self._claim_s = claim_s
-        self._poll_s = poll_s
-        self._start_within_s = start_within_s
+        self._times = times
         self._log = structlog.get_logger("deliveries")
         self._wake = threading.Event()
         self._stopping = threading.Event()
@@ -144,7 +153,7 @@ class Sender:
                 self._log.exception("deliveries broke")
                 claimed = False
             if not claimed:
-                self._wake.wait(self._poll_s)
+                self._wake.wait(self._times.poll_s)
                 self._wake.clear()
 
     def _keep_claims(self) -> None:
@@ -152,14 +161,14 @@ class Sender:
         for thread, (claimed, until) in list(self._sending.items()):
             if not thread.is_alive():
                 del self._sending[thread]
-            elif until - now < self._claim_s / 2:
-                until = now + self._claim_s
+            elif until - now < self._times.claim_s / 2:
+                until = now + self._times.claim_s
                 rows.prolong(self._engine, claimed, until=until)
                 self._sending[thread] = (claimed, until)
 
     def _claim(self) -> bool:
         now = time.time()
-        until = now + self._claim_s
+        until = now + self._times.claim_s
         found = rows.claim(self._engine, now=now, until=until)
         if found is None:
             return False
@@ -182,15 +191,17 @@ class Sender:
             state, error = "waiting", "the service broke; its log holds the details"
         wait_s = 0.0
         if state == "waiting":
-            wait_s = min(self._first_wait_s * _GROWTH ** (claimed.attempts - 1), _LONGEST_WAIT_S)
-            if claimed.attempts >= self._attempts:
+            wait_s = min(
+                self._times.first_wait_s * _GROWTH ** (claimed.attempts - 1), _LONGEST_WAIT_S
+            )
+            if claimed.attempts >= self._times.attempts:
                 state, error = "failed", f"{error}; given up after {claimed.attempts} attempts"
         log.info("delivery", state=state, reason=error)
         self._settle(claimed, state, time.time() + wait_s, error)
 
     def _settle(self, claimed: Delivery, state: str, next_at: float, error: str | None) -> None:
         """Write it down, for as long as the claim holds if the database is away."""
-        deadline = time.monotonic() + self._claim_s
+        deadline = time.monotonic() + self._times.claim_s
         while True:
             try:
                 rows.settle(self._engine, claimed, state, next_at=next_at, error=error)
@@ -231,7 +242,7 @@ class Sender:
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
         warnings, unsafe = self._looked_at(printer, job)
-        late = time.time() - (job.finished_at or 0.0) > self._start_within_s
+        late = time.time() - (job.finished_at or 0.0) > self._times.start_within_s
         starts = job.print_after and not unsafe and not late
         with self._storage.local(f"{job.output}/result/{job.result_name}") as file:
             reply = upload(printer, file, job.result_name, sha256=job.result_sha256, start=starts)
@@ -245,8 +256,8 @@ class Sender:
             elif job.print_after and late:
                 told = (
                     "uploaded, but not started: it was done more than "
-                    f"{self._start_within_s:.0f} s ago, and nobody may be there; start it at the "
-                    "printer"
+                    f"{self._times.start_within_s:.0f} s ago, and nobody may be there; start it "
+                    "at the printer"
                 )
             error = "; ".join([*([told] if told else ()), *unsafe, *warnings]) or None
         return state, error
@@ -260,7 +271,7 @@ class Sender:
             return [], []
         try:
             machine = self._machine(job)
-            method = str(job.options.get("method", "fbf"))
+            method = str(job.options.get("method", DEFAULT_METHOD))
             found = self._checker.check(printer, machine, method=method).findings
         except (PrinterUnknown, ModelError) as error:
             # Whether its limits and macros are what the file needs is not known then.

@@ -61,13 +61,12 @@ def _identify(task: Task, progress: ProgressCallback) -> None:
 
 def _design(task: Task, progress: ProgressCallback) -> None:
     """Write the report of the design of one axis; options: `axis`, `basis`, `robust`."""
-    from stillpath.applications.design.design import design_report
+    from stillpath.applications.design.design import DesignSettings, design_report
 
     progress_to(progress, "designing", 0.0)(0.0)
     asked = task.options
-    report = design_report(
-        task.pinned().machine, asked["axis"], basis=asked["basis"], robust=asked["robust"]
-    )
+    settings = DesignSettings(basis=asked["basis"], robust=asked["robust"])
+    report = design_report(task.pinned().machine, asked["axis"], settings)
     _write(task, report.model_dump(mode="json"))
 
 
@@ -114,10 +113,7 @@ def _trace(task: Task, progress: ProgressCallback) -> None:
         task.pinned().machine,
         settings,
         format=asked["format"],
-        start_s=asked["start_s"],
-        stop_s=asked["stop_s"],
-        dialect=settings.dialect,
-        plate=settings.plate,
+        window_s=(asked["start_s"], asked["stop_s"]),
         cache_dir=task.cache_dir,
         progress=progress,
     )

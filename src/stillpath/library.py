@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.service.client import Client
@@ -130,7 +131,7 @@ def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> 
 
 
 def design(
-    machine: Machine | str, axis: str, *, basis: str = "ce-opt", robust: str = "off"
+    machine: Machine | str, axis: str, *, basis: str = DEFAULT_BASIS, robust: str = "off"
 ) -> DesignReport:
     """Return what the design for one axis does, and what errors of its plant cost.
 
@@ -149,9 +150,9 @@ def design(
     ------
     stillpath.compensation.base.DesignError, stillpath.models.errors.ModelError
     """
-    from stillpath.applications.design.design import design_report
+    from stillpath.applications.design.design import DesignSettings, design_report
 
-    return design_report(_machine(machine), axis, basis=basis, robust=robust)
+    return design_report(_machine(machine), axis, DesignSettings(basis=basis, robust=robust))
 
 
 def _machine(machine: Machine | str) -> Machine:

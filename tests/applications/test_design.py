@@ -15,7 +15,7 @@ from scipy.linalg import toeplitz
 from starlette.testclient import TestClient
 
 from stillpath.applications.design import design as module
-from stillpath.applications.design.design import design_report
+from stillpath.applications.design.design import DesignSettings, design_report
 from stillpath.applications.design.figures import DesignReport
 from stillpath.applications.design.page import render_design, write_design
 from stillpath.applications.design.summary import Summary
@@ -24,7 +24,15 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import LADDER, PreviewFbf
 from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.models.machine import Machine
-from stillpath.models.plants import FirSpec, PlantSetSpec, discretise, plant_set
+from stillpath.models.plants import (
+    FirSpec,
+    PlantSetSpec,
+    RelativeMode,
+    RelativeModesSpec,
+    WeightedMember,
+    discretise,
+    plant_set,
+)
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.reports.charts import Chart, Line, Mark, draw
@@ -64,7 +72,8 @@ def report_of(machine: Machine, **settings: Any) -> DesignReport:
         "motion": MOTION,
         "tuned": TUNED,
     }
-    return design_report(machine, settings.pop("axis", "x"), **{**given, **settings})
+    given |= {name: settings.pop(name) for name in given if name in settings}
+    return design_report(machine, settings.pop("axis", "x"), DesignSettings(**settings), **given)
 
 
 @pytest.fixture(scope="module")
@@ -373,14 +382,14 @@ def test_command(
 ) -> None:
     asked = []
 
-    def pretended(machine: Machine, axis: str, **settings: str) -> DesignReport:
+    def pretended(machine: Machine, axis: str, settings: DesignSettings) -> DesignReport:
         asked.append((machine.name, axis, settings))
         return off
 
     monkeypatch.setattr(module, "design_report", pretended)
     command = ["design", "-m", "ender3", "--axis", "x", "--robust", "off"]
     assert run([*command, "--report", str(tmp_path / "d")]) == 0
-    assert asked == [("ender3", "x", {"basis": "ce-opt", "robust": "off"})]
+    assert asked == [("ender3", "x", DesignSettings(basis="ce-opt", robust="off"))]
     assert (tmp_path / "d" / "design.html").exists()
     shown = capsys.readouterr().out
     for words in ("rho(F)", "fbf minimax", "singular values", "remark 4.5", "n 90"):
@@ -462,4 +471,17 @@ def test_whole_report(name: str, axis: str) -> None:
 @pytest.mark.parametrize(("name", "mode"), [("ender3", "ensemble"), ("generic-corexy", "off")])
 def test_automatic_is_what_jobs_take(name: str, mode: str) -> None:
     machine = load_machine(name)
-    assert design_report(machine, "x", robust="auto", errors_percent=(0.0,)).robust == mode
+    assert report_of(machine, robust="auto").robust == mode
+
+
+def test_automatic_leaves_a_set_that_cannot_be_designed_for() -> None:
+    slow = [
+        RelativeModesSpec(modes=(RelativeMode(f_hz=f, zeta=0.001, share=1.0),)) for f in (3.0, 3.2)
+    ]
+    usual = RelativeModesSpec(modes=(RelativeMode(f_hz=45.0, zeta=0.06, share=1.0),))
+    axis = PlantSetSpec(nominal=usual, members=tuple(WeightedMember(plant=p) for p in slow))
+    machine = load_machine("generic-corexy").model_copy(update={"axes": {"x": axis, "y": axis}})
+    report = report_of(machine, robust="auto")
+    assert report.robust == "off"
+    assert report.chosen is not None
+    assert any(reason.startswith("fbf ensemble: ") for reason in report.robustness.missing)

@@ -13,8 +13,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
@@ -34,7 +35,7 @@ from stillpath.models.store import builtin_machines, load_machine
 from stillpath.service.database.documents import DocumentTable
 from stillpath.service.database.engine import open_database
 from stillpath.service.settings import Settings
-from tests.service.machines import make_machine, make_plants, with_accel
+from tests.service.machines import make_confirmation, make_machine, with_accel
 
 ROOT = Path(__file__).resolve().parents[2]
 MARCH = datetime(2026, 3, 2, 12, 0, tzinfo=UTC)
@@ -110,16 +111,15 @@ def test_a_change_on_an_old_state_is_refused(any_store: MachineStore):
     assert len(any_store.history("mine")) == 2
 
 
-def test_update_axis_leaves_everything_else(any_store: MachineStore):
+def test_a_confirmation_leaves_everything_else(any_store: MachineStore):
     any_store.add_revision("mine", with_accel(make_machine(), 7777.0), author="anna")
-    plants = make_plants(49.8, on=date(2026, 3, 2))
     before = any_store.current("mine").machine
-    after = any_store.update_axis("mine", {"x": plants}, author="bob", message="measured").machine
-    assert after.axes["x"] == plants
-    assert after.axes["y"] == before.axes["y"]
-    assert {change.place.split(".")[1] for change in diff(before, after)} == {"x"}
+    said = make_confirmation(5.0)
+    after = any_store.confirm("mine", {"x": said}, author="bob", message="ring test").machine
+    assert after.confirmations == {"x": said}
+    assert {change.place.split(".")[0] for change in diff(before, after)} == {"confirmations"}
     with pytest.raises(UnknownMachine, match="other"):
-        any_store.update_axis("other", {"x": plants}, author="bob")
+        any_store.confirm("other", {"x": said}, author="bob")
     assert any_store.names() == ["mine"]
 
 
@@ -269,10 +269,10 @@ def write_many(root: Path, writer: int, count: int) -> None:
         store.add_revision("mine", machine, author=f"writer-{writer}")
 
 
-def measure_many(root: Path, axis: str, count: int) -> None:
+def confirm_many(root: Path, axis: Literal["x", "y"], count: int) -> None:
     store = MachineStore(root)
     for k in range(count):
-        store.update_axis("mine", {axis: make_plants(50.0 + 0.01 * k)}, author=axis)  # type: ignore[dict-item]
+        store.confirm("mine", {axis: make_confirmation(1.0 + k)}, author=axis)
 
 
 def run_together(*tasks: tuple) -> None:
@@ -300,13 +300,12 @@ def test_two_writers_lose_nothing(store: MachineStore, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_two_measurements_at_once_do_not_undo_each_other(store: MachineStore, tmp_path: Path):
+def test_two_ring_tests_at_once_do_not_undo_each_other(store: MachineStore, tmp_path: Path):
     store.add_revision("mine", make_machine(), author="anna")
-    run_together(*[(measure_many, tmp_path / "machines", axis, 15) for axis in ("x", "y")])
+    run_together(*[(confirm_many, tmp_path / "machines", axis, 15) for axis in ("x", "y")])
     last = store.current("mine")
     assert last.number == 31
-    for axis in ("x", "y"):
-        assert last.machine.axes[axis] == make_plants(50.14)  # type: ignore[index]
+    assert last.machine.confirmations == dict.fromkeys("xy", make_confirmation(15.0))
 
 
 def delete_and_restore(root: Path, count: int) -> None:

@@ -20,9 +20,9 @@ from stillpath.gcode.types import Moves
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import AxisTravel, Machine
-from stillpath.models.plants import Mode, ModesSpec
+from stillpath.models.plants import Mode, ModesSpec, discretise
 from stillpath.models.store import builtin_machines, load_machine
-from stillpath.simulation.evaluation import continuous_response
+from stillpath.simulation.response import response
 
 SETTINGS = PrintSettings()
 
@@ -111,7 +111,7 @@ def test_ringing_of_a_mode_against_simulation():
     # Before it the axis has moved for long.
     run_up = np.linspace(-speed, 0, 10001)[:-1]
     whole = np.concatenate([run_up, u])[None]
-    y = continuous_response([spec], whole, dt_s=1e-4, factor=1)[0]
+    y = response([discretise(spec, 1e-4)], whole)[0]
     after = y[len(run_up) + round(brake * 1e4) :] - u[-1]
     mode = ringing_mode(spec)
     assert mode.f_hz == pytest.approx(40)

@@ -24,8 +24,8 @@ TEXT = b"G28\nG1 X10 Y10 F6000\n"
 
 
 @pytest.fixture
-def road(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
-    """Put a pipeline in place that does what `road.behave` says."""
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
+    """Put a pipeline in place that does what `pipeline.behave` says."""
     seen = types.SimpleNamespace(behave=lambda: None, options=None, machine=None, rate_hz=None)
 
     def compensate_file(source, target, machine, options, *, cache_dir=None, progress=None, **_):
@@ -74,19 +74,23 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
     return error
 
 
-def test_compensate_writes_file_report_and_table(road, source, tmp_path, capsys):
+def test_compensate_writes_file_report_and_table(pipeline, source, tmp_path, capsys):
     out, report = tmp_path / "out.gcode", tmp_path / "report"
     code = compensate(source, "-o", str(out), "-m", "ender3", "--report", str(report))
     assert code == 0
     assert out.read_bytes() == b"; compensated\n" + TEXT
     assert sorted(path.name for path in report.iterdir()) == ["report.html", "report.json"]
-    assert (road.machine, road.options.method, road.options.tolerance_um) == ("ender3", "fbf", 2.0)
+    assert (pipeline.machine, pipeline.options.method, pipeline.options.tolerance_um) == (
+        "ender3",
+        "fbf",
+        2.0,
+    )
     shown = capsys.readouterr().out
     assert "contour rms, extruding" in shown
     assert "reverted" in shown
 
 
-def test_options_reach_the_road(road, source, tmp_path):
+def test_options_reach_the_pipeline(pipeline, source, tmp_path):
     chosen = [
         "--method",
         "shaper:2hump_ei",
@@ -104,8 +108,8 @@ def test_options_reach_the_road(road, source, tmp_path):
         "marlin",
     ]
     assert compensate(source, "-o", str(tmp_path / "o"), "-m", "voron-v0", *chosen) == 0
-    assert road.machine == "voron-v0"
-    assert road.options.model_dump() == {
+    assert pipeline.machine == "voron-v0"
+    assert pipeline.options.model_dump() == {
         "method": "shaper:2hump_ei",
         "basis": "bspline",
         "robust": "minimax",
@@ -117,12 +121,12 @@ def test_options_reach_the_road(road, source, tmp_path):
     }
 
 
-def test_in_place(road, source):
+def test_in_place(pipeline, source):
     assert compensate(source, "--in-place", "-m", "ender3") == 0
     assert source.read_bytes() == b"; compensated\n" + TEXT
 
 
-def test_a_link_is_followed(road, source, tmp_path):
+def test_a_link_is_followed(pipeline, source, tmp_path):
     link = tmp_path / "link.gcode"
     link.symlink_to(source)
     assert compensate(link, "--in-place", "-m", "ender3") == 0
@@ -159,7 +163,7 @@ def test_a_link_is_followed(road, source, tmp_path):
         ("-o {out} -m ender3 --colour blue", ["colour"]),
     ],
 )
-def test_bad_requests(road, source, tmp_path, capsys, arguments, words):
+def test_bad_requests(pipeline, source, tmp_path, capsys, arguments, words):
     out = tmp_path / "out.gcode"
     filled = arguments.format(out=out, folder=tmp_path, source=source)
     assert compensate(source, *filled.split()) == 2
@@ -171,7 +175,7 @@ def test_bad_requests(road, source, tmp_path, capsys, arguments, words):
 
 
 @pytest.mark.parametrize("name", ["missing.gcode", "."])
-def test_bad_inputs(road, tmp_path, capsys, name):
+def test_bad_inputs(pipeline, tmp_path, capsys, name):
     assert compensate(tmp_path / name, "-o", str(tmp_path / "o"), "-m", "ender3") == 2
     one_line(capsys)
 
@@ -186,11 +190,11 @@ def test_bad_inputs(road, tmp_path, capsys, name):
         (KeyboardInterrupt(), 130, ["interrupted"]),
     ],
 )
-def test_errors_of_the_road(road, source, tmp_path, capsys, error, code, words):
+def test_errors_of_the_pipeline(pipeline, source, tmp_path, capsys, error, code, words):
     def fail() -> None:
         raise error
 
-    road.behave = fail
+    pipeline.behave = fail
     out = tmp_path / "out.gcode"
     assert compensate(source, "-o", str(out), "-m", "ender3") == code
     message = capsys.readouterr().err
@@ -200,20 +204,20 @@ def test_errors_of_the_road(road, source, tmp_path, capsys, error, code, words):
     assert not out.exists()
 
 
-def test_a_bug_is_not_dressed_up_as_a_bad_file(road, source, tmp_path):
+def test_a_bug_is_not_dressed_up_as_a_bad_file(pipeline, source, tmp_path):
     def fail() -> None:
         raise ValueError("ours")
 
-    road.behave = fail
+    pipeline.behave = fail
     with pytest.raises(ValueError, match="ours"):
         compensate(source, "-o", str(tmp_path / "o"), "-m", "ender3")
 
 
-def test_plan_and_simulate(road, source, tmp_path, capsys):
+def test_plan_and_simulate(pipeline, source, tmp_path, capsys):
     motion, report = tmp_path / "motion.npz", tmp_path / "report"
     plan = ["plan", str(source), "-m", "ender3"]
     assert run([*plan, "-o", str(motion), "--rate", "500", "--dialect", "klipper"]) == 0
-    assert (road.rate_hz, road.dialect) == (500.0, "klipper")
+    assert (pipeline.rate_hz, pipeline.dialect) == (500.0, "klipper")
     out, err = capsys.readouterr()
     assert "print time 12.0 s; Slicer says 11 s" in out
     assert "warning: the file is for Marlin" in err
@@ -270,7 +274,7 @@ def test_a_job_loads_only_what_it_needs():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
-def test_pipes_and_devices_are_neither_read_nor_replaced(road, source, tmp_path, capsys):
+def test_pipes_and_devices_are_neither_read_nor_replaced(pipeline, source, tmp_path, capsys):
     pipe, out = tmp_path / "pipe", tmp_path / "out.gcode"
     os.mkfifo(pipe)
     for command in (
@@ -293,14 +297,14 @@ def test_the_longest_name_that_a_file_can_have(tmp_path):
     assert target.read_bytes() == TEXT
 
 
-def test_a_full_disk_is_told_with_its_place(road, source, tmp_path, capsys):
+def test_a_full_disk_is_told_with_its_place(pipeline, source, tmp_path, capsys):
     target = tmp_path / "out.gcode"
 
     def full():
         with replacing(target):
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    road.behave = full
+    pipeline.behave = full
     assert compensate(source, "-o", str(target), "-m", "ender3") == 1
     assert f"{target}: No space left on device; make room there" in one_line(capsys)
     assert [path.name for path in tmp_path.iterdir()] == ["part.gcode"]

@@ -43,7 +43,7 @@ def test_compiling_is_a_stage_and_its_time_says_nothing_of_the_time_left(monkeyp
     assert told[-1] == later
 
 
-def test_who_stops_in_the_middle_of_a_compiler_is_heard_behind_it():
+def test_who_stops_in_the_middle_of_a_compiler_is_heard_after_it():
     def stop(progress: Progress) -> None:
         if progress.stage == STAGE:
             raise Cancelled

@@ -15,10 +15,10 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.main import run
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.store import builtin_machines
-from tests.cli.test_cli import compensate, one_line, road, source
+from tests.cli.test_cli import compensate, one_line, pipeline, source
 from tests.service.machines import make_machine, make_plants
 
-__all__ = ["road", "source"]  # fixtures
+__all__ = ["pipeline", "source"]  # fixtures
 
 CONFIG = """\
 [include mainsail.cfg]  # not for us
@@ -325,7 +325,8 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     fresh = make_plants(on=date.today())
     config.write_text(CONFIG.replace("[include mainsail.cfg]", ""))
     machines("from-config", config, "--name", "mine")
-    store.update_axis("mine", {"x": fresh, "y": fresh}, author="anna")
+    measured = store.current("mine").machine.model_copy(update={"axes": {"x": fresh, "y": fresh}})
+    store.add_revision("mine", measured, author="anna")
     capsys.readouterr()
     assert machines("check", "mine", "--printer-cfg", config) == 0
     assert capsys.readouterr().out == "mine: nothing speaks against it\n"
@@ -360,13 +361,13 @@ def test_the_age_of_a_measurement():
 
 
 def test_a_job_uses_the_users_machine_and_hears_of_its_age(
-    store: MachineStore, road, source, tmp_path, capsys, monkeypatch
+    store: MachineStore, pipeline, source, tmp_path, capsys, monkeypatch
 ):
     old = make_plants(on=date(2020, 1, 31))
     store.add_revision("mine", make_machine(axes={"x": old, "y": old}), author="anna")
     out, report = tmp_path / "out.gcode", tmp_path / "report"
     assert compensate(source, "-o", str(out), "-m", "mine", "--report", str(report)) == 0
-    assert road.machine == "mine"
+    assert pipeline.machine == "mine"
     assert "warning: axis x of mine: measured on 2020-01-31" in capsys.readouterr().out
     written = json.loads((report / "report.json").read_text())["warnings"]
     assert any("measured on 2020-01-31" in warning for warning in written)
@@ -376,7 +377,7 @@ def test_a_job_uses_the_users_machine_and_hears_of_its_age(
 
 
 def test_a_job_needs_an_approved_machine_where_that_is_switched_on(
-    store: MachineStore, road, source, tmp_path, capsys, monkeypatch
+    store: MachineStore, pipeline, source, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setenv("STILLPATH_REQUIRE_APPROVAL", "true")
     store.add_revision("mine", make_machine(), author="anna")

@@ -1,4 +1,4 @@
-"""The methods stand in several places that must not import one another; here they are compared."""
+"""Methods and defaults stand in places that must not import one another; here they are compared."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from stillpath.cli.arguments import METHODS
+from stillpath.cli.arguments import METHODS, CompensationOptions
 from stillpath.cli.post import Refused, compensate_in_place
+from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
+from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.registry import COMPENSATORS
+from stillpath.models.store import load_machine
 from stillpath.pipeline.options import MethodName, Options
 from stillpath.service.api.schemas import JobQuery
 
@@ -83,3 +86,31 @@ def test_cura_offers_them_all():
 def test_octoprint_offers_all_that_change_a_file():
     offered = literal("integrations/octoprint/octoprint_stillpath/choices.py", "METHODS")
     assert {name for name, _ in offered} == ALL - {"none"}
+
+
+def test_every_place_has_the_same_defaults():
+    usual = Options()
+    assert (usual.method, usual.basis) == (DEFAULT_METHOD, DEFAULT_BASIS)
+    asked = JobQuery(machine="ender3")
+    on_the_command_line = CompensationOptions()
+    for name in ("method", "basis", "robust", "where"):
+        assert getattr(asked, name) == getattr(on_the_command_line, name) == getattr(usual, name)
+    assert on_the_command_line.chosen() == usual
+    octoprint = literal("integrations/octoprint/octoprint_stillpath/choices.py", "DEFAULTS")
+    cura = literal("integrations/cura/Stillpath.py", "_SETTINGS")
+    for name in ("method", "robust", "tolerance_um"):
+        assert octoprint[name] == cura[name]["default_value"] == getattr(usual, name)
+
+
+def test_the_page_offers_the_defaults_first():
+    script = (ROOT / "service/web/views/new-job.js").read_text()
+    usual = Options()
+    for name in ("basis", "robust", "where", "times"):
+        first = re.search(rf'const {name} = select\("{name}", \[\["", \[\["([^"]+)", ', script)
+        assert first is not None
+        assert first[1] == getattr(usual, name)
+    assert script.split("const METHODS = [", 1)[1].split('["', 3)[2].startswith(f'{usual.method}"')
+    along = re.search(r'id: "along",.*placeholder: "([^"]+)"', script)
+    assert along is not None
+    compensator = PreviewFbf(load_machine("generic-corexy"), 1e-3, along=usual.along)
+    assert float(along[1]) == compensator.along

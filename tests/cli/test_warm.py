@@ -23,4 +23,4 @@ def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_file_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["warm", "nowhere.gcode", "-m", "ender3"]) == 2
-    assert "there is no file nowhere.gcode" in capsys.readouterr().err
+    assert "nowhere.gcode does not exist" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Bases: what each is defined by, nesting, and the identity behind the robust one."""
+"""Bases: what each is defined by, nesting, and the identity after the robust one."""
 
 from __future__ import annotations
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from stillpath.compensation.base import DesignError
-from stillpath.compensation.holds import stand_still
 from stillpath.compensation.inversion import invert
 from stillpath.compensation.inverting import InversionCompensator, zero_phase_fir
 from stillpath.compensation.registry import compensator
+from stillpath.compensation.rests import stand_still
 from stillpath.models.machine import Machine
 from stillpath.models.plants import ZpkSpec, plant_set
 from stillpath.models.store import load_machine

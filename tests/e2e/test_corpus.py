@@ -24,7 +24,7 @@ REFUSED = {
     ("hm_arcs_planes_marlin", "klipper"): "Klipper's arcs do not take R; slice with I and J",
     ("hm_cnc_inches_g20_numbered", "klipper"): "Klipper has no G20",
     ("hm_laser_grbl", "klipper"): "Klipper's arcs do not take R",
-    # It has no G5, and behind it the tool is somewhere else.
+    # It has no G5, and after it the tool is somewhere else.
     ("hm_arcs_planes_marlin", "reprapfirmware"): _CIRCLE,
     # Words without their G are nothing to it outside of its CNC mode.
     ("hm_cnc_inches_g20_numbered", "reprapfirmware"): _CIRCLE,

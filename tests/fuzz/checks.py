@@ -23,7 +23,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.verbatim import plan_verbatim
 from tests.gcode.states import differences, has_code
 
-__all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_road", "walk"]
+__all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_pipeline", "walk"]
 
 _LONGEST_S = 300.0
 """Lines whose moves last longer are taken out before the pipeline: every second of print costs."""
@@ -64,7 +64,7 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
     written, put_back, print_s = None, 0, 0.0
     for _ in range(8):
         try:
-            written, put_back, print_s = through_the_road(text, machine, folder, method, cache)
+            written, put_back, print_s = through_the_pipeline(text, machine, folder, method, cache)
             break
         except GcodeError as error:
             refusals.append(error)
@@ -160,7 +160,7 @@ def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeErr
     return bytes(good), refusals
 
 
-def through_the_road(
+def through_the_pipeline(
     text: bytes, machine: Machine, folder: Path, method: str, cache: Path
 ) -> tuple[bytes, int, float]:
     """Compensate a file; check lines, states and that nothing else is left behind.

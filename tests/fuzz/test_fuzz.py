@@ -13,7 +13,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import facts_in
-from tests.fuzz.checks import read_through, through_the_road, walk
+from tests.fuzz.checks import read_through, through_the_pipeline, walk
 from tests.fuzz.grammar import written
 from tests.fuzz.hostile import HOSTILE, pieces
 from tests.fuzz.machines import KINDS, machine_of
@@ -168,7 +168,7 @@ AFTER_DUST = (
 @pytest.mark.slow
 def test_what_was_found_on_reprapfirmware(tmp_path: Path, cache: Path) -> None:
     data = tagged(AFTER_DUST.encode())
-    through_the_road(data, machine_of("reprapfirmware"), tmp_path, "shaper:mzv", cache)
+    through_the_pipeline(data, machine_of("reprapfirmware"), tmp_path, "shaper:mzv", cache)
 
 
 @pytest.mark.slow
@@ -178,14 +178,16 @@ def test_what_was_found_on_reprapfirmware(tmp_path: Path, cache: Path) -> None:
 )
 def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
-    through_the_road(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)
+    through_the_pipeline(data, machine_of("marlin"), tmp_path, "shaper:mzv", cache)
 
 
 @pytest.mark.slow  # tunes the shaper of its machine
 @pytest.mark.parametrize("name", FOUND)
 @pytest.mark.parametrize("method", ["shaper:mzv", "fbf"])
 def test_what_was_found_once(name: str, method: str, tmp_path: Path, cache: Path) -> None:
-    through_the_road(tagged(FOUND[name].encode()), machine_of("klipper"), tmp_path, method, cache)
+    through_the_pipeline(
+        tagged(FOUND[name].encode()), machine_of("klipper"), tmp_path, method, cache
+    )
 
 
 @pytest.mark.shared
@@ -193,7 +195,7 @@ def test_what_was_found_once(name: str, method: str, tmp_path: Path, cache: Path
 def test_the_file_that_took_its_job_down(tmp_path: Path, cache: Path, shared_dir: Path) -> None:
     """A piece of moves that round to nothing: ValueError in the encoder, once."""
     data = tagged((shared_dir / "corpus" / "fuzz" / "crash_klipper_1.gcode").read_bytes())
-    _, put_back, _ = through_the_road(data, machine_of("klipper"), tmp_path, "fbf", cache)
+    _, put_back, _ = through_the_pipeline(data, machine_of("klipper"), tmp_path, "fbf", cache)
     # That one; in another a corner is at the edge of what may be printed (22 um).
     assert put_back <= 2
 
@@ -201,7 +203,7 @@ def test_the_file_that_took_its_job_down(tmp_path: Path, cache: Path, shared_dir
 @pytest.mark.shared
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_damaged_files_down_the_road(
+def test_damaged_files_through_the_pipeline(
     kind: str, tmp_path: Path, cache: Path, shared_dir: Path
 ) -> None:
     machine = machine_of(kind)

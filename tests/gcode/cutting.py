@@ -18,7 +18,7 @@ __all__ = ["HEAD", "compensated", "cut", "ender3_with", "pieces_of"]
 _SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 
 HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 F6000\nG4 P10\n"
-"""Behind this the machine stands still at 60, 50, 5."""
+"""After this the machine stands still at 60, 50, 5."""
 
 
 def cut(
@@ -55,7 +55,7 @@ def ender3_with(kind: str, mesh_slope: float = 0.0) -> Machine:
 
 
 def compensated(text: str, machine: Machine) -> tuple[Piece, CompensatedPiece]:
-    """The piece behind the head, as sliced and compensated."""
+    """The piece after the head, as sliced and compensated."""
     work = PieceCompensator(machine, Options())
     piece = pieces_of(text, machine)[1]
     work.compensator.reset(piece.moves.start_mm[0, :2])

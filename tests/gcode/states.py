@@ -174,7 +174,7 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
         return []
     if new.kind != old.kind:
         return [f"kind {new.kind}, not {old.kind}"]
-    # Behind a move that is swallowed, a line comes before the move that makes up for it.
+    # After a move that is swallowed, a line comes before the move that makes up for it.
     if new.known != old.known and not (swallows and new.kind >= 0):
         problems.append(f"known {new.known}, not {old.known}")
     knows = np.array([bool(old.known >> k & 1) for k in range(3)])

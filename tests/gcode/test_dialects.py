@@ -71,15 +71,15 @@ CASES = {
         "M83\nG1 X1E2 F600\n",
         {**same(("klipper", *FAMILY), 1, 0, 0, 2), "reprapfirmware": (100, 0, 0, 0)},
     ),
-    "G90 behind M83": (
+    "G90 after M83": (
         "M83\nG90\nG1 X1 E1 F600\nG1 X2 E1\n",
         {**same(("klipper", "reprapfirmware"), 2, 0, 0, 2), **same(FAMILY, 2, 0, 0, 1)},
     ),
-    "G91 behind M82": (
+    "G91 after M82": (
         "M82\nG91\nG1 X1 E1 F600\nG1 X1 E1\n",
         {**same(("klipper", *FAMILY), 2, 0, 0, 2), "reprapfirmware": (2, 0, 0, 1)},
     ),
-    "M82 behind G91": (
+    "M82 after G91": (
         "G91\nM82\nG1 X1 E1 F600\nG1 X1 E1\n",
         {"klipper": (2, 0, 0, 2), **same((*FAMILY, "reprapfirmware"), 2, 0, 0, 1)},
     ),
@@ -188,7 +188,7 @@ CASES = {
         'M117 "G1 X9"\nM118 P0 S"G1 X9"\nG1 X1 F600\n',
         {"reprapfirmware": (1, 0, 0, 0)},
     ),
-    "a command behind quoted text": (
+    "a command after quoted text": (
         'M117 "G1 X9" G1 X1 F600\nM117 G1 X9 "G1 X9"\n',
         {"reprapfirmware": (1, 0, 0, 0)},
     ),

@@ -246,7 +246,7 @@ def test_written_numbers_read_back(machine: Machine, seed: int, n: int) -> None:
 
 @pytest.mark.parametrize("top", [999, 10**6 + 1, 10**9, 10**14])
 def test_numbers_are_written_as_python_does(top: int) -> None:
-    """All digits but zeros behind the last one that counts."""
+    """All digits but zeros after the last one that counts."""
     rng = np.random.default_rng(top)
     millionths = rng.integers(-top, top, 200) * rng.choice([1, 10, 1000], 200)
     n = len(millionths)

@@ -58,7 +58,7 @@ CASES = {
         "M200 D1.75\nG92 E30\nG1 E-1\nM200 D0\nG1 X60 E2\nM82\nG1 E10\nM400\nG1 X90 E11"
     ),
     "leading zeros": "G092 E5\nG1 X60 E2.2\nM082\nG1 E6\nG1 Y60 E8\nM400\nG1 X90 E9",
-    "a new origin behind G10": (
+    "a new origin after G10": (
         "M82\nG92 E0\nG1 E-5\nG1 X90.3 Y90.015 E-4.9\nG1 E-5.9\nG10\nG92 E0\n"
         "G1 X90.598 Y90.045 E.015"
     ),

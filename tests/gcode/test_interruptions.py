@@ -1,4 +1,4 @@
-"""A stream that breaks off at any line: the firmware brakes, stands, and goes on behind it."""
+"""A stream that breaks off at any line: the firmware brakes, stands, and goes on after it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BODY = (
 )
 _SAMPLE_S = 5e-5
 _AROUND = 60
-"""Moves that are looked at before and behind a break."""
+"""Moves that are looked at before and after a break."""
 
 
 def written(piece: Piece, made: CompensatedPiece, factor: float) -> tuple[Moves, list[Limits]]:

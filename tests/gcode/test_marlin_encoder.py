@@ -222,7 +222,7 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, None])
-def test_linear_advance_is_off_in_the_stream_and_on_again_behind_it(
+def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
     tmp_path: Path, stated: bool | None
 ) -> None:
     """Whether the machine says that it has it or only the file does."""

@@ -345,7 +345,7 @@ def test_segments_are_stretched_while_the_queue_fills() -> None:
 
 def test_the_queue_sees_thirteen_blocks() -> None:
     # .1 mm each: from the start of a block the firmware must be able to brake within it and
-    # the twelve behind it: v2 = 2 * 500 * 1.3 = 1300, 36.06 mm/s, whatever F says.
+    # the twelve after it: v2 = 2 * 500 * 1.3 = 1300, 36.06 mm/s, whatever F says.
     points = 0.1 * np.arange(400.0)[:, None]
     facts = {"variant": "prusa", "slowdown": False, "junction": "classic_jerk"}
     phases = plan(machine(**facts), points, 100.0)

@@ -69,7 +69,7 @@ def choose(
 
 
 def timeline_of(mm: NDArray[Any], at_s: NDArray[np.float64]) -> Timeline:
-    """One whose path is the command, beginning behind another stretch."""
+    """One whose path is the command, beginning after another stretch."""
     t_s = DT_S * np.arange(round(at_s[-1] / DT_S) + 2)
     path = np.stack([np.interp(t_s, at_s, row) for row in mm.T])
     return cast(
@@ -196,7 +196,7 @@ def cost_of_all(
     samples = np.arange(1, len(command))
     error = np.column_stack([np.interp(samples, times, places[:, a]) for a in (0, 1)])
     error -= command[1:]
-    # The answer rings on behind the end.
+    # The answer rings on after the end.
     silence = np.zeros((1000, 2))
     lag = np.arange(len(error) + len(silence))
     answer = np.empty((len(lag), 2))

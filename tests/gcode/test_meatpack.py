@@ -65,7 +65,7 @@ def test_lines_packed_by_hand(text: bytes, packed: bytes):
         (ON + b"\x1d\xeb\xc1", b"G1 X1\n"),
         (ON + NO_SPACES + b"\x1d\x1e\xcc" + SPACES + b"\x1d\xeb\xc2", b"G1 X1\nG1 X2\n"),
         (ON + b"\x1d\x1e\xcc" + RESET + b"M3\n", b"G1 X1\nM3\n"),
-        # Behind a line end the second half is void.
+        # After a line end the second half is void.
         (ON + NO_SPACES + b"\x1d\x1e\x9c\x1d\xc2", b"G1 X1\nG12\n"),
         # Line ends are padding; spaces come back in lines of G only.
         (OFF + b"\n\nG1X1Y2\n\n\nM3X1\n;G1X2\n", b"G1 X1 Y2\nM3X1\n;G1X2\n"),

@@ -30,7 +30,7 @@ def crooked(slope: float, kind: str = "klipper") -> Machine:
 
 
 def on_a_plane(machine: Machine, piece: Piece, made: CompensatedPiece, slope: float) -> Phases:
-    """Plan the written moves with Z = slope x added, as firmwares do behind the G-code."""
+    """Plan the written moves with Z = slope x added, as firmwares do after the G-code."""
     encoded = made.encoded
     position = encoded.position / UNITS_PER_MM
     points = np.vstack([encoded.begin / UNITS_PER_MM, position])

@@ -86,7 +86,7 @@ def test_method_none(machine: Machine) -> None:
 
 
 def test_object_marks(machine: Machine) -> None:
-    """A mark ends a piece, and the travel behind it is not ours."""
+    """A mark ends a piece, and the travel after it is not ours."""
     text = HEAD + (
         "G1 X80 E1\nEXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=b\nG1 E-1\n"
         "G1 X20 Y20 F9000\nG1 E1\nG1 X40 Y20 E1\nG1 X40 Y40 E1\n"
@@ -111,7 +111,7 @@ def test_barriers(machine: Machine, barrier: str) -> None:
     known = barrier in ("G28", "G4 P5", "M400")  # this machine says where it homes
     last = items[-1]
     assert isinstance(last, Piece)
-    # Behind an unknown position X and Y must both be named before a move is ours.
+    # After an unknown position X and Y must both be named before a move is ours.
     first_line = last.text.split(b"\n", 1)[0]
     assert first_line == (b"G1 X20" if known else b"G1 X30")
 
@@ -315,7 +315,7 @@ def test_a_wild_extruder_leaves_as_it_came(machine: Machine, fed: float, ours: b
 
 @pytest.mark.parametrize("chunk", [1, 1 << 17])
 def test_a_line_that_finds_the_height_stays(machine: Machine, chunk: int) -> None:
-    """Z is guessed at 0: behind a start macro that left it elsewhere this line moves it."""
+    """Z is guessed at 0: after a start macro that left it elsewhere this line moves it."""
     text = b"G1 X104 Y100 F3000\nG1 Y189 E3\nG1 X107 Z0 E1\nG1 X90 E1\nG1 Y100 E1\n"
     pieces = [x.text for x in cut(text, machine, chunk=chunk) if isinstance(x, Piece)]
     assert b"".join(pieces).count(b"E") == 3

@@ -182,7 +182,7 @@ def test_rests_run_under_the_files_own_limits() -> None:
     rows = np.flatnonzero(made.encoded.row >= 0)
     phases = made.encoded.phases
     lasts = (phases.accel_s + phases.cruise_s + phases.decel_s)[rows]
-    # Behind a rest the motion goes on with at most the stream's jerk of the extruder, 10 mm/s, so
+    # After a rest the motion goes on with at most the stream's jerk of the extruder, 10 mm/s, so
     # that up to 10 / 5000 s of its braking fall away.
     longest = 0.8 / 35.0 + 35.0 / 5000.0
     assert longest - 10.0 / 5000.0 <= lasts[0] <= longest + 1e-5
@@ -245,7 +245,7 @@ def test_words_around_the_firmwares_own_shaper() -> None:
 
 
 def test_limits_wait_until_the_move_before_them_is_planned() -> None:
-    """Behind a G1 without words, which is no move and stops none."""
+    """After a G1 without words, which is no move and stops none."""
     stream_commands, machine = RepRapStreamCommands(firmware(), 0.0), machine_of(firmware())
     raised = stream_commands.limits(stream_limits(firmware(), CommandLimits()))
     assert raised.startswith(b"G1\nM201 X")

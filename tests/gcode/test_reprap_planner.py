@@ -184,7 +184,7 @@ def test_low_peaks_of_speed_are_cut_off(speeds: list[float], executed: float) ->
 
 def test_the_ring_limits_the_speed_of_short_moves() -> None:
     # At most half the ring of 40 is frozen. When the next move is frozen, 19 frozen ones are not
-    # over, so the ring holds 40 - 19 - 1 = 20 moves behind it, and must be able to stop within
+    # over, so the ring holds 40 - 19 - 1 = 20 moves after it, and must be able to stop within
     # their 2 mm: v = sqrt(2 1000 2) = 63.2 mm/s, far below the 200 mm/s that are asked for.
     phases = plan(path([(0.1 * k, 0) for k in range(400)], 200.0))
     middle = phases.end_mm_s[150:200]

@@ -219,7 +219,7 @@ def test_nothing_is_left_of_a_killed_writer(tmp_path: Path, content: bytes):
 
         source = Path(sys.argv[1])
         with replacing(source) as target, open_text(source, folder=source.parent) as container:
-            with rewriting(container, target, name=source, told=die) as made:
+            with rewriting(container, target, name=source, progress=die) as made:
                 made.write(b"; stamp" + container.text.read())
     """
     code = textwrap.dedent(program)

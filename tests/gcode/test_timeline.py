@@ -84,7 +84,7 @@ def test_x_and_y_stand_in_rests(piece: Piece, rest_s: float) -> None:
     assert np.all(line.rests[1:, 0] >= line.rests[:-1, 1])
     for a, b in line.rests:
         before = line.position_mm[:2, a - 1]
-        # The sample just behind a rest's end may be half a sample under way.
+        # The sample just after a rest's end may be half a sample under way.
         assert np.max(np.abs(line.position_mm[:2, a : b - 1].T - before), initial=0.0) == 0.0
         assert np.max(np.abs(line.position_mm[:2, b - 1] - before)) < 1e-2
 
@@ -114,7 +114,7 @@ def test_moving_and_rows(piece: Piece) -> None:
     assert np.mean(line.moving & still) < 0.02
 
 
-def test_standing_behind_the_end(piece: Piece) -> None:
+def test_standing_after_the_end(piece: Piece) -> None:
     short, long = timeline(piece), timeline(piece, end_s=0.15)
     n = short.position_mm.shape[1]
     assert long.position_mm.shape[1] == n + 150
@@ -125,7 +125,7 @@ def test_standing_behind_the_end(piece: Piece) -> None:
 
 
 def test_a_stretch_of_no_time_has_a_sample(piece: Piece) -> None:
-    """Marlin swallows a move of less than a step; a segment must be able to end behind it."""
+    """Marlin swallows a move of less than a step; a segment must be able to end after it."""
     rows = Phases(**{f.name: getattr(piece.phases, f.name)[:1] for f in fields(Phases)})
     none = np.zeros(1)
     phases = replace(rows, accel_s=none, cruise_s=none, decel_s=none)

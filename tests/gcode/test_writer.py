@@ -40,7 +40,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("cache")
 
 
-class Road:
+class Pipeline:
     def __init__(self, folder: Path, cache: Path, machine: Machine) -> None:
         self.folder, self.cache, self.machine = folder, cache, machine
         self.result: Result | None = None
@@ -55,17 +55,17 @@ class Road:
 
 
 @pytest.fixture
-def road(tmp_path: Path, cache: Path, machine: Machine) -> Road:
-    return Road(tmp_path, cache, machine)
+def pipeline(tmp_path: Path, cache: Path, machine: Machine) -> Pipeline:
+    return Pipeline(tmp_path, cache, machine)
 
 
-def check(road: Road, text: str | bytes) -> list[bytes]:
+def check(pipeline: Pipeline, text: str | bytes) -> list[bytes]:
     """Compensate; every line must find its state, and no piece may be reverted."""
     original = tagged(text.encode() if isinstance(text, str) else text)
-    written = road(original)
-    assert differences(original, written, road.machine) == []
-    assert road.result is not None
-    assert road.result.put_back == []
+    written = pipeline(original)
+    assert differences(original, written, pipeline.machine) == []
+    assert pipeline.result is not None
+    assert pipeline.result.put_back == []
     return written.splitlines()
 
 
@@ -73,31 +73,31 @@ def check(road: Road, text: str | bytes) -> list[bytes]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_made_up_prints(road: Road, seed: int) -> None:
+def test_made_up_prints(pipeline: Pipeline, seed: int) -> None:
     original = tagged(made_up_print(seed))
-    assert differences(original, road(original), road.machine) == []
+    assert differences(original, pipeline(original), pipeline.machine) == []
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_wild_prints(road: Road, seed: int) -> None:
+def test_wild_prints(pipeline: Pipeline, seed: int) -> None:
     """Modes, factors, G92 and macros in the middle of it."""
     original = tagged(made_up_print(seed, wild=True))
-    assert differences(original, road(original), road.machine) == []
+    assert differences(original, pipeline(original), pipeline.machine) == []
 
 
 @pytest.mark.shared
 @pytest.mark.parametrize(
     "name", ["klipper_excludeobj_multi", "cura_ender3_gear24", "ps_ender3_gear24_absE"]
 )
-def test_real_prints(road: Road, shared_dir: Path, name: str) -> None:
+def test_real_prints(pipeline: Pipeline, shared_dir: Path, name: str) -> None:
     data = gzip.decompress((shared_dir / "corpus" / "own" / f"{name}.gcode.gz").read_bytes())
     original = tagged(b"".join(data.splitlines(keepends=True)[:5000]))
-    assert differences(original, road(original), road.machine) == []
+    assert differences(original, pipeline(original), pipeline.machine) == []
 
 
-def test_the_check_sees_what_it_should(road: Road, machine: Machine) -> None:
+def test_the_check_sees_what_it_should(pipeline: Pipeline, machine: Machine) -> None:
     original = tagged((HEAD + ROUND + "G1 E-1 F2100\nM400\nG1 X1 Y1 F3000\nG28\n").encode())
-    written = road(original)
+    written = pipeline(original)
     assert differences(original, written, machine) == []
     for old, new, word in (
         (b"G1 E-1 F2100", b"G1 E-1 F2000", "became"),
@@ -113,8 +113,8 @@ def test_the_check_sees_what_it_should(road: Road, machine: Machine) -> None:
 # One thing at a time
 
 
-def test_limits_are_raised_and_restored(road: Road) -> None:
-    lines = check(road, HEAD + "M204 S1300\n" + ROUND + "M400\nG1 X10 F3000\nG28\n")
+def test_limits_are_raised_and_restored(pipeline: Pipeline) -> None:
+    lines = check(pipeline, HEAD + "M204 S1300\n" + ROUND + "M400\nG1 X10 F3000\nG28\n")
     on = lines.index(b"; stillpath: stream on")
     assert lines[on + 1].startswith(b"SET_INPUT_SHAPER")
     raised = [k for k, line in enumerate(lines) if line.startswith(b"SET_VELOCITY_LIMIT")]
@@ -131,8 +131,8 @@ def test_limits_are_raised_and_restored(road: Road) -> None:
     ["M204 S700", "M204 P700 T900", "SET_VELOCITY_LIMIT ACCEL=700",
      "SET_VELOCITY_LIMIT SQUARE_CORNER_VELOCITY=3 VELOCITY=90"],
 )  # fmt: skip
-def test_limit_changes_are_held_back(road: Road, line: str) -> None:
-    lines = check(road, HEAD + ROUND + f"{line}\n" + TURN + "M400\nG1 X10 F3000\n")
+def test_limit_changes_are_held_back(pipeline: Pipeline, line: str) -> None:
+    lines = check(pipeline, HEAD + ROUND + f"{line}\n" + TURN + "M400\nG1 X10 F3000\n")
     assert any(x.startswith(f"; stillpath, held back: {line}".encode()) for x in lines)
 
 
@@ -140,24 +140,24 @@ def test_limit_changes_are_held_back(road: Road, line: str) -> None:
     "change",
     ["M82\nG92 E0", "M220 S80", "M221 S90", "G92 E0", "G92 E12.5", "G1 F2400"],
 )
-def test_modes_between_figures(road: Road, change: str) -> None:
+def test_modes_between_figures(pipeline: Pipeline, change: str) -> None:
     """Changes at a rest, and the file goes on in them."""
     back = "M83\n" if "M82" in change else ""
     tail = f"G1 E-1 F2100\n{change}\nG1 E-1\n{back}" + ROUND + "G1 E1\nM400\nG1 E1\nG1 X10\nG28\n"
-    check(road, HEAD + ROUND + tail)
+    check(pipeline, HEAD + ROUND + tail)
 
 
-def test_relative_files(road: Road) -> None:
+def test_relative_files(pipeline: Pipeline) -> None:
     text = HEAD + "G91\nG1 X20 Y3 E1 F3000\nG1 X-4 Y9 E.5\nG1 E-1 F2100\nG1 X9\nG1 E1\n"
-    check(road, text + "G1 X-9 Y9 E1\nG1 Z1 F600\nG1 X5 F3000\nM400\nG1 X2 Y2\nG90\nG1 X50\n")
+    check(pipeline, text + "G1 X-9 Y9 E1\nG1 Z1 F600\nG1 X5 F3000\nM400\nG1 X2 Y2\nG90\nG1 X50\n")
 
 
-def test_absolute_filament(road: Road) -> None:
+def test_absolute_filament(pipeline: Pipeline) -> None:
     text = HEAD + "M82\nG92 E0\nG1 X90 E1 F3000\nG1 Y90 E2\nG1 E1.2 F2100\nG1 X50 F6000\nG1 E2\n"
-    check(road, text + "G1 Y50 E3 F3000\nM400\nG1 X20 Y20 E4\nG1 E3.2\n")
+    check(pipeline, text + "G1 Y50 E3 F3000\nM400\nG1 X20 Y20 E4\nG1 E3.2\n")
 
 
-def test_g92_e_in_mid_motion(road: Road) -> None:
+def test_g92_e_in_mid_motion(pipeline: Pipeline) -> None:
     text = HEAD + "M82\nG92 E0\nG1 X120 Y100 F6000\n"
     turn, e = [], 0.0
     for k, line in enumerate(polygon(90, 20)):
@@ -169,103 +169,105 @@ def test_g92_e_in_mid_motion(road: Road) -> None:
             e = 0.0
     text += "\n".join(turn) + "\nM400\nG28 X\nG1 X50 Y50 F3000\nG1 E0 F2100\n"
     original = tagged(text.encode())
-    assert differences(original, road(original), road.machine) == []
+    assert differences(original, pipeline(original), pipeline.machine) == []
 
 
-def test_move_of_no_length_in_mid_motion(road: Road) -> None:
-    check(road, HEAD + ROUND + ROUND + "M400\nG1 X10 F3000\n")
+def test_move_of_no_length_in_mid_motion(pipeline: Pipeline) -> None:
+    check(pipeline, HEAD + ROUND + ROUND + "M400\nG1 X10 F3000\n")
 
 
-def test_origin_moves(road: Road) -> None:
+def test_origin_moves(pipeline: Pipeline) -> None:
     """G92 X at a stand: the file's zero moves, the machine does not jump."""
     text = HEAD + ROUND + "M400\nG92 X20\nG1 X30 Y60 E1\nG1 X30 Y80 E1\nG92 E0\nM400\nG1 X5 Y70\n"
-    check(road, text)
+    check(pipeline, text)
 
 
-def test_modal_f_is_restored(road: Road) -> None:
-    """Raw lines without F behind a piece run at the file's F, not at the stream's."""
+def test_modal_f_is_restored(pipeline: Pipeline) -> None:
+    """Raw lines without F after a piece run at the file's F, not at the stream's."""
     text = (
         HEAD + ROUND + "G1 F1234\nG1 X90 Y90 E1\nM400\nEXCLUDE_OBJECT_START NAME=a\nG1 X20\nG28\n"
     )
     original = tagged(text.encode())
-    written = road(original)
-    after = {s.text.split(b" ;#")[0]: s for s in states(written, road.machine)}
+    written = pipeline(original)
+    after = {s.text.split(b" ;#")[0]: s for s in states(written, pipeline.machine)}
     assert after[b"G1 X20"].speed_mm_s == pytest.approx(1234 / 60, rel=1e-6)
     assert not after[b"G1 X20"].stream
 
 
-def test_rest_lines_without_f(road: Road) -> None:
-    check(road, HEAD + ROUND + "G1 F2100\nG1 E-1\nG1 Z6\n" + ROUND + "G1 F900\nG1 E1\nG1 X9 Y9\n")
+def test_rest_lines_without_f(pipeline: Pipeline) -> None:
+    check(
+        pipeline, HEAD + ROUND + "G1 F2100\nG1 E-1\nG1 Z6\n" + ROUND + "G1 F900\nG1 E1\nG1 X9 Y9\n"
+    )
 
 
-def test_shaper_unknown_stays_off(road: Road) -> None:
-    written = road(HEAD + ROUND + "G28\nG1 X5 Y5\n")
+def test_shaper_unknown_stays_off(pipeline: Pipeline) -> None:
+    written = pipeline(HEAD + ROUND + "G28\nG1 X5 Y5\n")
     assert written.count(b"SET_INPUT_SHAPER") == 1
-    assert road.result is not None
-    assert any("shaper" in warning for warning in road.result.warnings)
+    assert pipeline.result is not None
+    assert any("shaper" in warning for warning in pipeline.result.warnings)
 
 
-def test_shaper_of_the_machine_is_restored(road: Road, machine: Machine) -> None:
+def test_shaper_of_the_machine_is_restored(pipeline: Pipeline, machine: Machine) -> None:
     shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware})
-    lines = road(HEAD + ROUND + "G28\nM84\n", known).splitlines()
+    lines = pipeline(HEAD + ROUND + "G28\nM84\n", known).splitlines()
     calls = [k for k, line in enumerate(lines) if line.startswith(b"SET_INPUT_SHAPER")]
     assert len(calls) == 2
     assert b"SHAPER_TYPE_X=ei SHAPER_FREQ_X=51.5" in lines[calls[1]]
     assert calls[1] < len(lines) - 1 - lines[::-1].index(b"G28")
-    assert road.result is not None
-    assert not any("shaper" in warning for warning in road.result.warnings)
+    assert pipeline.result is not None
+    assert not any("shaper" in warning for warning in pipeline.result.warnings)
 
 
-def test_the_shaper_is_not_switched_for_travel(road: Road, machine: Machine) -> None:
+def test_the_shaper_is_not_switched_for_travel(pipeline: Pipeline, machine: Machine) -> None:
     """Klipper stands still for every SET_INPUT_SHAPER: times say how long, and there are few."""
     shaper = FirmwareShaper(type_x="ei", freq_x_hz=51.5, type_y="mzv", freq_y_hz=39)
     firmware = machine.firmware.model_copy(update={"shaper": shaper})
     known = machine.model_copy(update={"firmware": firmware, "pressure_advance_s": 0.05})
     marks = "EXCLUDE_OBJECT_END NAME=a\nEXCLUDE_OBJECT_START NAME=a\nG1 X130 Y90 F9000\n"
     text = HEAD + ROUND + 5 * (marks + ROUND) + "G28\n"
-    written = road(text, known)
+    written = pipeline(text, known)
     assert differences(text.encode(), written, known) == []
     assert written.count(b"SET_INPUT_SHAPER") == 2
-    assert road.result is not None
-    result = road.result
+    assert pipeline.result is not None
+    result = pipeline.result
     # Klipper's macros must know that the shaper is off there.
     limits = re.findall(
         rb"SQUARE_CORNER_VELOCITY=(\S+) [^\n]*\n[^\n]*\n.*stream off, line [^\n]*\nEXCLUDE", written
     )
     assert limits == 5 * [b"5.0000005"]
     assert written.rindex(b"SQUARE_CORNER_VELOCITY=5 ") < written.rindex(b"SET_INPUT_SHAPER")
-    # Off and on: each stands for the times ahead before and behind it. With advance those are 20 ms
+    # Off and on: each stands for the times ahead before and after it. With advance those are 20 ms
     # each; without, the shaper's longer side where it is on, and a millisecond where it is off.
     without = known.model_copy(update={"pressure_advance_s": 0.0})
-    road(text, without)
+    pipeline(text, without)
     reaches_s = []
     for kind, f_hz in (("ei", 51.5), ("mzv", 39.0)):
         weights, delays_s = shaper_pulses(kind, f_hz)
         middle_s = float(weights @ delays_s)
         reaches_s.append(max(middle_s, float(delays_s[-1]) - middle_s))
     window_s = max(reaches_s)
-    assert result.time_s - road.result.time_s == pytest.approx(
+    assert result.time_s - pipeline.result.time_s == pytest.approx(
         2 * (0.04 - window_s - 1e-3), abs=5e-4
     )
     assert 0.0 < result.left_alone_s < 0.2 * result.time_s
     assert result.left_alone_extruding_s == 0.0
 
 
-def test_shaper_of_the_file_is_restored(road: Road) -> None:
+def test_shaper_of_the_file_is_restored(pipeline: Pipeline) -> None:
     line = b"SET_INPUT_SHAPER SHAPER_TYPE=mzv SHAPER_FREQ_X=48 SHAPER_FREQ_Y=37"
-    written = road(HEAD.encode() + line + b"\n" + ROUND.encode() + b"G28\nM84\n")
+    written = pipeline(HEAD.encode() + line + b"\n" + ROUND.encode() + b"G28\nM84\n")
     assert written.count(line) == 2
     assert written.index(b"SHAPER_FREQ_X=0") < written.rindex(line) < written.rindex(b"G28")
 
 
-def test_rests_run_under_the_limits_of_the_file(road: Road, machine: Machine) -> None:
+def test_rests_run_under_the_limits_of_the_file(pipeline: Pipeline, machine: Machine) -> None:
     """What we did not write must not meet our limits: retractions, hops, and after an M204."""
     rest = "G1 E-1 F2100\nG1 Z5.4 F600\nM204 S1500\nG1 Z5 F600\nG1 E1 F2100\n"
-    lines = road(tagged((HEAD + ROUND + rest + ROUND + "G4 P1\n").encode())).splitlines()
-    assert road.result is not None
-    assert road.result.put_back == []
+    lines = pipeline(tagged((HEAD + ROUND + rest + ROUND + "G4 P1\n").encode())).splitlines()
+    assert pipeline.result is not None
+    assert pipeline.result.put_back == []
     accel, seen = 0.0, {}
     for line in lines:
         if found := re.match(rb"SET_VELOCITY_LIMIT .*ACCEL=(\d+)", line):
@@ -282,33 +284,33 @@ def test_rests_run_under_the_limits_of_the_file(road: Road, machine: Machine) ->
     }
 
 
-def test_a_file_that_ends_in_a_stream_gives_the_printer_back(road: Road) -> None:
-    lines = road(HEAD + ROUND).splitlines()
+def test_a_file_that_ends_in_a_stream_gives_the_printer_back(pipeline: Pipeline) -> None:
+    lines = pipeline(HEAD + ROUND).splitlines()
     limits = [line for line in lines if line.startswith(b"SET_VELOCITY_LIMIT")]
     assert b"ACCEL=5000 " in limits[-1]
     assert lines[-2] == b"; stillpath: stream off"
-    assert road.result is not None
-    assert any("shaper" in warning for warning in road.result.warnings)
+    assert pipeline.result is not None
+    assert any("shaper" in warning for warning in pipeline.result.warnings)
 
 
-def test_after_homing_the_machine_stands_still(road: Road) -> None:
+def test_after_homing_the_machine_stands_still(pipeline: Pipeline) -> None:
     """A jump is no motion: what follows must not be compensated for it."""
-    result = road(HEAD + ROUND + "G28\n" + ROUND + "G28\n")
+    result = pipeline(HEAD + ROUND + "G28\n" + ROUND + "G28\n")
     assert result.count(b"; stillpath: stream on") >= 2
-    assert road.result is not None
-    sliced, ours = (channel.extruding for channel in road.result.channels[:2])
+    assert pipeline.result is not None
+    sliced, ours = (channel.extruding for channel in pipeline.result.channels[:2])
     assert ours.contour_max_um < 0.3 * sliced.contour_max_um
 
 
 @pytest.mark.parametrize("length", ["0.0005", "0.001", "0.02"])
-def test_hardly_a_move_between_two_rests(road: Road, length: str) -> None:
+def test_hardly_a_move_between_two_rests(pipeline: Pipeline, length: str) -> None:
     tiny = f"G1 E-1 F2100\nG1 X{120 + float(length):.4f} F6000\nG1 E1 F2100\nG1 X130 F6000\n"
-    written = road(HEAD + ROUND + tiny + "M400\nG1 X130.001\nM400\n")
+    written = pipeline(HEAD + ROUND + tiny + "M400\nG1 X130.001\nM400\n")
     assert b"stream on" in written
 
 
-def test_stamps(road: Road, machine: Machine) -> None:
-    lines = road(HEAD + ROUND).splitlines()
+def test_stamps(pipeline: Pipeline, machine: Machine) -> None:
+    lines = pipeline(HEAD + ROUND).splitlines()
     assert lines[0].startswith(b"; Processed by stillpath ")
     assert lines[-1] == lines[0]
     assert f"model={machine.revision}".encode() in lines[0]
@@ -316,17 +318,17 @@ def test_stamps(road: Road, machine: Machine) -> None:
     assert kinds[0] == kinds[-1] == EventKind.STAMP
 
 
-def test_missing_last_newline(road: Road) -> None:
+def test_missing_last_newline(pipeline: Pipeline) -> None:
     for end in ("", "\n"):
-        lines = road(HEAD + ROUND + "M84" + end).splitlines()
+        lines = pipeline(HEAD + ROUND + "M84" + end).splitlines()
         assert b"M84" in lines
         assert lines[-1].startswith(b"; Processed by stillpath")
 
 
-def test_streams_are_closed_before_foreign_lines(road: Road) -> None:
+def test_streams_are_closed_before_foreign_lines(pipeline: Pipeline) -> None:
     text = HEAD + ROUND + "MY_MACRO A=1\nG1 X50 Y50\n" + ROUND + "PAUSE\nM84\n"
     on = False
-    for line in road(text).splitlines():
+    for line in pipeline(text).splitlines():
         on = on or line == b"; stillpath: stream on"
         on = on and not line.startswith(OFF)
         assert not (on and line.startswith((b"MY_MACRO", b"PAUSE")))
@@ -341,7 +343,7 @@ def test_streams_are_closed_before_foreign_lines(road: Road) -> None:
         ("SET_GCODE_OFFSET Z_ADJUST=.05 MOVE=1", "SET_GCODE_OFFSET X_ADJUST=1 MOVE=1"),
     ],
 )
-def test_what_the_printer_keeps_is_the_file_s(road: Road, kept: str, back: str) -> None:
+def test_what_the_printer_keeps_is_the_file_s(pipeline: Pipeline, kept: str, back: str) -> None:
     """Modes, F and place: those of a stream brought back would feed wrongly."""
     text = (
         HEAD.replace("M83", "M82")
@@ -349,14 +351,14 @@ def test_what_the_printer_keeps_is_the_file_s(road: Road, kept: str, back: str) 
         + f"{back}\nG1 X90 Y110 E5\nG1 X120 E6\nG1 Y130 E7\n"
     )
     assert "M82" in text
-    check(road, text)
+    check(pipeline, text)
 
 
-def test_filament_adds_up(road: Road, machine: Machine) -> None:
+def test_filament_adds_up(pipeline: Pipeline, machine: Machine) -> None:
     """Rounding of thousands of E words does not gather."""
     body = ROUND + (TURN + "G1 E-1 F2100\nG1 E1\n") * 30
     ends = []
-    for data in ((HEAD + body).encode(), road(HEAD + body)):
+    for data in ((HEAD + body).encode(), pipeline(HEAD + body)):
         reader = Interpreter(machine)
         reader.push(data)
         ends.append(reader.position_mm)
@@ -364,14 +366,14 @@ def test_filament_adds_up(road: Road, machine: Machine) -> None:
 
 
 @pytest.mark.parametrize("height", ["", "G1 Z.3\n"])
-def test_a_height_that_the_file_leaves_alone_is_not_named(road: Road, height: str) -> None:
-    """Off the grid, or unknown behind a start macro: naming it would drive the nozzle there."""
+def test_a_height_that_the_file_leaves_alone_is_not_named(pipeline: Pipeline, height: str) -> None:
+    """Off the grid, or unknown after a start macro: naming it would drive the nozzle there."""
     text = (
         "START_PRINT\nG90\nM83\n" + height + "G1 X50 Y50 F6000\n"
         "SET_GCODE_OFFSET Z_ADJUST=0.009174993 MOVE=1 MOVE_SPEED=5\n"
         "G1 X80 Y50 E1 F6000\nG1 X80 Y90 E1\nG1 E-1 F2100\nG1 X50 F6000\nG1 E1 F2100\nM400\n"
     )
-    lines = check(road, text)
+    lines = check(pipeline, text)
     assert any(line.startswith(b"; stillpath: stream on") for line in lines)
     named = [line for line in lines if re.match(rb"G1 .*Z", line)]
     assert [line.split(b" ;#")[0] for line in named] == height.encode().splitlines()

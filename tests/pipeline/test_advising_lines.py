@@ -104,7 +104,7 @@ def test_any_file(lines: list[str], ends: str) -> None:
     assert b"".join(x for x in out.splitlines(keepends=True) if MARK not in x) == data
     before, after = printed(data, machine), printed(out, machine)
     assert len(before) == len(after)
-    # What stands in a line without an end cannot have ours behind it; it is the last one.
+    # What stands in a line without an end cannot have ours after it; it is the last one.
     whole = len(after) if ends else len(after) - 1
     reader = Interpreter(machine)
     reader.push(data)

@@ -273,7 +273,7 @@ def test_tallies_are_the_whole_array_s() -> None:
     command[:, n:] = path[:, n:]
     layer, feeds = np.pad(layer, (0, 100), mode="edge"), np.pad(feeds, (0, 100))
     n += 100
-    # Behind lines that end at rest, the nozzle rings on them.
+    # After lines that end at rest, the nozzle rings on them.
     since = np.full(n, 101)
     for k in range(1, n):
         still = np.all(np.abs(path[:, k] - path[:, k - 1]) < 1e-9)
@@ -347,7 +347,7 @@ def test_real_prints(
 
 
 def check_marks(original: bytes, written: bytes, machine: Machine) -> None:
-    """The first travel behind every object mark is the slicer's, at the slicer's limits."""
+    """The first travel after every object mark is the slicer's, at the slicer's limits."""
     old, new = (states(d, machine) for d in (original, written))
     travels = []
     for lines in (old, new):

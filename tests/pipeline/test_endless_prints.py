@@ -26,39 +26,39 @@ FILES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(FILES))
-@pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
-def test_refused(tmp_path: Path, cache: Path, name: str, road: str) -> None:
+@pytest.mark.parametrize("method", ["none", "shaper:mzv", "simulate", "plan"])
+def test_refused(tmp_path: Path, cache: Path, name: str, method: str) -> None:
     text, message = FILES[name]
     source, target = tmp_path / "in.gcode", tmp_path / "out"
     source.write_text(text)
     with pytest.raises(GcodeError, match=message):
-        go(road, source, target, cache)
+        go(method, source, target, cache)
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 
 
 def go(
-    road: str, source: Path, target: Path, cache: Path, progress: ProgressCallback | None = None
+    method: str, source: Path, target: Path, cache: Path, progress: ProgressCallback | None = None
 ) -> None:
     machine = load_machine("ender3")
-    if road == "plan":
+    if method == "plan":
         plan_file(source, target, machine, rate_hz=1.0, progress=progress)
-    elif road == "simulate":
+    elif method == "simulate":
         simulate_file(source, machine, cache_dir=cache, progress=progress)
     else:
-        options = Options(method=road)
+        options = Options(method=method)
         compensate_file(source, target, machine, options, cache_dir=cache, progress=progress)
 
 
-@pytest.mark.parametrize("road", ["none", "shaper:mzv", "simulate", "plan"])
-def test_refused_before_it_is_computed(tmp_path: Path, cache: Path, road: str) -> None:
-    """What makes the print endless stands behind two long days of it: the file is read to its end
+@pytest.mark.parametrize("method", ["none", "shaper:mzv", "simulate", "plan"])
+def test_refused_before_it_is_computed(tmp_path: Path, cache: Path, method: str) -> None:
+    """What makes the print endless stands after two long days of it: the file is read to its end
     before hours are spent on its beginning."""
     source, target = tmp_path / "in.gcode", tmp_path / "out"
     days = "G4 P180000000\n"  # cheap ones
     source.write_text(HEAD + MOVES + days + MOVES * 8000 + "G4 P3600000000\n" + MOVES)
     told: list[Progress] = []
     with pytest.raises(GcodeError, match=r"line 16012: .* takes 1052\.76 h, more than 1000 h"):
-        go(road, source, target, cache, told.append)
+        go(method, source, target, cache, told.append)
     assert all(report.print_seconds < 60.0 for report in told)
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 

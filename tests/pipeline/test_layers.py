@@ -131,7 +131,7 @@ def test_every_layer_every_corner(tmp_path: Path, cache: Path) -> None:
         for name in index["channels"]:
             rms, largest = group.contour_rms_um[name], group.contour_max_um[name]
             assert tile.entry["rms_um"][name] == pytest.approx(rms, abs=0.006)
-            # The report's counts what rings behind the ends of lines too.
+            # The report's counts what rings after the ends of lines too.
             printed = tile.entry["max_um"][name]
             assert printed <= largest + 0.006
             drawn = tile.error[name][(tile.on > 0) & (tile.error[name] < UNKNOWN)]
@@ -146,7 +146,7 @@ def test_every_layer_every_corner(tmp_path: Path, cache: Path) -> None:
     (last,) = tiles[-1:]
     end = np.flatnonzero(last.line == len(lines) - 1)[-1]
     assert (last.x[end], last.y[end], last.on[end]) == (80.0, 40.0, 1)
-    # Behind homing nobody knows how the nozzle came there.
+    # After homing nobody knows how the nozzle came there.
     lifted = np.flatnonzero(last.error["before"] == UNKNOWN)
     assert len(lifted) == 2
     assert last.on[lifted[1]] == 0

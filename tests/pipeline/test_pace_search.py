@@ -21,7 +21,7 @@ WALL, INFILL = 0, 1
 
 @dataclass
 class Law:
-    """Errors of a class: its own, and what travel adds behind it."""
+    """Errors of a class: its own, and what travel adds after it."""
 
     own_um: dict[int, float]
     from_travel_um: dict[int, float] = field(default_factory=dict)

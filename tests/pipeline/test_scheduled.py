@@ -206,7 +206,7 @@ def test_band_is_warned_of(tmp_path: Path, cache: Path) -> None:
     narrow, _ = compensated(block(3), tmp_path, banded(25.0), cache)
     assert any("Axis y" in w and "above 25 Hz" in w for w in narrow.warnings)
     phase, _ = compensated(block(3), tmp_path, banded(None, 20.0), cache)
-    assert any("above 20 Hz, from where its model is not to be trusted" in w
+    assert any("above 20 Hz, where its model cannot be trusted" in w
                for w in phase.warnings)  # fmt: skip
     wide, _ = compensated(block(3), tmp_path, banded(130.0), cache)
     assert not any("planned motion" in w for w in wide.warnings)

@@ -98,7 +98,7 @@ def test_a_file_that_must_not_be_large(gear: Path, tmp_path: Path) -> None:
         assert found.settings.get("where", "all") == where
         assert found.written_bytes == target.stat().st_size <= 1e6 * limit_mb
     target.write_bytes(b"precious")
-    with pytest.raises(GcodeError, match=r"does not fit into max_mb 0\.2"):
+    with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.2"):
         run(gear, target, machine, max_mb=0.2)
     assert target.read_bytes() == b"precious"
     assert [p.name for p in tmp_path.iterdir()] == ["out.gcode"]

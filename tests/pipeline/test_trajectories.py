@@ -72,22 +72,20 @@ def test_the_whole_print(source: Path, tmp_path: Path, cache: Path) -> None:
     assert set(table["layer"]) <= {-1, 0}
 
 
-@pytest.mark.parametrize("options", [Options(), None])
-def test_a_part_of_it_as_text(
-    source: Path, tmp_path: Path, cache: Path, options: Options | None
-) -> None:
+@pytest.mark.parametrize("options", [Options(), Options(method="advise")])
+def test_a_part_of_it_as_text(source: Path, tmp_path: Path, cache: Path, options: Options) -> None:
     machine = load_machine("ender3")
     whole, part = tmp_path / "w.npz", tmp_path / "p.csv"
     write_trajectories(source, whole, machine, options, format="npz", cache_dir=cache)
     rows = write_trajectories(
-        source, part, machine, options, start_s=0.25, stop_s=0.75, cache_dir=cache
+        source, part, machine, options, window_s=(0.25, 0.75), cache_dir=cache
     )
     table = load(whole)
     with part.open(newline="") as file:
         read = list(csv.DictReader(file))
     assert rows == len(read) == 500
     assert list(read[0]) == list(table)
-    assert ("after_x_mm" in read[0]) == (options is not None)
+    assert ("before_contour_um" in read[0]) == (options.method != "advise")
     for name, values in table.items():
         column = np.array([float(row[name]) for row in read])
         assert column == pytest.approx(values[250:750], abs=6e-3)
@@ -101,7 +99,13 @@ def test_the_same_bytes(source: Path, tmp_path: Path, cache: Path) -> None:
         for name in ("one", "two"):
             target = tmp_path / f"{name}.{form}"
             write_trajectories(
-                source, target, machine, None, format=form, stop_s=0.3, cache_dir=cache
+                source,
+                target,
+                machine,
+                Options(),
+                format=form,
+                window_s=(0.0, 0.3),
+                cache_dir=cache,
             )
             made.append(target.read_bytes())
         assert made[0] == made[1]
@@ -110,8 +114,8 @@ def test_the_same_bytes(source: Path, tmp_path: Path, cache: Path) -> None:
 @pytest.mark.parametrize(
     ("start_s", "stop_s", "message"),
     [
-        (2.0, 1.0, "from 2 s to 1 s is no time"),
-        (-1.0, None, "no time"),
+        (2.0, 1.0, "2 s to 1 s is no period"),
+        (-1.0, None, "no period"),
         (1e5, None, r"nothing moves from 100000 s on: the print ends at [\d.]+ s"),
     ],
 )
@@ -123,9 +127,8 @@ def test_no_such_time(
             source,
             tmp_path / "t.csv",
             load_machine("ender3"),
-            None,
-            start_s=start_s,
-            stop_s=stop_s,
+            Options(),
+            window_s=(start_s, stop_s),
             cache_dir=cache,
         )
     assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]

@@ -5,12 +5,13 @@ from __future__ import annotations
 from datetime import date
 from typing import Any
 
+from stillpath.models.confirmation import Confirmation
 from stillpath.models.firmware.klipper import PlannerLimits
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec
 from stillpath.models.store import load_machine
 
-__all__ = ["make_machine", "make_plants", "with_accel"]
+__all__ = ["make_confirmation", "make_machine", "make_plants", "with_accel"]
 
 
 def make_plants(
@@ -22,6 +23,23 @@ def make_plants(
             "members": {"frequency_scale": (0.98, 1.0, 1.02), "damping_scale": (0.8, 1.2)},
             "provenance": {"kind": kind, "measured_on": on, "residual": 0.004},
         }
+    )
+
+
+def make_confirmation(measured_um: float) -> Confirmation:
+    digest = "0123456789ab"
+    return Confirmation(
+        tested_on=date(2026, 3, 2),
+        verdict="confirmed",
+        predicted_um=(1.0, 9.0),
+        measured_um=measured_um,
+        scatter_um=0.1,
+        uncompensated_um=20.0,
+        ratio=measured_um / 20.0,
+        sources=(),
+        machine="mine",
+        revision=digest,
+        plants=digest,
     )
 
 

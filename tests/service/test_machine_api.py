@@ -252,7 +252,7 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
     run_task(task, lambda progress: None)
     warnings = json.loads((task.report / "report.json").read_text())["warnings"]
     assert any("axis x of mine: measured on 2020-01-31" in warning for warning in warnings)
-    assert any("axis y of mine: nobody knows when" in warning for warning in warnings)
+    assert any("axis y of mine: its measurement has no date" in warning for warning in warnings)
 
 
 @pytest.mark.slow

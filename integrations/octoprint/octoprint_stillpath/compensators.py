@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode
 
-from .client import Failure, Service, _Broken, _read, _Told
+from .client import Failure, Service, _Broken, _CountedFile, _read
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -199,7 +199,7 @@ class OnServer(Service):
         while True:
             with source.open("rb") as file:
                 size = source.stat().st_size
-                body = _Told(file, size, lambda share: self._tell("sending", share))
+                body = _CountedFile(file, size, lambda share: self._tell("sending", share))
                 try:
                     with self._open("POST", f"/v1/jobs?{query}", body) as answer:
                         return self._document(_read(answer)), answer.status == 202

@@ -1,7 +1,6 @@
 """Readers of measurement and model files; see `read_measurements`."""
 
 from stillpath.models.identification.readers.reading import read_content, read_measurements
-from stillpath.models.identification.readers.resampling import resampled
 from stillpath.models.identification.readers.settings import (
     ReadSettings,
     date_in_name,
@@ -18,5 +17,4 @@ __all__ = [
     "excitation_notes",
     "read_content",
     "read_measurements",
-    "resampled",
 ]

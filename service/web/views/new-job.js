@@ -108,7 +108,7 @@ function complaint(file) {
 function moreOptions() {
   const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
   const robust = select("robust", [["", [["auto", "Automatic: what the measurement bears"], ["off", "The nominal plant"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
-  const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "automatic" });
+  const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "1" });
   const budget = h("input", { type: "number", id: "budget", min: "0.5", max: "1000", step: "0.5", placeholder: "keep all speeds" });
   const where = select("where", [["", [["all", "Everywhere"], ["visible", "Outer walls, top and bottom"], ["walls", "Outer walls"]]]]);
   const most = h("input", { type: "number", id: "max-mb", min: "1", step: "1", placeholder: "no limit" });

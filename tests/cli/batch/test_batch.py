@@ -166,7 +166,7 @@ def test_interrupted(monkeypatch):
         batch("--jobs", "2")
     thread.join()
     assert caught.value.code == 143
-    assert "1 of 2 are over" in told.getvalue()
+    assert "1 of 2 are finished" in told.getvalue()
     assert not list(Path("out/.stillpath/work").iterdir())
     fill(b="G28 Y")
     assert batch() == 0

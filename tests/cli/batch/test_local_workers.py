@@ -34,7 +34,7 @@ def children(pid: int) -> list[int]:
     return found
 
 
-def lanes(pid: int) -> list[int]:
+def worker_processes(pid: int) -> list[int]:
     """The processes that work: copies of the one that loads the libraries, or our own children."""
     mothers = [child for child in children(pid) if b"forkserver" in command_line(child)]
     if mothers:
@@ -82,9 +82,9 @@ def test_a_batch_for_real(files):
 def test_a_process_that_dies_costs_one_file(files):
     with start(files, "--jobs", "1") as process:
         deadline = time.monotonic() + 120
-        while not lanes(process.pid) and time.monotonic() < deadline:
+        while not worker_processes(process.pid) and time.monotonic() < deadline:
             time.sleep(0.02)
-        os.kill(lanes(process.pid)[0], signal.SIGKILL)
+        os.kill(worker_processes(process.pid)[0], signal.SIGKILL)
         _, stderr = process.communicate(timeout=600)
     assert process.returncode == 1
     assert "ended by signal 9" in stderr
@@ -98,9 +98,9 @@ def test_a_process_that_dies_costs_one_file(files):
 def test_processes_end_with_their_parent(files):
     with start(files, "--jobs", "2") as process:
         deadline = time.monotonic() + 120
-        while len(lanes(process.pid)) < 2 and time.monotonic() < deadline:
+        while len(worker_processes(process.pid)) < 2 and time.monotonic() < deadline:
             time.sleep(0.02)
-        working = lanes(process.pid)
+        working = worker_processes(process.pid)
         time.sleep(1)
         process.send_signal(signal.SIGKILL)
         process.communicate(timeout=60)

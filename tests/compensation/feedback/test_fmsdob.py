@@ -173,8 +173,8 @@ def test_fixed_zeros() -> None:
     assert np.abs(add_on(SLOW.nominal(), q, np.array([1500.0]), "servo"))[0] < 1e-9
 
 
-def test_width_behind_a_band_pass() -> None:
-    """Finding b: a Hermite Q behind a band pass is as narrow as a pointwise one."""
+def test_width_after_a_band_pass() -> None:
+    """Finding b: a Hermite Q after a band pass is as narrow as a pointwise one."""
     loop = FAST.nominal()
     f = 4000 + np.linspace(-400, 400, 80001)
     widths = {}

@@ -91,7 +91,7 @@ def test_every_place_gets_its_own_delay(golden_machine: Machine) -> None:
 def test_time_to_a_stop_grows_with_the_delay_between(golden_machine: Machine) -> None:
     text = b"M73 C3\nG1 X10 F600\n;PAUSE_PRINT\nM601\nM73 C9\nG1 X20\n"
     out = rewritten(text, golden_machine, [0.0, 90.0, 90.0])
-    # 180 + 90 s; behind the last stop nothing is known.
+    # 180 + 90 s; after the last stop nothing is known.
     assert told(out, b"M73") == [b"M73 C5", b"M73 C9"]
 
 

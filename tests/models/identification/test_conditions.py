@@ -1,4 +1,4 @@
-"""What stands behind the @ of a file's name."""
+"""What stands after the @ of a file's name."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ import control
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.signal import coherence, csd, welch
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import align
@@ -18,7 +17,6 @@ from stillpath.models.identification.estimation import (
     estimate_aligned,
     estimate_driven,
     estimate_response,
-    estimate_welch,
     plateau_gain,
 )
 from stillpath.models.identification.local_model import Transformed, local_response
@@ -212,12 +210,11 @@ def driven_log(
     return DrivenLog(time_s, command[1000:], measured, "x", f"log{seed}.csv"), plant
 
 
-@pytest.mark.parametrize("estimate", [estimate_driven, estimate_welch])
 @pytest.mark.parametrize("logs", [1, 3])
-def test_recorded_drives_give_the_response_of_python_control(estimate, logs: int) -> None:  # type: ignore[no-untyped-def]
+def test_recorded_drives_give_the_response_of_python_control(logs: int) -> None:
     recorded = [driven_log(30_000, seed) for seed in range(logs)]
     plant = recorded[0][1]
-    found = estimate([log for log, _ in recorded], label="noise")
+    found = estimate_driven([log for log, _ in recorded], label="noise")
     truth = plant(np.exp(2j * np.pi * found.f_hz / 1000))
     strong = np.abs(truth) > 0.3
     error = np.abs(found.response - truth)
@@ -242,25 +239,6 @@ def test_gravity_in_a_recorded_drive_changes_nothing(at_rest: bool) -> None:
     np.testing.assert_allclose(heavy.response[strong], plain.response[strong], rtol=1e-3)
 
 
-def test_welch_is_scipys() -> None:
-    log, _ = driven_log(20_000, 5)
-    found = estimate_welch(log, segment_s=2.0)
-    rate = (len(log.time_s) - 1) / (log.time_s[-1] - log.time_s[0])
-    f, cross = csd(log.command, log.measured, rate, nperseg=2000)
-    h1 = cross / welch(log.command, rate, nperseg=2000)[1]
-    gamma = coherence(log.command, log.measured, rate, nperseg=2000)[1]
-    at = np.searchsorted(f, found.f_hz - 1e-6)
-    np.testing.assert_allclose(f[at], found.f_hz, rtol=1e-9)
-    np.testing.assert_allclose(found.response, h1[at], rtol=1e-9)
-    np.testing.assert_allclose(found.coherence, gamma[at], rtol=1e-9)
-
-
-def test_more_logs_are_surer() -> None:
-    logs = [driven_log(20_000, seed)[0] for seed in range(4)]
-    sd = [np.median(estimate_welch(part, segment_s=2.0).sd) for part in (logs[:1], logs)]
-    assert sd[1] / sd[0] == pytest.approx(0.5, abs=0.1)
-
-
 def test_local_model_is_exact_for_one_pole_and_transients() -> None:
     # A response with one pole near, and a start that is not at rest.
     f = np.arange(0, 1001) * 0.1
@@ -279,17 +257,11 @@ def test_wrong_drives_have_their_own_messages() -> None:
     log, _ = driven_log(8000, 7)
     rng = np.random.default_rng(8)
     with pytest.raises(ModelError, match="follows the command at no frequency"):
-        estimate_welch(replace(log, measured=rng.normal(size=8000)))
-    with pytest.raises(ModelError, match="follows the command at no frequency"):
         estimate_driven(replace(log, measured=rng.normal(size=8000)))
     with pytest.raises(ModelError, match=r"logs of different axes \(x, y\)"):
         estimate_driven([log, replace(log, axis="y")])
-    with pytest.raises(ModelError, match="different rates"):
-        estimate_welch([log, replace(log, time_s=log.time_s * 2)])
     with pytest.raises(ModelError, match="at least one"):
-        estimate_welch([])
-    with pytest.raises(ModelError, match="too short"):
-        estimate_welch(log, segment_s=1e-3)
+        estimate_driven([])
     few = DrivenLog(log.time_s[:12], log.command[:12], log.measured[:12], "x", "few.csv")
     with pytest.raises(ModelError, match=r"too (short|few)"):
         estimate_driven(few)

@@ -18,12 +18,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers import ReadSettings, read_content, resampled
+from stillpath.models.identification.readers import ReadSettings, read_content
 from stillpath.models.identification.readers.matlab import matlab_variables
 from stillpath.models.identification.types import PlantModel
 from stillpath.models.plants import (
     PairsSpec,
-    PlantSpec,
     PolePair,
     ZeroPair,
     discretise,
@@ -344,33 +343,4 @@ def test_matlab_refusals() -> None:
 )  # fmt: skip
 def test_written_models_come_back(modes: list[tuple[float, float]]) -> None:
     spec = PairsSpec(poles=tuple(PolePair(f_hz=f, zeta=z) for f, z in modes))
-    sampled, _ = resampled(spec, DT_S)
-    for original in (spec, sampled):
-        model = read(original.model_dump_json())
-        assert model.spec == original
-
-
-def test_resampled_states_its_error() -> None:
-    same, nothing = resampled(PAIRS, DT_S)[0], resampled(resampled(PAIRS, DT_S)[0], DT_S)
-    assert nothing == (same, 0.0)
-    spec, error = resampled(PAIRS, DT_S, 150.0)
-    f_hz = np.linspace(0, 150, 1001)
-    discrete = control.sample_system(system(False), DT_S, "foh")
-    np.testing.assert_allclose(
-        frequency_response(spec, f_hz), discrete(np.exp(2j * np.pi * f_hz * DT_S)), atol=1e-8
-    )
-    exact = frequency_response(PAIRS, f_hz)
-    off = np.abs(frequency_response(spec, f_hz) - exact).max() / np.abs(exact).max()
-    assert error == pytest.approx(off, rel=1e-3)
-    assert 1e-4 < error < 0.02
-
-
-def test_resampled_back_and_forth() -> None:
-    fine, _ = resampled(PAIRS, 0.5e-3)
-    coarse, _ = resampled(fine, DT_S)
-    direct: PlantSpec = resampled(PAIRS, DT_S)[0]
-    np.testing.assert_allclose(
-        frequency_response(coarse, F_HZ), frequency_response(direct, F_HZ), atol=1e-7
-    )
-    with pytest.raises(ModelError, match="pure delay"):
-        resampled(read({"kind": "fir", "taps": [0.5, 0.5], "dt_s": 0.001}).spec, 0.002)
+    assert read(spec.model_dump_json()).spec == spec

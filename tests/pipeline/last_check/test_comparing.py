@@ -239,7 +239,7 @@ def test_what_it_cannot_follow_is_said(tmp_path: Path, cache: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_streams_without_a_line_that_stays(kind: str, tmp_path: Path, cache: Path) -> None:
-    """Behind each stream the same moves come again, and nothing but their number tells them."""
+    """After each stream the same moves come again, and nothing but their number tells them."""
     square = "G1 X70 Y50 E1\nG1 Y70 E1\nG1 X50 E1\nG1 Y50 E1\n"
     parts = f"; STILLPATH_OFF\n{square}; STILLPATH_ON\n{square}"
     data = ("G28\nM83\nG90\nG1 X50 Y50 Z.2 F6000\n" + 5 * parts).encode()

@@ -61,15 +61,15 @@ CASES: list[tuple[str, Firmware, dict[str, float]]] = [
     ("G1 X127.4 Y92.279\nG3 X100 Y104.303 I.082 J-.036", MARLIN, {"X": math.nan}),
     ("G1 X0 Y0\nG2 X10 Y0 I5 J0", MARLIN, {"X": 10}),
     ("G1 X0 Y0\nG2 X0 Y0 I5 J0", MARLIN, {"X": 0}),
-    # Whether E is relative depends on G91 too, which nobody knows behind an odd line.
+    # Whether E is relative depends on G91 too, which nobody knows after an odd line.
     ("G91\n\\G90\nM82", KLIPPER, {"REL": math.nan}),
     ("G91\n\\G90\nM83", KLIPPER, {"REL": 1}),
     ("G91\n\\G90\nM82\nG90", KLIPPER, {"REL": 0}),
-    # Numbers behind the point of a command's name are passed over.
+    # Numbers after the point of a command's name are passed over.
     ("M83\nG90.638\nG1 E5\nG1 E6", MARLIN, {"FED": 6}),
-    # What stands behind an odd character may be carried out, or not.
+    # What stands after an odd character may be carried out, or not.
     ("M82\nG1 E1\nM83\rG1 X3\nG1 E3", MARLIN, {"FED": math.nan}),
-    # RepRapFirmware: an E behind a digit is an exponent, sums are checked, conditions hold lines.
+    # RepRapFirmware: an E after a digit is an exponent, sums are checked, conditions hold lines.
     ("M83\nG91\nG1 E5\nG90\nG1 E5", REPRAP, {"FED": 10}),
     ("G1 X5 Y5\nG1X1Y1E2", REPRAP, {"X": math.nan}),
     ("G1 X5\nN1 G1 X7*98", REPRAP, {"X": 5}),
@@ -108,7 +108,7 @@ def test_what_may_become_of_a_line() -> None:
         assert reader.carry_out(text.encode())[0] is kind, text
 
 
-def test_behind_a_move_that_may_wait_nobody_knows_what_moves() -> None:
+def test_after_a_move_that_may_wait_nobody_knows_what_moves() -> None:
     reader = Reader(rules_of(MARLIN), shortest_mm=0.15)
     for line in (b"G28", b"M83", b"G1 X5 Y5 Z1"):
         reader.carry_out(line)

@@ -20,7 +20,7 @@ from tests.service.test_api import assert_problem, over, until
 def test_a_commit_whose_answer_was_lost(
     client: TestClient, data_dir: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The connection broke behind the commit: the job is there, and so must be its file."""
+    """The connection broke after the commit: the job is there, and so must be its file."""
     store, add = client.app.state.store, client.app.state.store.add
 
     def lost(*args: Any, **more: Any) -> None:

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from sqlalchemy import Engine
@@ -16,7 +17,7 @@ from stillpath.applications.machines.store import MachineStore
 from stillpath.service.database.documents import DocumentTable, open_documents
 from stillpath.service.database.engine import open_database
 from stillpath.service.settings import Settings
-from tests.service.machines import make_machine, make_plants, with_accel
+from tests.service.machines import make_confirmation, make_machine, with_accel
 
 PLACES = ["folder", "sqlite", pytest.param("postgresql", marks=pytest.mark.postgresql)]
 
@@ -140,18 +141,18 @@ def test_writers_of_one_machine_lose_nothing(documents: Documents):
         assert accel == [1000.0 * (writer + 1) + k for k in range(4)]
 
 
-def test_measurements_at_once_do_not_undo_each_other(documents: Documents):
+def test_ring_tests_at_once_do_not_undo_each_other(documents: Documents):
     store = MachineStore(documents)
     store.add_revision("mine", make_machine(), author="anna")
 
-    def measure(axis: str) -> None:
+    def test(axis: Literal["x", "y"]) -> None:
         for k in range(3):
-            store.update_axis("mine", {axis: make_plants(50.0 + k)}, author=axis)  # type: ignore[dict-item]
+            store.confirm("mine", {axis: make_confirmation(5.0 + k)}, author=axis)
 
-    together(lambda: measure("x"), lambda: measure("y"))
+    together(lambda: test("x"), lambda: test("y"))
     last = store.current("mine")
     assert last.number == 7
-    assert last.machine.axes["x"] == last.machine.axes["y"] == make_plants(52.0)
+    assert last.machine.confirmations == dict.fromkeys("xy", make_confirmation(7.0))
 
 
 def test_writers_beside_somebody_who_deletes(documents: Documents):

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from stillpath.service.database.engine import open_database
+from stillpath.service.deliveries.checking import Checker
 from stillpath.service.deliveries.printers import load_printers
 from stillpath.service.deliveries.rows import Delivery, deliveries_of
-from stillpath.service.deliveries.sender import Sender
+from stillpath.service.deliveries.sender import Sender, SendingTimes
 from stillpath.service.jobs.state import Claimed, Failed, Finished, Job
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
@@ -35,11 +36,13 @@ class Place:
         self.store = JobStore(self.engine)
         self.storage = open_storage(settings)
 
-    def sender(self, **how: Any) -> Sender:
+    def sender(self, checker: Checker | None = None, **how: Any) -> Sender:
         """Return a sender in a hurry."""
-        how = {"first_wait_s": 0.05, "poll_s": 0.05, "claim_s": 60.0} | how
+        times = SendingTimes(**{"first_wait_s": 0.05, "poll_s": 0.05} | how)
         printers = load_printers(self.settings.printers)
-        return Sender(self.engine, self.store, self.storage, self.settings, printers, **how)
+        return Sender(
+            self.engine, self.store, self.storage, self.settings, printers, checker, times
+        )
 
     @contextmanager
     def sending(self, **how: Any) -> Iterator[None]:

@@ -26,7 +26,7 @@ def stand_still(u_mm: Array, y_d_mm: Array, rests: NDArray[np.int64], blend: int
         Filter output and plan; the plan stands still in the rests.
     rests : ndarray of int64, shape (k, 2)
         Sample ranges [a, b); the sample before `a` belongs to the rest too: the plan stands there
-        already. Behind it a rest shorter than a sample may be over.
+        already. After it a rest shorter than a sample may be over.
     blend : int
         Samples of a transition; at most half the distance to the next rest.
     """

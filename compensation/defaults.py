@@ -1,0 +1,14 @@
+"""The method and basis of a job that names none.
+
+They stand in a module of their own because the command line shows them before it imports anything
+that computes.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = ["DEFAULT_BASIS", "DEFAULT_METHOD"]
+
+DEFAULT_METHOD: Final = "fbf"
+DEFAULT_BASIS: Final = "ce-opt"

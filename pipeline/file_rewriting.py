@@ -1,0 +1,81 @@
+"""Opens all that a file is rewritten with, and puts the new one in place when it is complete."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from stillpath.gcode.containers.opening import Container, open_text, rewriting
+from stillpath.pipeline.files import replacing
+from stillpath.pipeline.measuring.layer_files import LayerWriter, written_layers
+from stillpath.pipeline.measuring.measure import channel_names
+from stillpath.pipeline.progress import ProgressCallback, progress_to
+
+__all__ = ["FileRewriting", "file_rewriting"]
+
+
+@dataclass(slots=True)
+class FileRewriting:
+    """A file and what it is rewritten with.
+
+    Attributes
+    ----------
+    container : Container
+        The file as it is, its G-code in `text`.
+    text : binary file
+        Takes the new G-code.
+    spool : binary file
+        Seekable: what is written before its times are known.
+    layers : LayerWriter, optional
+    sizes : dict
+        Fields of a `Result`: bytes of both files; filled when the new one is complete.
+    """
+
+    container: Container
+    text: BinaryIO
+    spool: BinaryIO
+    layers: LayerWriter | None
+    sizes: dict[str, int] = field(default_factory=dict)
+
+
+@contextlib.contextmanager
+def file_rewriting(
+    source: Path,
+    target: Path,
+    *,
+    plate: int | None,
+    layers: Path | None,
+    progress: ProgressCallback | None,
+) -> Iterator[FileRewriting]:
+    """Yield what a file is rewritten with; the target and the folder of layers appear at the end.
+
+    Raises
+    ------
+    GcodeError
+        The container is damaged, or cannot be what the target is called.
+    OSError
+    """
+    unpacking = progress_to(progress, "unpacking", 0.0)
+    packing = progress_to(progress, "packing", 1.0)
+    with (
+        contextlib.ExitStack() as files,
+        replacing(target) as temporary,
+        open_text(source, plate=plate, folder=target.parent, progress=unpacking) as container,
+    ):
+        with (
+            rewriting(container, temporary, name=target, progress=packing) as text,
+            tempfile.TemporaryFile(dir=target.parent) as spool,
+        ):
+            writer = None
+            if layers is not None:
+                names = channel_names(compensated=True)
+                writer = files.enter_context(written_layers(layers, names))
+            made = FileRewriting(container, text, spool, writer)
+            yield made
+        # Before the target is put in place: it may be the source.
+        made.sizes["original_bytes"] = source.stat().st_size
+        made.sizes["written_bytes"] = temporary.stat().st_size
