@@ -37,6 +37,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "shaper_freq_x": 57.8,
         "shaper_type_y": "ei",
         "shaper_freq_y": 45.2,
+        "damping_ratio_x": 0.1,
+        "damping_ratio_y": 0.05,
     },
 }
 _TRADITIONAL = re.compile(r"[A-Z]\d+(\.\d+)?$")
@@ -273,7 +275,7 @@ class Klipper:
         if given:
             self.sent.append(line)
         for name, value in given.items():
-            self.shaper[name.lower()] = float(value) if "FREQ" in name else value
+            self.shaper[name.lower()] = value if "TYPE" in name else float(value)
         told = (f"{name}:{value}" for name, value in self.shaper.items())
         self.told.append(" ".join(told))
 

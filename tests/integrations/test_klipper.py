@@ -44,7 +44,8 @@ gcode:
 OWN = "SET_VELOCITY_LIMIT VELOCITY=300.0 ACCEL=5000.0 SQUARE_CORNER_VELOCITY=5.0 "
 OWN_LIMITS = OWN + "MINIMUM_CRUISE_RATIO=0.5"
 OWN_SHAPER = (
-    'SET_INPUT_SHAPER SHAPER_FREQ_X=57.8 SHAPER_FREQ_Y=45.2 SHAPER_TYPE_X="mzv" SHAPER_TYPE_Y="ei"'
+    'SET_INPUT_SHAPER SHAPER_FREQ_X=57.8 SHAPER_FREQ_Y=45.2 SHAPER_TYPE_X="mzv" SHAPER_TYPE_Y="ei" '
+    "DAMPING_RATIO_X=0.1 DAMPING_RATIO_Y=0.05"
 )
 
 
@@ -239,6 +240,29 @@ def test_check_is_content():
     assert printer.told[0].startswith("Stillpath: printer.cfg says shaper_freq_x:57.800")
     assert printer.told[-1].startswith("shaper_type_x:mzv shaper_freq_x:57.8")
     assert "restore the limits first" in printer.told[1]
+    assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
+
+
+def test_check_shows_whether_the_shaper_goes_off():
+    printer = Klipper(macros_of(OURS))
+    printer.run("SET_VELOCITY_LIMIT ACCEL=9000")
+    printer.run("STILLPATH_CHECK")
+    [place] = [k for k, line in enumerate(printer.told) if "does not say 0.000" in line]
+    assert "shaper_freq_x:0.0" in printer.told[place + 1]
+    assert "shaper_freq_y:0.0" in printer.told[place + 1]
+    assert printer.sent[-1] == OWN_SHAPER
+    assert limits(printer)[0][1] == 9000  # told, and left to STILLPATH_RESTORE
+    printer.sent.clear()
+    printer.state = "printing"
+    printer.run("STILLPATH_CHECK")
+    assert printer.sent == []
+
+
+def test_the_files_own_damping_does_not_outlive_a_pause():
+    printer = in_stretch(OURS)
+    printer.run("SET_INPUT_SHAPER DAMPING_RATIO_X=0.2")
+    printer.run("PAUSE")
+    assert printer.shaper["damping_ratio_x"] == 0.1
 
 
 @pytest.mark.parametrize(
