@@ -1,7 +1,8 @@
 """Marlin's commands that Python carries out.
 
 Sources: Marlin/src/gcode: config/M200-M205.cpp, config/M220.cpp, config/M221.cpp, geometry/G92.cpp,
-feature/advance/M900.cpp, feature/ft_motion/M495.cpp; which versions, and what was not read, stands in docs/dialects.md.
+feature/advance/M900.cpp, feature/ft_motion/M495.cpp; which versions, and what was not read, stands
+in docs/dialects.md.
 """
 
 from __future__ import annotations
