@@ -96,7 +96,7 @@ _RESPONSES = (
 # The package's kinematics/cartesian.py looks for two modules where they are not. And the host ends
 # beside the thread that still writes: here it waits until nothing more comes.
 _START = """
-import os, sys, time
+import os, struct, sys, time
 import klippy.chelper, klippy.kinematics, klippy.serialhdl, klippy.stepper
 klippy.kinematics.stepper = klippy.stepper
 sys.modules["chelper"] = klippy.chelper
@@ -107,12 +107,12 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 klippy.serialhdl.SerialReader.disconnect = disconnect
-from klippy.klippy import main
-main()
+import klippy.toolhead as toolhead
+from klippy.kinematics import extruder
 """
 # A checkout's modules import each other by their plain names.
 _START_CHECKOUT = """
-import os, sys, time
+import os, struct, sys, time
 sys.path.insert(0, sys.argv.pop(1))
 import serialhdl, stepper
 stepper.MAX_STEPCOMPRESS_ERROR = 1e-6
@@ -123,6 +123,31 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 serialhdl.SerialReader.disconnect = disconnect
+import toolhead
+from kinematics import extruder
+"""
+# What it plans, as it goes into the queues that steps are made of.
+_RECORD = """
+moves = open("moves.bin", "wb", buffering=0)
+def recording(kind, number):
+    begin = kind.__init__
+    def __init__(self, *given):
+        begin(self, *given)
+        append = self.trapq_append
+        def record(trapq, *move):
+            if trapq == self.trapq:
+                moves.write(struct.pack("<14d", number, *move))
+            return append(trapq, *move)
+        self.trapq_append = record
+    kind.__init__ = __init__
+recording(toolhead.ToolHead, 0)
+recording(extruder.PrinterExtruder, 1)
+"""
+_MAIN = """
+from klippy.klippy import main
+main()
+"""
+_MAIN_CHECKOUT = """
 import klippy
 klippy.main()
 """
@@ -234,11 +259,11 @@ def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) 
         ("klipper.dict", json.dumps(_dictionary())),
     ):
         (place / name).write_text(text, encoding="utf-8")
-    start, environment = ["-c", _START], dict(os.environ)
+    start, environment = ["-c", _START + _RECORD + _MAIN], dict(os.environ)
     if klipper is not None:
         environment["PYTHONPATH"] = str(klipper)
         if CHECKOUT is not None:
-            start = ["-c", _START_CHECKOUT, str(klipper / "klippy")]
+            start = ["-c", _START_CHECKOUT + _RECORD + _MAIN_CHECKOUT, str(klipper / "klippy")]
             config = config.replace("\nmax_stepper_error: 0.000001", "")
             config = re.sub("max_accel_to_decel: .*", "minimum_cruise_ratio: 0.5", config)
             (place / "printer.cfg").write_text(config, encoding="utf-8")
