@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
 
 __all__ = [
@@ -93,8 +94,9 @@ _RESPONSES = (
     "starting",
     "stats count=%u sum=%u sumsq=%u",
 )
-# The package's kinematics/cartesian.py looks for two modules where they are not. And the host ends
-# beside the thread that still writes: here it waits until nothing more comes.
+# The package's kinematics/cartesian.py looks for two modules where they are not, and its
+# the declaration of one function of its library is older than the function. And the host ends beside
+# the thread that still writes: here it waits until nothing more comes.
 _START = """
 import os, struct, sys, time
 import klippy.chelper, klippy.kinematics, klippy.serialhdl, klippy.stepper
@@ -107,10 +109,22 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 klippy.serialhdl.SerialReader.disconnect = disconnect
+import klippy.extras.input_shaper
 import klippy.toolhead as toolhead
 from klippy.kinematics import extruder
+ffi, library = klippy.chelper.get_ffi()
+window = "input_shaper_get_step_generation_window"
+class Library:
+    def __getattr__(self, name):
+        return getattr(library, name)
+setattr(Library, window, staticmethod(
+    ffi.cast("double(*)(struct stepper_kinematics *)", getattr(library, window))))
+class Chelper:
+    get_ffi = staticmethod(lambda: (ffi, Library()))
+klippy.extras.input_shaper.chelper = Chelper
 """
-# A checkout's modules import each other by their plain names.
+# A checkout's modules import each other by their plain names. In batch mode, and only there, it comes
+# to rest wherever it has read all of a block of the file: here it waits for the next block.
 _START_CHECKOUT = """
 import os, struct, sys, time
 sys.path.insert(0, sys.argv.pop(1))
@@ -125,6 +139,13 @@ def disconnect(self):
 serialhdl.SerialReader.disconnect = disconnect
 import toolhead
 from kinematics import extruder
+from extras.motion_queuing import PrinterMotionQueuing
+def flush(self, eventtime):
+    while self.last_step_gen_time < self.need_flush_time - 1.5:
+        self._advance_flush_time(0.0, self.last_step_gen_time + 0.25)
+    self.do_kick_flush_timer = True
+    return self.reactor.NEVER
+PrinterMotionQueuing._flush_handler_debug = flush
 """
 # What it plans, as it goes into the queues that steps are made of.
 _RECORD = """
@@ -151,6 +172,7 @@ _MAIN_CHECKOUT = """
 import klippy
 klippy.main()
 """
+_NO_SHAPER = "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400"
 _IDENTIFY = {0: "identify_response offset=%u data=%.*s", 1: "identify offset=%u count=%c"}
 
 
@@ -190,8 +212,12 @@ class Steps:
         return np.stack([np.append(0.0, p)[np.searchsorted(t, at_s, "right")] for t, p in rows])
 
 
-def printer_cfg(machine: Machine, *more: str) -> str:
-    """Write the printer.cfg of a machine, with finer steps in X and Y than any has."""
+def printer_cfg(machine: Machine, *more: str, shaper: bool = False) -> str:
+    """Write the printer.cfg of a machine, with finer steps in X and Y than any has.
+
+    `shaper`: with the machine's own [input_shaper]. By default SET_INPUT_SHAPER only empties the
+    queue, so that steps are those of the plan.
+    """
     firmware = machine.firmware
     assert firmware.kind == "klipper"
     planner, hot = firmware.planner, firmware.extruder
@@ -224,11 +250,20 @@ def printer_cfg(machine: Machine, *more: str) -> str:
         "max_extrude_cross_section: 50",
         "[heater_bed]\nheater_pin: P24\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: P25",
         "control: watermark\nmin_temp: 0\nmax_temp: 130\n[fan]\npin: P26",
-        # The package's [input_shaper] does not start; what it does to the queue is to empty it.
-        "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400",
+        _shaper_section(firmware.shaper) if shaper else _NO_SHAPER,
         "[pause_resume]\n[exclude_object]",
     ]
     return "\n".join([*lines, *more]) + "\n"
+
+
+def _shaper_section(stated: FirmwareShaper | None) -> str:
+    if stated is None:
+        return "[input_shaper]"
+    return (
+        f"[input_shaper]\nshaper_type_x: {stated.type_x}\nshaper_freq_x: {stated.freq_x_hz}\n"
+        f"damping_ratio_x: {stated.damping_x}\nshaper_type_y: {stated.type_y}\n"
+        f"shaper_freq_y: {stated.freq_y_hz}\ndamping_ratio_y: {stated.damping_y}"
+    )
 
 
 def klipper_with_extra(place: Path) -> Path:
