@@ -407,8 +407,13 @@ def _no_shaper(asked: Asked) -> Iterator[Finding]:
 
 def _unwrapped(asked: Asked) -> Iterable[str]:
     if asked.commands is None:
-        wrapped = {f"gcode_macro {name}" for name in ("Pause", "Resume", "Cancel_Print")}
-        return () if wrapped <= set(asked.sections) else _WRAPPED
+        # Of macros of one name the last one counts.
+        last = {name.upper(): name for name in asked.sections}
+        return [
+            name
+            for name in _WRAPPED
+            if last.get(f"GCODE_MACRO {name}") != f"gcode_macro {name.title()}"
+        ]
     known = asked.commands
     looked_for = (*_WRAPPED, "M600") if "M600" in known else _WRAPPED
     return [name for name in looked_for if not known.get(name, "").startswith(_OURS)]

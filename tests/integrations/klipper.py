@@ -83,7 +83,7 @@ class Klipper:
     settings : dict
         What ``configfile.settings`` says of the other sections.
     shows_commands : bool
-        Whether ``printer.gcode.commands`` is there (since 2022).
+        Whether ``printer.gcode.commands`` is there (since 2023-12).
     extra : dict
         Other objects of ``printer``.
     sent : list of str
@@ -152,7 +152,10 @@ class Klipper:
     def __getitem__(self, name: str) -> Any:
         name = str(name).strip()
         objects: dict[str, Any] = {
-            "configfile": {"settings": self.settings},
+            "configfile": {
+                "settings": self.settings,
+                "config": {section: {} for section, _ in self.sections},
+            },
             "toolhead": self.toolhead,
             "pause_resume": {"is_paused": self.is_paused},
             "print_stats": {"state": self.state},

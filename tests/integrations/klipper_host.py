@@ -94,9 +94,9 @@ _RESPONSES = (
     "starting",
     "stats count=%u sum=%u sumsq=%u",
 )
-# The package's kinematics/cartesian.py looks for two modules where they are not, and its
-# the declaration of one function of its library is older than the function. And the host ends beside
-# the thread that still writes: here it waits until nothing more comes.
+# The package's kinematics/cartesian.py looks for two modules where they are not, and a function of
+# its library is declared as it was before. And the host ends beside the thread that still writes:
+# here it waits until nothing more comes.
 _START = """
 import os, struct, sys, time
 import klippy.chelper, klippy.kinematics, klippy.serialhdl, klippy.stepper
@@ -123,8 +123,8 @@ class Chelper:
     get_ffi = staticmethod(lambda: (ffi, Library()))
 klippy.extras.input_shaper.chelper = Chelper
 """
-# A checkout's modules import each other by their plain names. In batch mode, and only there, it comes
-# to rest wherever it has read all of a block of the file: here it waits for the next block.
+# A checkout's modules import each other by their plain names. In batch mode, and only there, it
+# comes to rest wherever it has read all of a block of the file: here it waits for the next block.
 _START_CHECKOUT = """
 import os, struct, sys, time
 sys.path.insert(0, sys.argv.pop(1))

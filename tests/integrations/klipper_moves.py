@@ -18,7 +18,15 @@ from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 
-__all__ = ["COLUMNS", "HostMoves", "Difference", "compared", "recorded", "text_for_host"]
+__all__ = [
+    "COLUMNS",
+    "Difference",
+    "HostMoves",
+    "compared",
+    "of_the_package",
+    "read_back",
+    "recorded",
+]
 
 Array = NDArray[np.float64]
 
@@ -33,7 +41,7 @@ COLUMNS = {
     "braking": "s",
     "begin": "s",
 }
-"""What is compared, and in which unit; `begin` counts from the end of the last stand."""
+"""What is compared, and in which unit; `begin` counts from the end of the move before it."""
 _STANDS_S = 1e-6
 _WIDTH = 14
 
@@ -61,12 +69,13 @@ class Difference:
     Attributes
     ----------
     moves, extruding, stands : int
-        How many were compared: of the head, of filament, and waits between moves.
+        How many were compared: of the head, of filament, and times between moves of the head, in
+        which it stands.
     largest : dict
         Largest absolute difference of each of `COLUMNS`, of the head and of filament; speeds and
         accelerations relative to the larger of the host's value and 1.
     stand_s : float
-        Largest difference of a wait.
+        Largest difference of a stand.
     """
 
     moves: int
@@ -74,6 +83,17 @@ class Difference:
     stands: int
     largest: dict[str, float]
     stand_s: float
+
+
+def of_the_package(machine: Machine) -> Machine:
+    """The machine without a minimum cruise ratio.
+
+    The package's Klipper of 2023 has max_accel_to_decel instead, which M204 does not scale.
+    """
+    firmware = machine.firmware
+    assert firmware.kind == "klipper"
+    planner = firmware.planner.model_copy(update={"minimum_cruise_ratio": 0.0})
+    return machine.model_copy(update={"firmware": firmware.model_copy(update={"planner": planner})})
 
 
 def recorded(place: Path) -> HostMoves:
@@ -103,19 +123,17 @@ def compared(text: str, machine: Machine, host: HostMoves) -> Difference:
     of_extruder[:, 7] = 1.0
     extruder = extruder.copy()
     extruder[:, 8] = 0.0
-    stands, stand_s = 0, 0.0
     for theirs, ours in ((head, of_head), (extruder, of_extruder)):
         for name, columns in _PLACES.items():
             off = np.abs(theirs[:, columns] - ours[:, columns])
             if name.endswith(("speed", "acceleration")):
                 off = off / np.maximum(1.0, np.abs(theirs[:, columns]))
             largest[name] = max(largest[name], float(off.max()))
-    for theirs, ours in ((head, of_head),):
-        rests = _waits(theirs) > _STANDS_S
-        off = np.abs(_waits(theirs) - _waits(ours))
-        largest["begin"] = float(off[~rests].max())
-        stands, stand_s = int(rests.sum()), float(off[rests].max(initial=0.0))
-    return Difference(len(head), len(extruder), stands, largest, stand_s)
+    rests = _waits(head) > _STANDS_S
+    off = np.abs(_waits(head) - _waits(of_head))
+    largest["begin"] = float(off[~rests].max())
+    stand_s = float(off[rests].max(initial=0.0))
+    return Difference(len(head), len(extruder), int(rests.sum()), largest, stand_s)
 
 
 def read_back(text: str, machine: Machine) -> Phases:

@@ -115,6 +115,12 @@ def _old_klipper(status: dict[str, Any]) -> None:
     del status["gcode"]
 
 
+def _old_klipper_in_wrong_order(status: dict[str, Any]) -> None:
+    _old_klipper(status)
+    macros = status["configfile"]["config"]
+    macros["gcode_macro PAUSE"] = macros.pop("gcode_macro PAUSE")
+
+
 def _travel(status: dict[str, Any]) -> None:
     settings_of(status)["stepper_x"]["position_max"] -= 10.0
 
@@ -136,7 +142,8 @@ def _travel(status: dict[str, Any]) -> None:
         (_own_shaper_macro, "SET_INPUT_SHAPER", "on top of", False),
         (_not_wrapped, "PAUSE", "include stillpath.cfg", False),
         (_m600, "M600", "include stillpath-m600.cfg", False),
-        (_old_klipper, "PAUSE, RESUME, CANCEL_PRINT", "include stillpath.cfg", False),
+        (_old_klipper, "CANCEL_PRINT", "include stillpath.cfg", False),
+        (_old_klipper_in_wrong_order, "PAUSE, CANCEL_PRINT", "behind your own", False),
         (_travel, "[stepper_x] position_max", "travel.x.max_mm", False),
     ],
 )
