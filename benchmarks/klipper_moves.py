@@ -1,7 +1,7 @@
 """Klipper's own host: the moves that it plans of written files, beside Stillpath's read-back.
 
-Needs `KLIPPY_PYTHON` (`tests/get-tools`); with `STILLPATH_KLIPPER` a checkout of Klipper plans, with
-its own input shaper. The first layers of each file are compensated for each machine.
+Needs `KLIPPY_PYTHON` (`tests/get-tools`). With `STILLPATH_KLIPPER` a checkout of Klipper plans, and
+its own input shaper is on. The first layers of each file are compensated for each machine.
 """
 
 from __future__ import annotations
