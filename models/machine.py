@@ -116,6 +116,8 @@ class Machine(Document):
                     del about[added]
         if not content["firmware"].get("ft_motion", True):
             del content["firmware"]["ft_motion"]
+        if content["firmware"].get("ft_motion_version") == 2:
+            del content["firmware"]["ft_motion_version"]
         document = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(document.encode()).hexdigest()[:12]
 

@@ -91,7 +91,11 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
         planner["junction_deviation_mm"] = word("M205", "J")
     else:
         planner["jerk_mm_s"] = per_axis("M205")
-    return {
+    section: dict[str, Any] = {}
+    if "M493" in found:
+        # Version 1 reports Y's frequency as B, version 2 one line for each axis.
+        section["ft_motion_version"] = 1 if "B" in found["M493"] else 2
+    return section | {
         "kind": "marlin",
         "steps_per_mm": per_axis("M92"),
         "planner": planner,

@@ -42,6 +42,10 @@ _WAITING = ("queued", "running")
 _IDLE = ("standby", "complete", "cancelled")
 _BUSY = ("printing", "paused")
 _STOP_S = 10.0
+_WITHOUT_STREAM = ("none", "advise")
+# Of 2026-04-27 to 2026-05-04: SHAPER_FREQ_X=0 does not switch the shaper off
+# (klippy/extras/input_shaper.py, db10e92e9 to 77d5d942e).
+_KEEPS_SHAPER = re.compile(r"v0\.13\.0-6(3[1-9]|4[01])-g")
 
 
 class Refused(Exception):
@@ -348,6 +352,16 @@ class Stillpath:
         found = await apis.query_objects({"print_stats": ["state", "filename"]}, default={})
         return dict(found.get("print_stats", {}))
 
+    async def _keeps_shaper(self) -> str:
+        """Return the version of a Klipper whose shaper stays on in compensated stretches, or ''."""
+        apis = self.server.lookup_component("klippy_apis")
+        version = str((await apis.get_klippy_info(default={})).get("software_version", ""))
+        if self._options["method"] in _WITHOUT_STREAM or not _KEEPS_SHAPER.match(version):
+            return ""
+        found = await apis.query_objects({"configfile": ["settings"]}, default={})
+        shaper = found.get("configfile", {}).get("settings", {}).get("input_shaper", {})
+        return version if shaper.get("shaper_freq_x") or shaper.get("shaper_freq_y") else ""
+
     async def _check_free(self, name: str, result: Path) -> None:
         now = await self._print_state()
         if now.get("state") in _BUSY and now.get("filename") == name:
@@ -359,6 +373,12 @@ class Stillpath:
         """Print the result if that is wanted and the printer is idle."""
         if job["held"]:
             self._tell(f"{job['result']} was not started: {job['held']}")
+        if version := await self._keeps_shaper():
+            self._tell(
+                f"do not print {job['result']} yet: Klipper {version} keeps its shaper on in "
+                "compensated stretches, on top of the compensation; update Klipper"
+            )
+            return
         if not job["print_after"]:
             return
         state = (await self._print_state()).get("state")

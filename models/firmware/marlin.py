@@ -125,6 +125,9 @@ class Marlin(FirmwareFacts):
     """None: not known. Without a shaper (M593) both frequencies are 0."""
     ft_motion: bool = False
     """FT_MOTION is built in and on (M493): it has shapers of its own, and M593 has no effect."""
+    ft_motion_version: Literal[1, 2] = 2
+    """How M493 is read; what it answers to M493 V. 2, since 2025-10: X and Y say whose C, A and I
+    follow. 1, since 2024-03, does not answer: X and Y are shapers, A and I are X's, B and J Y's."""
     board: Literal["32bit", "avr"] = "32bit"
     """An 8-bit board computes step rates in 16 bits and cannot follow a dense stream."""
     step_timer_hz: Annotated[float, Field(ge=1e5, le=1e9)] = 2e6

@@ -19,6 +19,7 @@ from pydantic_core import from_json
 from stillpath.applications.machines.checks import differences
 from stillpath.applications.machines.documents import Documents
 from stillpath.compensation.defaults import DEFAULT_METHOD
+from stillpath.gcode.firmware.klipper.versions import keeps_shaper
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
@@ -263,6 +264,7 @@ def findings(machine: Machine, asked: Asked, *, method: str = DEFAULT_METHOD) ->
         *_in_force(machine, asked),
         *(_commands(machine, asked) if streams else ()),
         *(_wrappers(asked) if streams else ()),
+        *(_kept_shaper(asked, streams=streams) if method != "none" else ()),
         *(_no_shaper(asked) if method == "advise" else ()),
     ]
     return sorted(found, key=lambda finding: not finding.unsafe)
@@ -378,6 +380,26 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
     yield Finding(place=names, text=text)
 
 
+def _kept_shaper(asked: Asked, *, streams: bool) -> Iterator[Finding]:
+    """Find a Klipper that does not switch its shaper off, nor set its frequency."""
+    shaper = asked.settings.get("input_shaper")
+    if shaper is None or not keeps_shaper(asked.software):
+        return
+    if streams and not any(shaper.get(f"shaper_freq_{axis}") for axis in "xy"):
+        return
+    does = (
+        "it stays on in compensated stretches, on top of the compensation"
+        if streams
+        else "frequencies that a file sets have no effect"
+    )
+    text = (
+        f"Klipper {asked.software} keeps the frequencies of its shaper whatever SET_INPUT_SHAPER "
+        f"says, as all do from 2026-04-27 to 2026-05-04: {does}; update Klipper, or take the "
+        "frequencies out of [input_shaper]"
+    )
+    yield Finding(place="SET_INPUT_SHAPER", printer=asked.software, unsafe=streams, text=text)
+
+
 def _no_shaper(asked: Asked) -> Iterator[Finding]:
     """Find that the shaper cannot be set."""
     if "input_shaper" not in asked.settings:
@@ -391,8 +413,13 @@ def _no_shaper(asked: Asked) -> Iterator[Finding]:
 
 def _unwrapped(asked: Asked) -> Iterable[str]:
     if asked.commands is None:
-        wrapped = {f"gcode_macro {name}" for name in ("Pause", "Resume", "Cancel_Print")}
-        return () if wrapped <= set(asked.sections) else _WRAPPED
+        # Of macros of one name the last one counts.
+        last = {name.upper(): name for name in asked.sections}
+        return [
+            name
+            for name in _WRAPPED
+            if last.get(f"GCODE_MACRO {name}") != f"gcode_macro {name.title()}"
+        ]
     known = asked.commands
     looked_for = (*_WRAPPED, "M600") if "M600" in known else _WRAPPED
     return [name for name in looked_for if not known.get(name, "").startswith(_OURS)]

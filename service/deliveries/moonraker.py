@@ -48,7 +48,7 @@ class Asked:
         `max_velocity`, `max_accel`, `square_corner_velocity` and, since 2024-03,
         `minimum_cruise_ratio`, in force now.
     commands : dict, optional
-        Known commands and their help; None: this Klipper does not tell (before 2022).
+        Known commands and their help; None: this Klipper does not tell (before 2023-12).
     pressure_advance_s : float, optional
         In force now.
     prints : bool

@@ -109,6 +109,24 @@ def test_what_is_not_built_in_is_not_there(make, capsys) -> None:
 
 
 @pytest.mark.parametrize(
+    ("lines", "on", "version"),
+    [
+        (["M493 S1 A37.00 B38.00 D0 F0.00 H0.00 P0 K0.00"], True, 1),
+        (["M493 S1 D0 H1", "M493 X C8 A37.00 F0.00 I0.10", "M493 Y C8 A38.00 I0.10"], True, 2),
+        (["M493 S0 D0 H1", "M493 X C0 A37.00 I0.10", "M493 Y C0 A38.00 I0.10"], False, 2),
+        ([], False, 2),
+    ],
+)
+def test_fixed_time_motion_of_both_versions(
+    make, capsys, lines: list[str], on: bool, version: int
+) -> None:
+    said = "".join(f"Recv: echo:  {line}\n" for line in lines)
+    assert make(M503.replace("Recv: ok", f"{said}Recv: ok"))[0] == 0
+    firmware = stored(capsys).firmware
+    assert (firmware.ft_motion, firmware.ft_motion_version) == (on, version)
+
+
+@pytest.mark.parametrize(
     ("text", "more", "words"),
     [
         ("[printer]\nkinematics: corexy\n", (), ("m503.txt", "M203", "save all of")),

@@ -339,6 +339,8 @@ CLASSES = {
     },
     "M204.2 K0.5": {"bambu": EventKind.UNKNOWN},
     "M900 K0": {"marlin": EventKind.HARMLESS},  # as it is already
+    "M495 X F10 T100": {"marlin": EventKind.HARMLESS},  # set, not begun
+    "M496": {"marlin": EventKind.HARMLESS},
     "M900 K0.05 T1": {"marlin": EventKind.HARMLESS},
     "M221 S90 T1": {"marlin": EventKind.HARMLESS},
     "M7": {"marlin": EventKind.STOP},
@@ -364,6 +366,9 @@ CLASSES = {
             "M402",
             "M425 F1",
             "M493 S1",
+            "M494 X0.05",
+            "M495 Y F10 T100 S1",
+            "M495 X S",
             "M915",
             "M1000",
             "M102 S10",

@@ -226,6 +226,20 @@ def test_classes(wary_machine: Machine) -> None:
     assert block.events.dwell_s.sum() == pytest.approx(0.2 + 0.04)
 
 
+def test_a_shaper_with_much_damping_makes_klipper_stand_longer(golden_machine: Machine) -> None:
+    """ZV: the second pulse comes half a damped period later, and the middle lies nearer to it."""
+    machine = golden_machine.model_copy(update={"pressure_advance_s": 0.0})
+    stands = {}
+    for damping in (0.05, 0.1, 0.3):
+        line = f"SET_INPUT_SHAPER SHAPER_TYPE=zv SHAPER_FREQ_X=40 DAMPING_RATIO_X={damping}\n"
+        of_host = run("SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n" + line, machine)
+        stands[damping] = float(of_host.events.dwell_s[1])
+        bent = np.sqrt(1.0 - damping**2)
+        ahead_s = 0.5 / 40.0 / bent / (1.0 + np.exp(-np.pi * damping / bent))
+        assert stands[damping] == pytest.approx(1e-3 + ahead_s, abs=1e-9)
+    assert stands[0.3] - stands[0.05] > 1.5e-3
+
+
 def test_macros_that_the_machine_declares(wary_machine: Machine) -> None:
     firmware = wary_machine.firmware.model_copy(
         update={"harmless_macros": ("_on_layer",), "stopping_macros": ("CLEAN", "M600")}

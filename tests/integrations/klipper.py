@@ -37,6 +37,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "shaper_freq_x": 57.8,
         "shaper_type_y": "ei",
         "shaper_freq_y": 45.2,
+        "damping_ratio_x": 0.1,
+        "damping_ratio_y": 0.05,
     },
 }
 _TRADITIONAL = re.compile(r"[A-Z]\d+(\.\d+)?$")
@@ -81,7 +83,7 @@ class Klipper:
     settings : dict
         What ``configfile.settings`` says of the other sections.
     shows_commands : bool
-        Whether ``printer.gcode.commands`` is there (since 2022).
+        Whether ``printer.gcode.commands`` is there (since 2023-12).
     extra : dict
         Other objects of ``printer``.
     sent : list of str
@@ -150,7 +152,10 @@ class Klipper:
     def __getitem__(self, name: str) -> Any:
         name = str(name).strip()
         objects: dict[str, Any] = {
-            "configfile": {"settings": self.settings},
+            "configfile": {
+                "settings": self.settings,
+                "config": {section: {} for section, _ in self.sections},
+            },
             "toolhead": self.toolhead,
             "pause_resume": {"is_paused": self.is_paused},
             "print_stats": {"state": self.state},
@@ -273,7 +278,7 @@ class Klipper:
         if given:
             self.sent.append(line)
         for name, value in given.items():
-            self.shaper[name.lower()] = float(value) if "FREQ" in name else value
+            self.shaper[name.lower()] = value if "TYPE" in name else float(value)
         told = (f"{name}:{value}" for name, value in self.shaper.items())
         self.told.append(" ".join(told))
 

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
 
 __all__ = [
@@ -93,10 +94,11 @@ _RESPONSES = (
     "starting",
     "stats count=%u sum=%u sumsq=%u",
 )
-# The package's kinematics/cartesian.py looks for two modules where they are not. And the host ends
-# beside the thread that still writes: here it waits until nothing more comes.
+# The package's kinematics/cartesian.py looks for two modules where they are not, and a function of
+# its library is declared as it was before. And the host ends beside the thread that still writes:
+# here it waits until nothing more comes.
 _START = """
-import os, sys, time
+import os, struct, sys, time
 import klippy.chelper, klippy.kinematics, klippy.serialhdl, klippy.stepper
 klippy.kinematics.stepper = klippy.stepper
 sys.modules["chelper"] = klippy.chelper
@@ -107,12 +109,24 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 klippy.serialhdl.SerialReader.disconnect = disconnect
-from klippy.klippy import main
-main()
+import klippy.extras.input_shaper
+import klippy.toolhead as toolhead
+from klippy.kinematics import extruder
+ffi, library = klippy.chelper.get_ffi()
+window = "input_shaper_get_step_generation_window"
+class Library:
+    def __getattr__(self, name):
+        return getattr(library, name)
+setattr(Library, window, staticmethod(
+    ffi.cast("double(*)(struct stepper_kinematics *)", getattr(library, window))))
+class Chelper:
+    get_ffi = staticmethod(lambda: (ffi, Library()))
+klippy.extras.input_shaper.chelper = Chelper
 """
-# A checkout's modules import each other by their plain names.
+# A checkout's modules import each other by their plain names. In batch mode, and only there, it
+# comes to rest wherever it has read all of a block of the file: here it waits for the next block.
 _START_CHECKOUT = """
-import os, sys, time
+import os, struct, sys, time
 sys.path.insert(0, sys.argv.pop(1))
 import serialhdl, stepper
 stepper.MAX_STEPCOMPRESS_ERROR = 1e-6
@@ -123,9 +137,42 @@ def disconnect(self):
         time.sleep(0.5)
     plain(self)
 serialhdl.SerialReader.disconnect = disconnect
+import toolhead
+from kinematics import extruder
+from extras.motion_queuing import PrinterMotionQueuing
+def flush(self, eventtime):
+    while self.last_step_gen_time < self.need_flush_time - 1.5:
+        self._advance_flush_time(0.0, self.last_step_gen_time + 0.25)
+    self.do_kick_flush_timer = True
+    return self.reactor.NEVER
+PrinterMotionQueuing._flush_handler_debug = flush
+"""
+# What it plans, as it goes into the queues that steps are made of.
+_RECORD = """
+moves = open("moves.bin", "wb", buffering=0)
+def recording(kind, number):
+    begin = kind.__init__
+    def __init__(self, *given):
+        begin(self, *given)
+        append = self.trapq_append
+        def record(trapq, *move):
+            if trapq == self.trapq:
+                moves.write(struct.pack("<14d", number, *move))
+            return append(trapq, *move)
+        self.trapq_append = record
+    kind.__init__ = __init__
+recording(toolhead.ToolHead, 0)
+recording(extruder.PrinterExtruder, 1)
+"""
+_MAIN = """
+from klippy.klippy import main
+main()
+"""
+_MAIN_CHECKOUT = """
 import klippy
 klippy.main()
 """
+_NO_SHAPER = "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400"
 _IDENTIFY = {0: "identify_response offset=%u data=%.*s", 1: "identify offset=%u count=%c"}
 
 
@@ -165,8 +212,12 @@ class Steps:
         return np.stack([np.append(0.0, p)[np.searchsorted(t, at_s, "right")] for t, p in rows])
 
 
-def printer_cfg(machine: Machine, *more: str) -> str:
-    """Write the printer.cfg of a machine, with finer steps in X and Y than any has."""
+def printer_cfg(machine: Machine, *more: str, shaper: bool = False) -> str:
+    """Write the printer.cfg of a machine, with finer steps in X and Y than any has.
+
+    `shaper`: with the machine's own [input_shaper]. By default SET_INPUT_SHAPER only empties the
+    queue, so that steps are those of the plan.
+    """
     firmware = machine.firmware
     assert firmware.kind == "klipper"
     planner, hot = firmware.planner, firmware.extruder
@@ -199,11 +250,20 @@ def printer_cfg(machine: Machine, *more: str) -> str:
         "max_extrude_cross_section: 50",
         "[heater_bed]\nheater_pin: P24\nsensor_type: EPCOS 100K B57560G104F\nsensor_pin: P25",
         "control: watermark\nmin_temp: 0\nmax_temp: 130\n[fan]\npin: P26",
-        # The package's [input_shaper] does not start; what it does to the queue is to empty it.
-        "[gcode_macro SET_INPUT_SHAPER]\ngcode:\n  M400",
+        _shaper_section(firmware.shaper) if shaper else _NO_SHAPER,
         "[pause_resume]\n[exclude_object]",
     ]
     return "\n".join([*lines, *more]) + "\n"
+
+
+def _shaper_section(stated: FirmwareShaper | None) -> str:
+    if stated is None:
+        return "[input_shaper]"
+    return (
+        f"[input_shaper]\nshaper_type_x: {stated.type_x}\nshaper_freq_x: {stated.freq_x_hz}\n"
+        f"damping_ratio_x: {stated.damping_x}\nshaper_type_y: {stated.type_y}\n"
+        f"shaper_freq_y: {stated.freq_y_hz}\ndamping_ratio_y: {stated.damping_y}"
+    )
 
 
 def klipper_with_extra(place: Path) -> Path:
@@ -234,11 +294,11 @@ def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) 
         ("klipper.dict", json.dumps(_dictionary())),
     ):
         (place / name).write_text(text, encoding="utf-8")
-    start, environment = ["-c", _START], dict(os.environ)
+    start, environment = ["-c", _START + _RECORD + _MAIN], dict(os.environ)
     if klipper is not None:
         environment["PYTHONPATH"] = str(klipper)
         if CHECKOUT is not None:
-            start = ["-c", _START_CHECKOUT, str(klipper / "klippy")]
+            start = ["-c", _START_CHECKOUT + _RECORD + _MAIN_CHECKOUT, str(klipper / "klippy")]
             config = config.replace("\nmax_stepper_error: 0.000001", "")
             config = re.sub("max_accel_to_decel: .*", "minimum_cruise_ratio: 0.5", config)
             (place / "printer.cfg").write_text(config, encoding="utf-8")

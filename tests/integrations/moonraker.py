@@ -92,6 +92,10 @@ class Server:
     ----------
     print_stats : dict
         Of the printer; empty: Klipper is away.
+    software : str
+        Klipper's version.
+    settings : dict
+        Sections of printer.cfg.
     console : list of str
     started : list of str
         Prints that were asked for.
@@ -104,6 +108,8 @@ class Server:
         self.gcodes = self.data / "gcodes"
         self.gcodes.mkdir(parents=True, exist_ok=True)
         self.print_stats: dict[str, Any] = {"state": "standby", "filename": ""}
+        self.software = "v0.13.0-300-g1"
+        self.settings: dict[str, Any] = {"input_shaper": {"shaper_freq_x": 57.8}}
         self.console: list[str] = []
         self.changes: list[dict[str, Any]] = []
         self.started: list[str] = []
@@ -192,7 +198,13 @@ class Server:
         self._handlers["job_state:state_changed"](state, before, dict(self.print_stats))
 
     async def query_objects(self, objects: dict[str, Any], default: Any) -> Any:
-        return {"print_stats": dict(self.print_stats)} if self.print_stats else default
+        if not self.print_stats:
+            return default
+        known = {"print_stats": self.print_stats, "configfile": {"settings": self.settings}}
+        return {name: dict(known[name]) for name in objects}
+
+    async def get_klippy_info(self, default: Any) -> Any:
+        return {"software_version": self.software} if self.print_stats else default
 
     async def start_print(self, filename: str) -> str:
         if self.print_stats.get("state") == "error":

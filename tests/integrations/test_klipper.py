@@ -1,4 +1,7 @@
-"""The macros for Klipper: what reaches the firmware, and in which order."""
+"""The macros for Klipper: what reaches the firmware, and in which order.
+
+On an imitation, quickly and in many orders; on Klipper's own host: `test_real_macros`.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,8 @@ gcode:
 OWN = "SET_VELOCITY_LIMIT VELOCITY=300.0 ACCEL=5000.0 SQUARE_CORNER_VELOCITY=5.0 "
 OWN_LIMITS = OWN + "MINIMUM_CRUISE_RATIO=0.5"
 OWN_SHAPER = (
-    'SET_INPUT_SHAPER SHAPER_FREQ_X=57.8 SHAPER_FREQ_Y=45.2 SHAPER_TYPE_X="mzv" SHAPER_TYPE_Y="ei"'
+    'SET_INPUT_SHAPER SHAPER_FREQ_X=57.8 SHAPER_FREQ_Y=45.2 SHAPER_TYPE_X="mzv" SHAPER_TYPE_Y="ei" '
+    "DAMPING_RATIO_X=0.1 DAMPING_RATIO_Y=0.05"
 )
 
 
@@ -64,17 +68,6 @@ def in_stretch(*files: Path | str, **more) -> Klipper:
 
 def limits(printer: Klipper) -> tuple:
     return tuple(printer.toolhead.values()), printer.shaper["shaper_freq_x"]
-
-
-def test_without_macros_of_ones_own():
-    printer = in_stretch(OURS)
-    before = limits(printer)
-    printer.run("PAUSE")
-    assert printer.sent == [OWN_LIMITS, OWN_SHAPER, "PAUSE"]
-    printer.sent.clear()
-    printer.run("RESUME VELOCITY=80")
-    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, "RESUME"]
-    assert limits(printer) == before
 
 
 def test_ones_own_macros_move_under_ones_own_limits():
@@ -139,14 +132,6 @@ def test_a_change_of_filament_in_mid_stretch(file_position: int | None):
     assert printer.sent[-1] == "G1 E-50 F1000"
     assert limits(printer)[0] == (300.0, 5000.0, 5.0, 0.5)
     printer.run("RESUME")
-    assert limits(printer) == before
-
-
-def test_a_change_of_filament_that_does_not_pause():
-    printer = in_stretch("[gcode_macro M600]\ngcode:\n  G1 E-50 F1000\n", OURS, M600)
-    before = limits(printer)
-    printer.run("M600")
-    assert printer.sent[:3] == [OWN_LIMITS, OWN_SHAPER, "G1 E-50 F1000"]
     assert limits(printer) == before
 
 
@@ -239,6 +224,29 @@ def test_check_is_content():
     assert printer.told[0].startswith("Stillpath: printer.cfg says shaper_freq_x:57.800")
     assert printer.told[-1].startswith("shaper_type_x:mzv shaper_freq_x:57.8")
     assert "restore the limits first" in printer.told[1]
+    assert limits(printer) == ((300.0, 5000.0, 5.0, 0.5), 57.8)
+
+
+def test_check_shows_whether_the_shaper_goes_off():
+    printer = Klipper(macros_of(OURS))
+    printer.run("SET_VELOCITY_LIMIT ACCEL=9000")
+    printer.run("STILLPATH_CHECK")
+    [place] = [k for k, line in enumerate(printer.told) if "does not say 0.000" in line]
+    assert "shaper_freq_x:0.0" in printer.told[place + 1]
+    assert "shaper_freq_y:0.0" in printer.told[place + 1]
+    assert printer.sent[-1] == OWN_SHAPER
+    assert limits(printer)[0][1] == 9000  # told, and left to STILLPATH_RESTORE
+    printer.sent.clear()
+    printer.state = "printing"
+    printer.run("STILLPATH_CHECK")
+    assert printer.sent == []
+
+
+def test_the_files_own_damping_does_not_outlive_a_pause():
+    printer = in_stretch(OURS)
+    printer.run("SET_INPUT_SHAPER DAMPING_RATIO_X=0.2")
+    printer.run("PAUSE")
+    assert printer.shaper["damping_ratio_x"] == 0.1
 
 
 @pytest.mark.parametrize(
@@ -249,8 +257,9 @@ def test_check_is_content():
     ],
     ids=["wrong order", "M600 left out"],
 )
-def test_check_finds_wrappers_that_are_missing(files, words: str):
-    printer = Klipper(macros_of(*files))
+@pytest.mark.parametrize("shows_commands", [True, False])
+def test_check_finds_wrappers_that_are_missing(files, words: str, shows_commands: bool):
+    printer = Klipper(macros_of(*files), shows_commands=shows_commands)
     printer.run("STILLPATH_CHECK")
     assert re.search(words, "\n".join(printer.told))
     with pytest.raises(CommandError, match="STILLPATH_CHECK"):

@@ -204,6 +204,34 @@ def test_what_may_not_be_printed_any_more(tmp_path: Path):
     assert "was not started: Moonraker was started anew" in server.console[-1]
 
 
+@pytest.mark.parametrize(
+    ("software", "settings", "method", "sound"),
+    [
+        ("v0.13.0-630-ge4c4a5b94", {"shaper_freq_x": 57.8}, "fbf", True),
+        ("v0.13.0-631-gdb10e92e9", {"shaper_freq_x": 57.8}, "fbf", False),
+        ("v0.13.0-641-g2239041df-dirty", {"shaper_freq_y": 40.0}, "fbf", False),
+        ("v0.13.0-642-g77d5d942e", {"shaper_freq_x": 57.8}, "fbf", True),
+        ("v0.13.0-634-g530cd0512", {"shaper_freq_x": 0.0, "shaper_freq_y": 0.0}, "fbf", True),
+        ("v0.13.0-634-g530cd0512", {"shaper_freq_x": 57.8}, "advise", True),
+    ],
+)
+def test_nothing_is_printed_where_the_shaper_cannot_be_switched_off(
+    tmp_path: Path, software: str, settings: dict[str, float], method: str, sound: bool
+):
+    async def scenario(server: Server, component: Any) -> None:
+        async def made(job: dict[str, Any]) -> None:
+            pass
+
+        component._compensate = made
+        server.software, server.settings = software, {"input_shaper": settings}
+        server.upload("a.gcode", PART)
+        await server.until(lambda: server.started or "do not print" in "".join(server.console))
+
+    server = with_component(tmp_path, scenario, print_after="True", method=method)
+    assert server.started == (["a.sp.gcode"] if sound else [])
+    assert sound or f"Klipper {software} keeps its shaper on" in server.console[-1]
+
+
 def test_a_file_of_ones_own_is_not_written_over(tmp_path: Path):
     async def scenario(server: Server, _: Any) -> None:
         (server.gcodes / "a.sp.gcode").write_text("mine\n")

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from stillpath.applications.proof.motor_test import borne, levels_of, motor_test
+from stillpath.models.firmware.klipper import FirmwareShaper
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file, plan_file
@@ -23,11 +24,14 @@ from tests.integrations.interrupted import (
     run,
     two_objects,
 )
-from tests.integrations.klipper_host import NO_KLIPPER, PYTHON
+from tests.integrations.klipper_host import NO_KLIPPER, PYTHON, printer_cfg, steps_of
+from tests.integrations.klipper_moves import COLUMNS, compared, of_the_package, recorded
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLIPPER)]
 
-GEAR = Path(__file__).resolve().parents[2] / "examples" / "cura_ender3_gear24.gcode"
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+GEAR = EXAMPLES / "cura_ender3_gear24.gcode"
+HEPTAGON = EXAMPLES / "ps_ender3_pauses_hept24f.gcode"
 _STILL_MM, _SHORT = 1e-5, 60
 _OFF_MM = 0.005
 
@@ -66,9 +70,58 @@ def test_the_host_moves_as_we_read_the_file_back(
     check_motion(*written, tmp_path)
 
 
-def test_a_slicers_file_moves_as_we_read_it_back(tmp_path: Path) -> None:
-    layers = GEAR.read_text().partition(";LAYER:2")[0]
-    check_motion(*write(layers, homed(load_machine("ender3")), tmp_path), tmp_path)
+FILES = {
+    "two objects": two_objects,
+    "gear": lambda: GEAR.read_text().partition(";LAYER:2")[0],
+    "heptagon": lambda: HEPTAGON.read_text().partition(";Z:0.8")[0],
+}
+
+
+@pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
+@pytest.mark.parametrize("file", FILES)
+def test_the_host_plans_what_we_read_back(name: str, file: str, tmp_path: Path) -> None:
+    """Column by column, move by move: what it appends to its queues."""
+    made, machine = write(FILES[file](), of_the_package(homed(load_machine(name))), tmp_path)
+    text = made.read_text()
+    run(text, machine, tmp_path)
+    found = compared(text, machine, recorded(tmp_path))
+    assert found.moves > 2000
+    assert found.extruding > 1000
+    assert set(found.largest) == set(COLUMNS)
+    assert max(found.largest.values()) < 1e-6
+    assert found.stand_s < 1e-6
+
+
+def test_a_file_that_the_host_did_not_get_differs(
+    written: tuple[Path, Machine], tmp_path: Path
+) -> None:
+    made, machine = written
+    text = made.read_text()
+    run(text, machine, tmp_path)
+    host = recorded(tmp_path)
+    line = next(x for x in text.split("\n")[-400::-1] if x.startswith("G1 X") and " F" in x)
+    other = f"{line.rpartition('F')[0]}F{0.5 * float(line.rpartition('F')[2]):.1f}"
+    off = compared(text.replace(line, other), machine, host).largest
+    assert off["cruise speed"] > 0.1
+    assert off["cruising"] > 1e-4
+
+
+@pytest.mark.parametrize("damping", [0.05, 0.1])
+def test_with_klippers_own_shaper(damping: float, tmp_path: Path) -> None:
+    """The file switches it off for the stream; the host stands still as long as times count."""
+    shaper = FirmwareShaper(freq_x_hz=57.8, freq_y_hz=45.2, damping_x=damping, damping_y=damping)
+    machine = homed(load_machine("ender3"))
+    firmware = machine.firmware.model_copy(update={"shaper": shaper})
+    machine = machine.model_copy(update={"firmware": firmware})
+    made, _ = write(two_objects(), machine, tmp_path)
+    text = made.read_text()
+    steps_of(text, printer_cfg(machine, shaper=True), tmp_path)
+    log = (tmp_path / "klippy.log").read_text()
+    told = [x.split()[1] for x in log.split("\n") if x.startswith("shaper_type_x:")]
+    assert told == ["shaper_freq_x:0.000", "shaper_freq_x:57.800"]
+    found = compared(text, machine, recorded(tmp_path))
+    assert max(found.largest.values()) < 1e-6
+    assert found.stand_s < 1e-6
 
 
 @pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])

@@ -122,7 +122,8 @@ def test_any_file(lines: list[str], ends: str) -> None:
 def test_every_firmwares_words_are_read_as_they_are_written() -> None:
     base = klipper()
     found = {}
-    for firmware in (Klipper(), Marlin(ft_motion=True), Marlin(), RepRapFirmware()):
+    fixed_time = [Marlin(ft_motion=True, ft_motion_version=version) for version in (1, 2)]
+    for firmware in (Klipper(), *fixed_time, Marlin(), RepRapFirmware()):
         machine = base.model_copy(update={"firmware": firmware})
         firmware_adapter = adapter(machine)
         adviser = firmware_adapter.adviser(Interpreter(machine).dialect)
@@ -141,6 +142,30 @@ def test_every_firmwares_words_are_read_as_they_are_written() -> None:
         assert now == adviser.with_accel(limits, 2345.0)
         found[firmware.kind, adviser.shapers] = True
     assert len(found) == 4
+
+
+@pytest.mark.parametrize(
+    ("version", "lines", "own"),
+    [
+        (1, [b"M493 X8 Y5 A44.4 B31.3 I0.1 J0.05"], "M493 S1 X1 Y1 A37 B38 I.2"),
+        (
+            2,
+            [b"M493 X C8 A44.4 I0.1", b"M493 Y C5 A31.3 I0.05"],
+            "M493 S1 XY C1 A37 I.2\nM493 Y A38 I.1",
+        ),
+    ],
+)
+def test_m493_of_both_versions(version: int, lines: list[bytes], own: str) -> None:
+    firmware = Marlin(ft_motion=True, ft_motion_version=version)
+    machine = klipper().model_copy(update={"firmware": firmware})
+    adviser = adapter(machine).adviser(Interpreter(machine).dialect)
+    wanted = Shaping(AxisShaper("mzv", 44.4), AxisShaper("ei", 31.3, 0.05))
+    assert list(adviser.shaper_lines(wanted)) == lines
+    found = wanted
+    for line in own.split("\n"):
+        found = adviser.read_shaper(line, found)
+    y_damping = {1: 0.05, 2: 0.1}[version]
+    assert found == Shaping(AxisShaper("zv", 37.0, 0.2), AxisShaper("zv", 38.0, y_damping))
 
 
 @pytest.mark.parametrize("kind", ["zv", "ei", "3hump_ei"])

@@ -130,7 +130,18 @@ def test_without_one_nothing_is_said(tmp_path: Path, cache: Path):
         assert not [line for line in result.warnings if "sets the firmware's" in line]
 
 
-@pytest.mark.parametrize("line", ["M493 S1 X C1 A45", "M493 X A40", "M493S2 ; S0"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "M493 S1 X C1 A45",
+        "M493 X A40",
+        "M493S2 ; S0",
+        "M493 S",
+        "M493 S1 X1 Y1 A37 B37",
+        "M493 S10 A37 B37",
+        "M493 V1",
+    ],
+)
 def test_fixed_time_motion_is_refused_with_line_and_remedy(line: str, tmp_path: Path, cache: Path):
     with pytest.raises(GcodeError, match=r"line 2: M493 .* on top of .*; take it out"):
         compensated(f"G28\n{line}\n{PART}", machine_with("marlin"), tmp_path, cache)
@@ -138,7 +149,7 @@ def test_fixed_time_motion_is_refused_with_line_and_remedy(line: str, tmp_path: 
 
 
 def test_fixed_time_motion_that_is_off_or_that_the_machine_has(tmp_path: Path, cache: Path):
-    for line in ("M493 S0", "M493"):
+    for line in ("M493 S0", "M493", "M493 V", "M495 X F20", "M496"):
         compensated(f"{line}\n{HEAD}{PART}{BEHIND}", machine_with("marlin"), tmp_path, cache)
     with pytest.raises(ModelError, match="fixed-time motion"):
         compensated(HEAD + PART, machine_with("marlin", ft_motion=True), tmp_path, cache)

@@ -27,7 +27,6 @@ _SMOOTH_S = 0.04
 _MOST_SMOOTH_S = 0.2
 _MOST_REACH_S = 1.0
 _KINDS = tuple(SHAPERS)
-_DAMPING = 0.1
 
 
 def pressure_advance(state: MachineState, command: Command) -> int:
@@ -44,12 +43,15 @@ def shaper(state: MachineState, command: Command) -> int:
     given = state.extended(command)
     before_s = _ahead_s(state)
     for axis in "XY":
-        kind, f_hz = _shaper(state, axis)
+        kind, f_hz, damping = _shaper(state, axis)
         kind = given.get(f"SHAPER_TYPE_{axis}", given.get("SHAPER_TYPE", kind)).lower()
         if f"SHAPER_FREQ_{axis}" in given:
             f_hz = _number(given[f"SHAPER_FREQ_{axis}"])
+        if f"DAMPING_RATIO_{axis}" in given:
+            damping = _number(given[f"DAMPING_RATIO_{axis}"])
         state.factors[f"shaper {axis}"] = float(_KINDS.index(kind)) if kind in _KINDS else -1.0
         state.factors[f"f_hz {axis}"] = f_hz
+        state.factors[f"damping {axis}"] = damping
     return state.event(EventKind.SHAPER, before_s + _ahead_s(state))
 
 
@@ -61,23 +63,26 @@ def _ahead_s(state: MachineState) -> float:
     return max(_LEAST_S, 0.5 * smooth_s, *(_reach_s(*_shaper(state, axis)) for axis in "XY"))
 
 
-def _shaper(state: MachineState, axis: str) -> tuple[str, float]:
-    """Return type and frequency of an axis' shaper; before the first line those of printer.cfg."""
-    if f"shaper {axis}" in state.factors:
-        kind = int(state.factors[f"shaper {axis}"])
-        return _KINDS[kind] if kind >= 0 else "", state.factors[f"f_hz {axis}"]
-    stated = state.firmware.shaper if isinstance(state.firmware, Klipper) else None
-    if stated is None:
-        return "mzv", 0.0
-    return (stated.type_x, stated.freq_x_hz) if axis == "X" else (stated.type_y, stated.freq_y_hz)
+def _shaper(state: MachineState, axis: str) -> tuple[str, float, float]:
+    """Return an axis' shaper: type, frequency, damping; before the first line printer.cfg's."""
+    known = state.factors
+    if f"shaper {axis}" in known:
+        kind = int(known[f"shaper {axis}"])
+        name = _KINDS[kind] if kind >= 0 else ""
+        return name, known[f"f_hz {axis}"], known[f"damping {axis}"]
+    s = state.firmware.shaper if isinstance(state.firmware, Klipper) else None
+    if s is None:
+        return "mzv", 0.0, 0.1
+    x = axis == "X"
+    return (s.type_x, s.freq_x_hz, s.damping_x) if x else (s.type_y, s.freq_y_hz, s.damping_y)
 
 
-def _reach_s(kind: str, f_hz: float) -> float:
+def _reach_s(kind: str, f_hz: float, damping: float) -> float:
     """Return how far a shaper looks ahead or back, whichever is more; 0: off, or not known."""
     if f_hz <= 0.0:
         return 0.0
     try:
-        weights, delays_s = shaper_pulses(kind, f_hz, _DAMPING)
+        weights, delays_s = shaper_pulses(kind, f_hz, damping)
     except ModelError:
         return 0.0
     middle_s = float(weights @ delays_s)

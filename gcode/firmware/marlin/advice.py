@@ -24,9 +24,11 @@ class MarlinAdviser:
     """See `gcode.firmware.base.Adviser`.
 
     M593 sets a ZV shaper; a build may lack it, so it is only written where the machine states a
-    shaper (`firmware.shaper` with a frequency above 0), M493 where it says `ft_motion`. Sources:
+    shaper (`firmware.shaper` with a frequency above 0), M493 where it says `ft_motion`, in the
+    words of `ft_motion_version`. Sources:
     Marlin/src/gcode/feature/input_shaping/M593.cpp and gcode/config/M200-M205.cpp, 2.1.2 (2023-01);
-    gcode/feature/ft_motion/M493.cpp, bugfix-2.1.x (2025); module/settings.cpp for M500.
+    gcode/feature/ft_motion/M493.cpp, bugfix-2.1.x: version 1 of 2024-03 (#26848), version 2 of
+    2025-10 (#28127), as of 2026-08; module/settings.cpp for M500.
     """
 
     same_for_both = False
@@ -47,6 +49,7 @@ class MarlinAdviser:
         elif firmware.variant == "2.0":
             self.stated = OFF
         self._fixed_time = firmware.ft_motion
+        self._version = firmware.ft_motion_version
         self.shaper_word = "M493" if self._fixed_time else "M593"
         if self._fixed_time:
             # What M593 states is not what fixed-time motion does.
@@ -81,6 +84,11 @@ class MarlinAdviser:
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set both shapers."""
+        if self._fixed_time and self._version == 1:
+            x, y = shaping.x, shaping.y
+            modes = f"M493 X{_COMPENSATORS[x.type]} Y{_COMPENSATORS[y.type]}"
+            hertz = f" A{x.f_hz:.6g} B{y.f_hz:.6g} I{x.damping:.6g} J{y.damping:.6g}"
+            return ((modes + hertz).encode(),)
         if self._fixed_time:
             return tuple(
                 f"M493 {axis} C{_COMPENSATORS[s.type]} A{s.f_hz:.6g} I{s.damping:.6g}".encode()
@@ -95,6 +103,9 @@ class MarlinAdviser:
         """Return what an M593 or M493 leaves in force."""
         for command in split_line(text, self._dialect):
             if command.name != self.shaper_word:
+                continue
+            if self._fixed_time and self._version == 1:
+                now = _read_version_1(command, now)
                 continue
             both = not command.words.keys() & {"X", "Y"}
             hertz, zeta = ("A", "I") if self._fixed_time else ("F", "D")
@@ -112,3 +123,18 @@ class MarlinAdviser:
     def _type(self, command: Command, now: str) -> str:
         mode = command.words.get("C", "")
         return _MODELLED.get(mode, f"M493 C{mode}") if mode else now
+
+
+def _read_version_1(command: Command, now: Shaping) -> Shaping:
+    """Return what an M493 of version 1 leaves in force: each axis has letters of its own."""
+    axes = []
+    for s, (axis, hertz, zeta) in ((now.x, "XAI"), (now.y, "YBJ")):
+        mode, f_hz, damping = (command.words.get(letter, "") for letter in (axis, hertz, zeta))
+        axes.append(
+            AxisShaper(
+                _MODELLED.get(mode, f"M493 {axis}{mode}") if mode else s.type,
+                float(f_hz) if f_hz else s.f_hz,
+                float(damping) if damping else s.damping,
+            )
+        )
+    return Shaping(*axes)

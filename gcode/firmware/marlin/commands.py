@@ -1,7 +1,8 @@
 """Marlin's commands that Python carries out.
 
 Sources: Marlin/src/gcode: config/M200-M205.cpp, config/M220.cpp, config/M221.cpp, geometry/G92.cpp,
-feature/advance/M900.cpp; which versions, and what was not read, stands in docs/dialects.md.
+feature/advance/M900.cpp, feature/ft_motion/M495.cpp; which versions, and what was not read, stands
+in docs/dialects.md.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ __all__ = [
     "park_tool",
     "reset_limits",
     "reset_origin",
+    "resonance_test",
     "retract_settings",
     "speed_factor",
     "unheeded",
@@ -218,6 +220,18 @@ def end_motion_mode(state: MachineState, _command: Command) -> int:
 def park_tool(state: MachineState, _command: Command) -> int:
     """P0 of a Prusa with a tool changer: no tool is in use, and the next T fetches one."""
     state.tool_known = False
+    return state.event(EventKind.UNKNOWN)
+
+
+def resonance_test(state: MachineState, command: Command) -> int:
+    """M495: with S an axis vibrates by itself, else the test is set or told (M496 ends it).
+
+    Source: Marlin/src/gcode/feature/ft_motion/M495.cpp of 2025-11 (#28158), M495_M496.cpp, 2026.
+    """
+    if "S" not in command.words:
+        return state.event(EventKind.HARMLESS)
+    state.warn("M495 S: a resonance test moves an axis, also while the next lines run")
+    state.forget(origin=False)
     return state.event(EventKind.UNKNOWN)
 
 

@@ -136,9 +136,11 @@ STEPS: dict[str, Word] = {
     "M593": EventKind.SHAPER,
     # Fixed-time motion has a planner and shapers of its own.
     **words(
-        "M493 M494 M495 M496",
+        "M493 M494",
         commands.unheeded(EventKind.UNKNOWN, "fixed-time motion is not modelled"),
     ),
+    "M495": commands.resonance_test,
+    "M496": EventKind.HARMLESS,
 }
 
 

@@ -18,15 +18,17 @@ _NOTES = (
     "stopped in there leaves them in force: send M501; see Stillpath's docs/safety.md.",
 )
 
-_FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*[A-Z]", re.IGNORECASE)
-_FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0*(?![\d.])", re.IGNORECASE)
+# M493 V asks for the version, and S without a number is S1.
+_FIXED_TIME = re.compile(rb"\s*(?:N\d+\s*)?M493(?!\d)\s*(?!V\s*(?:[;*]|$))[A-Z]", re.IGNORECASE)
+_FIXED_TIME_OFF = re.compile(rb"[^;]*\bM493(?!\d)[^;]*S0+(?![\d.])", re.IGNORECASE)
 
 
 class MarlinStreamCommands:
     """Lines that Marlin understands; see `gcode.firmware.base.StreamCommands`.
 
     Sources: Marlin/src/gcode/config/M200-M205.cpp, gcode/feature/input_shaping/M593.cpp,
-    gcode/geometry/G92.cpp, feature/advance/M900.cpp and parser.cpp, release 2.1.2 (2023-01).
+    gcode/geometry/G92.cpp, feature/advance/M900.cpp and parser.cpp, release 2.1.2 (2023-01);
+    feature/ft_motion/M493.cpp, bugfix-2.1.x, 2026-08.
     """
 
     stand_still = b"M400 ; stand still\n"

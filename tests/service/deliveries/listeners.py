@@ -111,6 +111,7 @@ def moonraker(
     can_print: bool = True,
     status: dict[str, Any] | None = None,
     state: str = "ready",
+    software: str = "v0.13.0-300-g1",
 ) -> Iterator[Listener]:
     """Serve as Moonraker does.
 
@@ -124,6 +125,8 @@ def moonraker(
         Objects of the printer, read anew for each request; by default none is there.
     state : str
         Of Klipper; ``away``: it is not connected.
+    software : str
+        Klipper's version.
     """
 
     def answer(seen: Seen) -> Answer:
@@ -135,7 +138,7 @@ def moonraker(
                 return _told(503, {"error": {"code": 503, "message": "Klippy Host not connected"}})
             if place == "/printer/info":
                 said = {"state": state, "state_message": f"Printer is {state}"}
-                return _told(200, {"result": said | {"software_version": "v0.13.0-300-g1"}})
+                return _told(200, {"result": said | {"software_version": software}})
             if place == "/printer/objects/query":
                 found = _queried(status, query)
                 return _told(200, {"result": {"eventtime": 578243.5, "status": found}})

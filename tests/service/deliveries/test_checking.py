@@ -115,6 +115,12 @@ def _old_klipper(status: dict[str, Any]) -> None:
     del status["gcode"]
 
 
+def _old_klipper_in_wrong_order(status: dict[str, Any]) -> None:
+    _old_klipper(status)
+    macros = status["configfile"]["config"]
+    macros["gcode_macro PAUSE"] = macros.pop("gcode_macro PAUSE")
+
+
 def _travel(status: dict[str, Any]) -> None:
     settings_of(status)["stepper_x"]["position_max"] -= 10.0
 
@@ -136,7 +142,8 @@ def _travel(status: dict[str, Any]) -> None:
         (_own_shaper_macro, "SET_INPUT_SHAPER", "on top of", False),
         (_not_wrapped, "PAUSE", "include stillpath.cfg", False),
         (_m600, "M600", "include stillpath-m600.cfg", False),
-        (_old_klipper, "PAUSE, RESUME, CANCEL_PRINT", "include stillpath.cfg", False),
+        (_old_klipper, "CANCEL_PRINT", "include stillpath.cfg", False),
+        (_old_klipper_in_wrong_order, "PAUSE, CANCEL_PRINT", "behind your own", False),
         (_travel, "[stepper_x] position_max", "travel.x.max_mm", False),
     ],
 )
@@ -147,6 +154,40 @@ def test_what_differs_is_found(tmp_path: Path, change, place: str, words: str, u
     assert place in found, list(found)
     assert words in found[place].text
     assert found[place].unsafe is unsafe
+
+
+@pytest.mark.parametrize(
+    ("software", "kept"),
+    [
+        ("v0.13.0-630-ge4c4a5b94", False),
+        ("v0.13.0-631-gdb10e92e9", True),
+        ("v0.13.0-641-g2239041df-dirty", True),
+        ("v0.13.0-642-g77d5d942e", False),
+        ("v0.14.0-635-g0123456", False),
+        ("?", False),
+    ],
+)
+def test_a_klipper_that_cannot_switch_its_shaper_off(tmp_path: Path, software: str, kept: bool):
+    status = status_of(MACHINE)
+    settings_of(status)["input_shaper"] = {"shaper_freq_x": 0.0, "shaper_freq_y": 41.0}
+
+    def found(method: str) -> dict[str, Any]:
+        with moonraker(status=status, software=software) as server:
+            checker = Checker(DocumentFolder(tmp_path))
+            check = checker.check(printer_at(server), MACHINE, method=method, accept=True)
+        return {each.place: each for each in check.findings}
+
+    finding = found("fbf").get("SET_INPUT_SHAPER")
+    assert (finding is not None) is kept
+    if finding is not None:
+        assert finding.unsafe
+        assert re.search(rf"{software} .* stays on .*; update Klipper", finding.text)
+        advised = found("advise")["SET_INPUT_SHAPER"]
+        assert not advised.unsafe
+        assert "have no effect" in advised.text
+    assert "SET_INPUT_SHAPER" not in found("none")
+    settings_of(status)["input_shaper"]["shaper_freq_y"] = 0.0
+    assert "SET_INPUT_SHAPER" not in found("fbf")
 
 
 def test_limits_of_a_print_under_way_are_its_own(tmp_path: Path):

@@ -24,7 +24,11 @@ from .motors import Motor, queue_of
 KINEMATICS = {"cartesian": "CartKinematics", "corexy": "CoreXYKinematics"}
 ASIDE = ("TEST_RESONANCES", "SHAPER_CALIBRATE", "SET_INPUT_SHAPER", "FORCE_MOVE", "STEPPER_BUZZ")
 """Commands during which the motors follow Klipper's plan itself."""
-SHAPER = "input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
+# Klipper of those days does not obey (v0.13.0-631 to -641).
+SHAPER = (
+    "input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
+    " (update a Klipper of 2026-04-27 to 2026-05-04, or take the frequencies out of printer.cfg)"
+)
 LIMIT_TOLERANCE = 0.01
 MOST_LOAD, LOAD_S = 0.5, 5.0
 
