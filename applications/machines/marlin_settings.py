@@ -158,7 +158,7 @@ def machine_from_m503(
         machine = Machine.model_validate(document)
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
-    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
+    return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
 def with_m503(machine: Machine, text: str, file: str) -> Machine:
