@@ -24,6 +24,7 @@ __all__ = [
     "machine_from_config",
     "not_followed",
     "typed_in",
+    "with_firmware",
 ]
 
 _DEFAULT_HZ = 50.0
@@ -253,6 +254,24 @@ def _borne(allowed: AxisAllowance) -> dict[str, float]:
         "accel_mm_s2": _ACCEL_ROOM * allowed.accel_mm_s2,
         "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
     }
+
+
+def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
+    """Return a machine with another firmware section.
+
+    What the motors bear is derived anew where it was derived, and stays where somebody said it.
+
+    Raises
+    ------
+    ValidationError
+        If the section, or the machine with it, is none.
+    """
+    document = {**machine.model_dump(mode="json"), "firmware": section}
+    derived = machine.command == derived_envelope(machine)
+    if derived:
+        del document["command"]
+    changed = Machine.model_validate(document)
+    return changed.model_copy(update={"command": derived_envelope(changed)}) if derived else changed
 
 
 def envelope_warnings(machine: Machine) -> list[str]:
