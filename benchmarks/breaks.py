@@ -2,8 +2,8 @@
 
 For each file, machine and firmware the written file is read back with its own limits. At some
 hundred of its stream's lines the motion breaks off: the firmware brakes to a stand by its own
-rules, and goes on from there. The table gives the largest change of velocity of X and Y within a
-ms around all breaks, at some speed factors (M220), beside what the machine says its motors bear;
+rules, and goes on from there. The table gives the largest change of a motor's speed within a ms
+around all breaks, at some speed factors (M220), beside what the machine says its motors bear;
 and the report's contour error of one model (a prediction), print time, segments a second and put
 back pieces, for comparison with streams that ran under other limits.
 
@@ -52,7 +52,10 @@ _AROUND = 60
 
 
 def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
-    """Largest change of velocity within a ms when moves go from rest to rest, mm/s."""
+    """Largest change of a motor's speed within a ms when moves go from rest to rest, mm/s.
+
+    Of an axis that bears more, the same share of what it bears.
+    """
     phases = plan_moves(moves, limits, machine)
     if not len(phases):
         return 0.0
@@ -66,7 +69,12 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     place, _ = sample_phases(phases, (begin_s, _SAMPLE_S, count))
     velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
     change = velocity[:, _REACH:] - velocity[:, :-_REACH]
-    return float(np.max(np.hypot(*change), initial=0.0))
+    if machine.kinematics == "corexy":
+        change = np.stack([change[0] + change[1], change[0] - change[1]])
+    least = machine.command.speed_step_mm_s
+    for row, axis in zip(change, ("x", "y"), strict=True):
+        row *= least / machine.command.of(axis).speed_step_mm_s
+    return float(np.max(np.abs(change), initial=0.0))
 
 
 def worst_steps(written: Path, machine: Machine, breaks: int) -> list[float]:

@@ -39,7 +39,7 @@ FILES = (
     "ps_mk3s_xyzcube",
     "real_cura4.10_objs",
     "cura_prusa_mk3_reltiveE_tris24",
-    "ps_ender3_gear24_absE",
+    "real_kisslicer2.0.6",
     "arcwelder_mk3s_xyzcube",
     "real_superslicer2.3_arcwelder",
 )

@@ -126,7 +126,7 @@ class PreviewFbf:
         window, update = round(window_s / dt_s), round(update_s / dt_s)
         self._dt_s = dt_s
         self.along = along
-        self._limits = machine.command
+        self._limits = [machine.command.of("x"), machine.command.of("y")]
         self._accel_share = 1.0
         self._travel = [machine.travel[axis] for axis in ("x", "y")]
         self._last: list[AxisCommand] = []
@@ -205,9 +205,9 @@ class PreviewFbf:
         if n > 2:
             largest = max(one.mean_square for one in asked)
             rms_limit = RMS_RATIO * np.sqrt(largest) / self._dt_s**2
-        accel_limit = self._accel_limit_mm_s2(asked)
+        accel_limits = self._accel_limits_mm_s2(asked)
         tasks = [
-            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limit), rms_limit)
+            AxisTask(path, weight, stops, self._bounds(i, asked[i], accel_limits[i]), rms_limit)
             for i, path in enumerate(y_d_mm)
         ]
         found = [self._ladder(axis, task) for axis, task in zip(self._axes, tasks, strict=True)]
@@ -221,19 +221,20 @@ class PreviewFbf:
         return np.stack([command.position_mm for command in self._last])
 
     def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
-        """Acceleration that the command of a path (2, n) may ask for."""
-        return self._accel_limit_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm])
+        """Acceleration that the command of a path (2, n) may ask for, of the axis that may more."""
+        return max(self._accel_limits_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm]))
 
-    def _accel_limit_mm_s2(self, asked: list[Extremes]) -> float:
-        ceiling = self._accel_share * self._limits.accel_mm_s2
+    def _accel_limits_mm_s2(self, asked: list[Extremes]) -> tuple[float, float]:
         path_accel = max(one.accel for one in asked) / self._dt_s**2
-        return min(ceiling, max(ACCEL_RATIO * path_accel, 0.25 * ceiling))
+        x, y = (self._accel_share * limits.accel_mm_s2 for limits in self._limits)
+        wanted = ACCEL_RATIO * path_accel
+        return min(x, max(wanted, 0.25 * x)), min(y, max(wanted, 0.25 * y))
 
     def _bounds(self, i: int, asked: Extremes, accel_limit: float) -> Bounds:
         travel, dt = self._travel[i], self._dt_s
         return Bounds(
             accel=accel_limit * dt**2,
-            speed=self._limits.velocity_mm_s * dt,
+            speed=self._limits[i].velocity_mm_s * dt,
             # The path itself may touch the ends of the travel, or be judged elsewhere.
             low_mm=min(travel.min_mm, asked.low_mm),
             high_mm=max(travel.max_mm, asked.high_mm),
@@ -283,7 +284,7 @@ class PreviewFbf:
             rung, careful, rounds = rung + 1, frozenset(), 0
         raise DesignError(
             f"axis {axis.name}: even the gentlest design asks for {asked}; allowed are "
-            f"{bounds.accel / dt**2:.0f} mm/s2, {self._limits.velocity_mm_s:.0f} mm/s and "
+            f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
             f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the machine)"
         )
 

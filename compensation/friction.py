@@ -77,15 +77,10 @@ class FrictionCompensator(Overlay):
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
         wanted = self._inner.compensate(y_d_mm, extruding, rests)
-        own = self._peaks(wanted)
-        # What the inner compensator asks for is its own business; friction must not add to it.
-        speed = max(own[0], self._limits.velocity_mm_s)
-        accel = max(own[1], self._limits.accel_mm_s2)
         for rounded_s in _ROUNDED_S:
             u = against_friction(wanted, self._held_mm, rests, self._dt_s, rounded_s)
             u = self._within_travel(wanted, u)
-            needs = self._peaks(u)
-            if needs[0] <= speed and needs[1] <= accel:
+            if self._kept(u, wanted):
                 return u
         return wanted
 

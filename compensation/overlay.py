@@ -31,7 +31,10 @@ class Overlay:
 
     def __init__(self, inner: Compensator, machine: Machine, dt_s: float) -> None:
         self.lead_s, self.tail_s = inner.lead_s, inner.tail_s
-        self._inner, self._dt_s, self._limits = inner, dt_s, machine.command
+        self._inner, self._dt_s = inner, dt_s
+        limits = [machine.command.of("x"), machine.command.of("y")]
+        self._speed_mm_s = np.array([one.velocity_mm_s for one in limits])
+        self._accel_mm_s2 = np.array([one.accel_mm_s2 for one in limits])
 
     def reset(self, position_mm: Array) -> None:
         """See `compensation.base.Compensator.reset`."""
@@ -53,7 +56,17 @@ class Overlay:
         """See `compensation.base.Compensator.ease`."""
         return self._inner.ease(accel_share)
 
-    def _peaks(self, u: Array) -> tuple[float, float]:
-        """Largest speed and acceleration of an axis."""
-        speed = float(np.abs(np.diff(u)).max(initial=0.0)) / self._dt_s
-        return speed, float(np.abs(np.diff(u, 2)).max(initial=0.0)) / self._dt_s**2
+    def _kept(self, u: Array, wanted: Array) -> bool:
+        """Tell whether a command keeps each axis' limits, or asks for no more than `wanted`.
+
+        What the inner compensator asks for is its own business; what is laid over it must not add
+        to that.
+        """
+        for order, limits in ((1, self._speed_mm_s), (2, self._accel_mm_s2)):
+            asked, own = (
+                np.abs(np.diff(rows, order)).max(axis=1, initial=0.0) / self._dt_s**order
+                for rows in (u, wanted)
+            )
+            if np.any(asked > np.maximum(own.max(), limits)):
+                return False
+        return True

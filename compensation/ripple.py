@@ -190,7 +190,7 @@ class RippleCompensator(Overlay):
             for (axis, spec), table in zip(plants, self._ripple.outputs, strict=True)
         ]
         self._blend = max(2, round(_BLEND_S / dt_s))
-        self.budget_mm_s2 = machine.command.accel_mm_s2
+        self._least_mm_s2 = self.budget_mm_s2 = machine.command.accel_mm_s2
         """Of the last piece, for the acceleration of a wave; 0: no room, the ripple stays."""
 
     def compensate(
@@ -198,23 +198,18 @@ class RippleCompensator(Overlay):
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
         wanted = self._inner.compensate(y_d_mm, extruding, rests)
-        speed, accel = self._peaks(wanted)
-        # What the inner compensator asks for is its own business; ripple must not add to it.
-        speed = max(speed, self._limits.velocity_mm_s)
-        accel = max(accel, self._limits.accel_mm_s2)
         for step in _STEPS:
-            self.budget_mm_s2 = step * self._limits.accel_mm_s2
+            self.budget_mm_s2 = step * self._least_mm_s2
             u = self._undone(wanted, y_d_mm)
             u = wanted + stand_still(u - wanted, np.zeros_like(u), rests, self._blend)
-            needs = self._peaks(u)
-            if needs[0] <= speed and needs[1] <= accel:
+            if self._kept(u, wanted):
                 return u
         self.budget_mm_s2 = 0.0
         return wanted
 
     def _undone(self, wanted: Array, y_d: Array) -> Array:
         aim = wanted.copy()
-        room = self.budget_mm_s2 / self._limits.accel_mm_s2
+        room = self.budget_mm_s2 / self._least_mm_s2
         fir = _lowpass(_CUTOFF * math.sqrt(room))
         for row, output in enumerate(self._outputs):
             if output is not None:

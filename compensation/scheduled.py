@@ -155,11 +155,8 @@ class ScheduledCompensator:
             then = machine_at(self._machine, point)
             if self._grid.nodes > 1:
                 limits = then.command
-                room = {
-                    "velocity_mm_s": _ROOM * limits.velocity_mm_s,
-                    "accel_mm_s2": _ROOM * limits.accel_mm_s2,
-                }
-                then = then.model_copy(update={"command": limits.model_copy(update=room)})
+                room = limits.scaled(velocity=_ROOM, accel=_ROOM)
+                then = then.model_copy(update={"command": room})
             self._made[point] = self._make(then)
             self._made[point].ease(self._share)
         return self._made[point]
@@ -179,18 +176,19 @@ class ScheduledCompensator:
 
     def _check(self, command: Array, y_d_mm: Array) -> None:
         """Raise unless the blend keeps the limits, or the path itself is beyond them."""
-        limits, dt = self._machine.command, self._dt_s
-        for what, limit, order in (
-            ("mm/s", limits.velocity_mm_s, 1),
-            ("mm/s2", limits.accel_mm_s2, 2),
+        dt, machine = self._dt_s, self._machine
+        axes = [machine.command.of("x"), machine.command.of("y")]
+        for what, limits, order in (
+            ("mm/s", np.array([one.velocity_mm_s for one in axes]), 1),
+            ("mm/s2", np.array([one.accel_mm_s2 for one in axes]), 2),
         ):
             asked, path = (
                 np.max(np.abs(np.diff(rows, order)), axis=1, initial=0.0) / dt**order
                 for rows in (command, y_d_mm)
             )
-            for i in np.flatnonzero(asked > np.maximum(limit, path) * (1.0 + 1e-9)):
+            for i in np.flatnonzero(asked > np.maximum(limits, path) * (1.0 + 1e-9)):
                 raise DesignError(
                     f"axis {'xy'[i]}: blended over the position, the command asks for "
-                    f"{asked[i]:.0f} {what}; allowed are {limit:.0f} {what} (command limits of the "
-                    "machine): print more slowly, or measure the plants at nearer positions"
+                    f"{asked[i]:.0f} {what}; allowed are {limits[i]:.0f} {what} (command limits of "
+                    "the machine): print more slowly, or measure the plants at nearer positions"
                 )

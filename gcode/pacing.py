@@ -100,13 +100,7 @@ def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
 
 def top_limits(machine: Machine) -> CommandLimits:
     """Return what no plan is raised above."""
-    command = machine.command
-    return command.model_copy(
-        update={
-            "accel_mm_s2": _ACCEL_ROOM * command.accel_mm_s2,
-            "velocity_mm_s": _SPEED_ROOM * command.velocity_mm_s,
-        }
-    )
+    return machine.command.every_way.scaled(velocity=_SPEED_ROOM, accel=_ACCEL_ROOM)
 
 
 def paced(piece: Piece, classes: Ints, paces: Mapping[int, Pace], machine: Machine) -> Piece:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Literal
+import math
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -22,10 +23,15 @@ from stillpath.models.ripple import AxisRipple, MachineRipple, RippleAxis
 from stillpath.models.schedule import AxisSchedule
 
 __all__ = [
+    "AxisLimits",
     "AxisTravel",
     "CommandLimits",
     "Machine",
+    "MotorLimits",
 ]
+
+
+_Part = TypeVar("_Part", bound=Document)
 
 
 class AxisTravel(Document):
@@ -41,17 +47,84 @@ class AxisTravel(Document):
         return self
 
 
+class AxisLimits(Document):
+    """What an axis bears, where it is more than `CommandLimits` says of both; None: the same."""
+
+    velocity_mm_s: Positive | None = None
+    accel_mm_s2: Positive | None = None
+    speed_step_mm_s: Positive | None = None
+
+
+class MotorLimits(Document):
+    """What each motor of a CoreXY bears of x + y, or x - y; None: as much as both axes ask."""
+
+    velocity_mm_s: Positive | None = None
+    accel_mm_s2: Positive | None = None
+
+
 class CommandLimits(Document):
     """What the motors of X and Y bear: no command asks for more, nor does a stream that breaks off.
 
     The written stream runs under these limits, so that the firmware itself keeps them whatever
     happens: braking for a pause, going on behind it, at any line.
+
+    The plain numbers hold for X as well as for Y. Along one axis more may be borne (`axes`, where
+    each axis has a motor); where both motors move either axis (CoreXY), X and Y together may be
+    held to less than their sum (`motors`).
     """
 
     velocity_mm_s: Positive = 500.0
     accel_mm_s2: Positive = 20_000.0
     speed_step_mm_s: Positive = 45.0
     """Largest step of a motor's speed within a ms, from one straight segment to the next."""
+    axes: dict[Literal["x", "y"], AxisLimits] = Field(default_factory=dict)
+    motors: MotorLimits | None = None
+
+    @model_validator(mode="after")
+    def _not_less(self) -> CommandLimits:
+        parts = [(f"axes.{axis}", more) for axis, more in self.axes.items()]
+        for place, more in [*parts, ("motors", self.motors)]:
+            for name, value in {} if more is None else more:
+                if value is not None and value < getattr(self, name):
+                    raise ValueError(
+                        f"{place}.{name} is {value:g}, below {name} {getattr(self, name):g}, which "
+                        f"holds for every axis and motor: lower {name} to {value:g}, and state "
+                        "what bears more"
+                    )
+        return self
+
+    def of(self, axis: Literal["x", "y"]) -> CommandLimits:
+        """Return what one axis bears by itself."""
+        more = self.axes.get(axis)
+        if more is None:
+            return self
+        stated = {name: value for name, value in more if value is not None}
+        return self.model_copy(update={**stated, "axes": {}})
+
+    @property
+    def every_way(self) -> CommandLimits:
+        """What is borne in every direction, by a firmware that has one limit for all of them.
+
+        A motor of a CoreXY sees up to sqrt(2) times what the head does.
+        """
+        if self.motors is None or self.motors.accel_mm_s2 is None:
+            return self
+        accel = min(self.accel_mm_s2, self.motors.accel_mm_s2 / math.sqrt(2.0))
+        return self.model_copy(update={"accel_mm_s2": accel})
+
+    def scaled(self, *, velocity: float, accel: float) -> CommandLimits:
+        """Return the limits with speeds and accelerations multiplied."""
+        ratios = {"velocity_mm_s": velocity, "accel_mm_s2": accel}
+        axes = {axis: _multiplied(more, ratios) for axis, more in self.axes.items()}
+        motors = None if self.motors is None else _multiplied(self.motors, ratios)
+        return _multiplied(self, ratios).model_copy(update={"axes": axes, "motors": motors})
+
+
+def _multiplied(document: _Part, ratios: dict[str, float]) -> _Part:
+    given = {name: getattr(document, name) for name in ratios}
+    return document.model_copy(
+        update={name: ratios[name] * value for name, value in given.items() if value is not None}
+    )
 
 
 class Machine(Document):
@@ -95,6 +168,7 @@ class Machine(Document):
         for axis in ("x", "y"):
             if axis not in self.axes:
                 raise ValueError(f"plant of axis {axis} is missing")
+        self._check_command()
         self._check_schedules()
         MachineRipple(self.kinematics, self.ripple)
         return self
@@ -107,6 +181,9 @@ class Machine(Document):
             if not content[added]:
                 # Machines from before there were such fields keep their revision.
                 del content[added]
+        for added in ("axes", "motors"):
+            if not content["command"][added]:
+                del content["command"][added]
         for axis in content["axes"].values():
             if axis["friction_mm"] is None:
                 del axis["friction_mm"]
@@ -130,6 +207,26 @@ class Machine(Document):
         """Return the machine with guides that do not rub."""
         axes = {k: v.model_copy(update={"friction_mm": None}) for k, v in self.axes.items()}
         return self.model_copy(update={"axes": axes})
+
+    def _check_command(self) -> None:
+        """See that limits by axis or motor are of a kind that kinematics and firmware know."""
+        command = self.command
+        if command.axes and self.kinematics == "corexy":
+            raise ModelError(
+                "command.axes: both motors of a corexy machine move X and Y; say what a motor "
+                "bears in command.motors"
+            )
+        if command.motors is not None and self.kinematics != "corexy":
+            raise ModelError(
+                "command.motors: on a cartesian machine each axis has a motor; say what an axis "
+                "bears in command.axes"
+            )
+        if command.axes and self.firmware.kind == "klipper":
+            raise ModelError(
+                "command.axes: Klipper has one acceleration and one corner speed for X and Y, so "
+                "a stream that breaks off asks either axis for them: put what the weaker one bears "
+                "at command.accel_mm_s2, velocity_mm_s and speed_step_mm_s, and leave axes out"
+            )
 
     def _check_schedules(self) -> None:
         densities = set()

@@ -56,6 +56,7 @@ _SOFT_S = (2e-3, 4e-3, 8e-3)
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Filament is smoothed over so many times its mm per mm, before and after, and no further."""
+_ROUNDED = 1.0 + 1e-9
 _EXTRUDING_EXCESS_MM = 15e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
@@ -139,6 +140,10 @@ class PieceCompensator:
         self._step_mm = firmware.step_mm
         self._follow_mm = follow_tolerance_mm(firmware, options.tolerance_um)
         self._filter = _error_filter(machine)
+        command = machine.command
+        steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
+        # An axis that bears more is looked at as if it went less far.
+        self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
         self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
 
@@ -218,6 +223,7 @@ class PieceCompensator:
             _retract_along(command, timeline, phases)
             _feed_evenly(command, extruding)
             self._check_travel(command[:2], timeline.row, piece)
+            self._check_motors(command[:2])
             step_mm, bend_mm = peaks(command)
             segments, encoded = self._fit(piece, timeline, command, bend_mm)
             change = np.max(np.abs(encoded.rest_s - rest_s)[resting], initial=0.0)
@@ -285,12 +291,30 @@ class PieceCompensator:
             phases.start_mm_s,
             phases.cruise_mm_s,
             phases.accel_mm_s2,
-            phases.direction,
+            phases.direction * self._of_a_step,
             max(self._step_mm[:2]),
             # Ramps are parts of a step there, and no motor can tell.
             max(self._step_mm) > 0.0,
             self._machine.kinematics == "corexy",
         )
+
+    def _check_motors(self, command_mm: NDArray[np.float64]) -> None:
+        """See that X and Y (2, n) together ask no motor of a CoreXY for more than it bears."""
+        motors = self._machine.command.motors
+        if motors is None:
+            return
+        x, y = command_mm
+        for order, unit, limit in (
+            (1, "mm/s", motors.velocity_mm_s),
+            (2, "mm/s2", motors.accel_mm_s2),
+        ):
+            changes = np.diff([x + y, x - y], order)
+            asked = float(np.abs(changes).max(initial=0.0)) / DT_S**order
+            if limit is not None and asked > _ROUNDED * limit:
+                raise _Sudden(
+                    f"X and Y together ask a motor for {asked:.0f} {unit}; the machine allows "
+                    f"{limit:.0f} {unit} (command.motors)"
+                )
 
     def _check_travel(
         self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece

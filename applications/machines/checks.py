@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from typing import Any
 
@@ -9,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.applications.machines.klipper_config import Fact, PrinterConfig, facts
 from stillpath.models.errors import ModelError
-from stillpath.models.firmware.common import FirmwareFacts
-from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.firmware.common import AxisAllowance
+from stillpath.models.machine import AxisLimits, CommandLimits, Machine, MotorLimits
 from stillpath.models.store import explain
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "machine_from_config",
     "not_followed",
     "typed_in",
+    "with_firmware",
 ]
 
 _DEFAULT_HZ = 50.0
@@ -173,6 +175,7 @@ def machine_from_config(
             for axis, given in zip("xy", f_hz, strict=True)
         },
     }
+    _refuse_limits_by_axis(config)
     for fact in facts(config):
         _put(document, fact)
     try:
@@ -180,7 +183,24 @@ def machine_from_config(
     except ValidationError as error:
         hint = "".join(f"; {line}" for line in not_followed(config))
         raise ModelError(f"{config.name}: {explain(error)}{hint}") from None
-    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
+    return machine.model_copy(update={"command": derived_envelope(machine)})
+
+
+def _refuse_limits_by_axis(config: PrinterConfig) -> None:
+    """Refuse a fork's kinematics whose limits by axis no stream may raise (Kalico, 2026)."""
+    kinematics = config.text("printer", "kinematics") or ""
+    plain = kinematics.removeprefix("limited_")
+    if plain == kinematics:
+        return
+    names = ("max_accel", "max_x_accel", "max_y_accel")
+    stated = [config.number("printer", name) for name in names if config.text("printer", name)]
+    least = f"max_accel: {min(stated):g}" if stated else "the lower of both axes at max_accel"
+    raise ModelError(
+        f"{config.name}: [printer] kinematics {kinematics} holds X and Y to max_x_accel and "
+        "max_y_accel whatever a file sets, so a stream would come late. Put kinematics: "
+        f"{plain} and {least} there, without max_x_accel and max_y_accel, or use simulate and "
+        "advise with a copy that says so"
+    )
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
@@ -204,18 +224,54 @@ def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
     }
 
 
-def derived_envelope(firmware: FirmwareFacts) -> CommandLimits:
+def derived_envelope(machine: Machine) -> CommandLimits:
     """Return what the motors are taken to bear, from what the printer allows a file.
 
     A little more than that, since a command has to lead the nozzle; who knows more says so in the
-    machine's `command`.
+    machine's `command`. Where the printer states X and Y apart, so do `axes`; the motors of a
+    CoreXY are taken to bear what a file's diagonals ask of them.
     """
-    step = _CORNERS * firmware.corner_mm_s
-    return CommandLimits(
-        velocity_mm_s=_SPEED_ROOM * firmware.fastest_mm_s,
-        accel_mm_s2=_ACCEL_ROOM * firmware.largest_accel_mm_s2,
-        speed_step_mm_s=min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
-    )
+    x, y = (_borne(machine.firmware.allowance(axis)) for axis in ("x", "y"))
+    least = {name: min(value, y[name]) for name, value in x.items()}
+    if machine.kinematics == "corexy":
+        # Whole, and not below what a diagonal at the head's own limit asks.
+        accel = math.ceil(_ACCEL_ROOM * machine.firmware.motor_accel_mm_s2())
+        return CommandLimits(**least, motors=MotorLimits(accel_mm_s2=accel))
+    if machine.firmware.kind == "klipper":
+        return CommandLimits(**least)
+    more = {
+        axis: AxisLimits(**{name: value for name, value in borne.items() if value > least[name]})
+        for axis, borne in (("x", x), ("y", y))
+        if borne != least
+    }
+    return CommandLimits(**least, axes=more)
+
+
+def _borne(allowed: AxisAllowance) -> dict[str, float]:
+    step = _CORNERS * allowed.corner_mm_s
+    return {
+        "velocity_mm_s": _SPEED_ROOM * allowed.speed_mm_s,
+        "accel_mm_s2": _ACCEL_ROOM * allowed.accel_mm_s2,
+        "speed_step_mm_s": min(max(step, _LEAST_STEP_MM_S), CommandLimits().speed_step_mm_s),
+    }
+
+
+def with_firmware(machine: Machine, section: dict[str, Any]) -> Machine:
+    """Return a machine with another firmware section.
+
+    What the motors bear is derived anew where it was derived, and stays where somebody said it.
+
+    Raises
+    ------
+    ValidationError
+        If the section, or the machine with it, is none.
+    """
+    document = {**machine.model_dump(mode="json"), "firmware": section}
+    derived = machine.command == derived_envelope(machine)
+    if derived:
+        del document["command"]
+    changed = Machine.model_validate(document)
+    return changed.model_copy(update={"command": derived_envelope(changed)}) if derived else changed
 
 
 def envelope_warnings(machine: Machine) -> list[str]:
@@ -223,16 +279,21 @@ def envelope_warnings(machine: Machine) -> list[str]:
 
     Until 2026-11 machines were made with 20 000 mm/s2 whatever the printer's limit was.
     """
-    derived, stated = derived_envelope(machine.firmware), machine.command
-    if stated.accel_mm_s2 <= _NOT_MORE * derived.accel_mm_s2:
-        return []
-    text = (
-        f"{machine.name}: a command may ask the motors for {stated.accel_mm_s2:.0f} mm/s2 "
-        f"(command.accel_mm_s2), more than {_ACCEL_ROOM:g} times what the printer allows a file "
-        f"({machine.firmware.largest_accel_mm_s2:.0f}): right if the motors were tried at it; "
-        f"otherwise put {derived.accel_mm_s2:.0f} there"
-    )
-    return [text]
+    derived, stated = derived_envelope(machine), machine.command
+    found: dict[str, tuple[float, float]] = {}
+    for axis in ("x", "y"):
+        most, asked = derived.of(axis).accel_mm_s2, stated.of(axis).accel_mm_s2
+        if asked > _NOT_MORE * most:
+            by_axis = axis in stated.axes and stated.axes[axis].accel_mm_s2 is not None
+            place = f"axes.{axis}.accel_mm_s2" if by_axis else "accel_mm_s2"
+            found[place] = (asked, min(most, found.get(place, (asked, most))[1]))
+    return [
+        f"{machine.name}: a command may ask the motors for {asked:.0f} mm/s2 (command.{place}), "
+        f"more than {_ACCEL_ROOM:g} times what the printer allows a file "
+        f"({most / _ACCEL_ROOM:.0f}): right if the motors were tried at it; otherwise put "
+        f"{most:.0f} there"
+        for place, (asked, most) in found.items()
+    ]
 
 
 def _at(document: Any, place: str) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stillpath.applications.machines.checks import derived_envelope, typed_in
+from stillpath.applications.machines.checks import derived_envelope, typed_in, with_firmware
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import explain
@@ -162,7 +162,7 @@ def machine_from_m503(
         machine = Machine.model_validate(document)
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
-    return machine.model_copy(update={"command": derived_envelope(machine.firmware)})
+    return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
 def with_m503(machine: Machine, text: str, file: str) -> Machine:
@@ -182,9 +182,8 @@ def with_m503(machine: Machine, text: str, file: str) -> Machine:
         before = machine.firmware.model_dump(mode="json", exclude_unset=True)
     for part in ("planner", "shaper"):
         said[part] = {**(before.get(part) or {}), **said[part]}
-    document = {**machine.model_dump(mode="json"), "firmware": {**before, **said}}
     try:
-        return Machine.model_validate(document)
+        return with_firmware(machine, {**before, **said})
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
 

@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
+from stillpath.applications.machines.checks import with_firmware
 from stillpath.applications.machines.marlin_settings import looks_like_m503, with_m503
 from stillpath.applications.machines.revision import (
     Approval,
@@ -118,7 +119,7 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
     if not isinstance(section, dict) or "kind" not in section:
         raise ModelError(f"{file}: a firmware section is an object that says its kind")
     try:
-        changed = Machine.model_validate({**machine.model_dump(mode="json"), "firmware": section})
+        changed = with_firmware(machine, section)
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
     return changed, source_file(file.name, content)

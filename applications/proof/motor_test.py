@@ -126,10 +126,14 @@ def borne(levels: list[Level], console: str, full_step: int) -> int:
 
 def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:
     """Return what the machine may ask of motors that bore a level."""
-    changed = {
+    changed: dict[str, object] = {
         "accel_mm_s2": round(margin * level.accel_mm_s2),
         "speed_step_mm_s": round(margin * level.speed_step_mm_s, 1),
     }
+    if machine.command.motors is not None:
+        # The strokes along diagonals ask one motor of a CoreXY for so much.
+        accel = round(math.sqrt(2.0) * margin * level.accel_mm_s2)
+        changed["motors"] = machine.command.motors.model_copy(update={"accel_mm_s2": accel})
     return machine.command.model_copy(update=changed)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+import math
+from typing import Literal, NamedTuple
 
 from stillpath.models.document import Document, Finite, NonNegative, Positive
 
 __all__ = [
+    "AxisAllowance",
     "FirmwareFacts",
     "FirmwareRetraction",
     "Hotend",
@@ -27,6 +29,16 @@ class FirmwareRetraction(Document):
     retract_speed_mm_s: Positive = 35.0
     unretract_extra_length_mm: NonNegative = 0.0
     unretract_speed_mm_s: Positive = 35.0
+
+
+class AxisAllowance(NamedTuple):
+    """What a printer's configuration allows a file along one axis."""
+
+    speed_mm_s: float
+    accel_mm_s2: float
+    """Of moves that print."""
+    corner_mm_s: float
+    """Through a square corner."""
 
 
 class FirmwareFacts(Document):
@@ -70,6 +82,17 @@ class FirmwareFacts(Document):
     def corner_mm_s(self) -> float:
         """Configured speed through a square corner of X and Y."""
         raise NotImplementedError
+
+    def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:  # noqa: ARG002
+        """Return what a file is allowed along X or Y; by default the same."""
+        return AxisAllowance(self.fastest_mm_s, self.largest_accel_mm_s2, self.corner_mm_s)
+
+    def motor_accel_mm_s2(self) -> float:
+        """Acceleration that a file can ask of a motor of a CoreXY, on a diagonal.
+
+        By default that of the head, in whatever direction.
+        """
+        return math.sqrt(2.0) * self.largest_accel_mm_s2
 
     @property
     def fastest_z_mm_s(self) -> float:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from stillpath.models.document import Document, NonNegative, Positive
-from stillpath.models.firmware.common import FirmwareFacts, Hotend
+from stillpath.models.firmware.common import AxisAllowance, FirmwareFacts, Hotend
 
 __all__ = ["Marlin", "MarlinPlanner", "MarlinShaper", "PerAxis", "PerAxisLimit"]
 
@@ -175,6 +175,20 @@ class Marlin(FirmwareFacts):
             return min(planner.jerk_mm_s.x, planner.jerk_mm_s.y)
         bend = planner.junction_deviation_mm * self.largest_accel_mm_s2
         return math.sqrt(bend / (math.sqrt(2.0) - 1.0))
+
+    def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:
+        """Return what a file is allowed along X or Y."""
+        planner = self.planner
+        accel = min(planner.accel_mm_s2, getattr(planner.max_accel_mm_s2, axis))
+        corner = self.corner_mm_s
+        if self.junction == "classic_jerk":
+            corner = getattr(planner.jerk_mm_s, axis)
+        return AxisAllowance(getattr(planner.max_feedrate_mm_s, axis), accel, corner)
+
+    def motor_accel_mm_s2(self) -> float:
+        """Return what M201 leaves of the acceleration of a diagonal: it holds for motors."""
+        limit = self.planner.max_accel_mm_s2
+        return min(math.sqrt(2.0) * self.planner.accel_mm_s2, limit.x, limit.y)
 
     @property
     def fastest_z_mm_s(self) -> float:

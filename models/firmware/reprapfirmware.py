@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from stillpath.models.document import Document, NonNegative, Positive
-from stillpath.models.firmware.common import FirmwareFacts, Hotend
+from stillpath.models.firmware.common import AxisAllowance, FirmwareFacts, Hotend
 
 __all__ = ["Drive", "RepRapExtruder", "RepRapFirmware", "RepRapShaper"]
 
@@ -102,6 +103,17 @@ class RepRapFirmware(FirmwareFacts):
     def corner_mm_s(self) -> float:
         """Configured speed through a square corner of X and Y."""
         return min(self.x.jerk_mm_s, self.y.jerk_mm_s)
+
+    def allowance(self, axis: Literal["x", "y"]) -> AxisAllowance:
+        """Return what a file is allowed along X or Y."""
+        drive: Drive = getattr(self, axis)
+        accel = min(self.print_accel_mm_s2, drive.max_accel_mm_s2)
+        return AxisAllowance(drive.max_speed_mm_s, accel, drive.jerk_mm_s)
+
+    def motor_accel_mm_s2(self) -> float:
+        """Return what M201 leaves of the acceleration of a diagonal: it holds for motors, too."""
+        least = min(self.x.max_accel_mm_s2, self.y.max_accel_mm_s2)
+        return min(math.sqrt(2.0) * self.print_accel_mm_s2, least)
 
     @property
     def fastest_z_mm_s(self) -> float:

@@ -18,7 +18,7 @@ from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
 from stillpath.pipeline.measuring.layer_views import LayerViews
 from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
-from stillpath.pipeline.measuring.line_ends import RINGING_S, LineEnds
+from stillpath.pipeline.measuring.maxima import RINGING_S, Maxima
 from stillpath.pipeline.measuring.points import MeasuredPoints, MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.measuring.responses import Responses, ResponseSamples
@@ -39,7 +39,8 @@ __all__ = ["STRIDE", "Measurement", "channel_names"]
 Array = NDArray[np.float64]
 
 STRIDE = 6
-"""Contour errors are measured at every sixth sample: they change over tens of samples."""
+"""Contour errors are measured at every sixth sample, since they change over tens of samples; the
+largest of what is written are looked for between them, too (`maxima`)."""
 _SMALL_BYTES = 200_000
 """Of smaller files every sample is measured: there are too few for chance to even out."""
 _TRACK_BINS = 400
@@ -97,7 +98,9 @@ class Measurement:
         self._shown = shown
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
         self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
-        self._ends = LineEnds(dt_s, len(self._names))
+        sparse = self._stride > 1 and "after" in self._names
+        exact = self._names.index("after") if sparse else None
+        self._maxima = Maxima(dt_s, len(self._names), exact)
         self._answers = Responses(machine, dt_s, shaper, self._names, compensated=compensated)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
@@ -125,7 +128,7 @@ class Measurement:
                 self._jumped = False
             self._count += len(samples)
             self._band.add(samples.path_mm, samples.extruding)
-            self._ends.add(samples)
+            self._maxima.add(samples)
             self._measure(self._answers.push(samples))
 
     def stand(self, samples: int) -> Array | None:
@@ -153,7 +156,7 @@ class Measurement:
         """Say that the position is lost: the machine stands still when motion goes on."""
         self._measure(self._answers.flush())
         self._band.jump()
-        self._ends.jump()
+        self._maxima.jump()
         self._spectra.jump()
         self._jumped = True
         self._last = None
@@ -163,7 +166,7 @@ class Measurement:
         self.stand(round(RINGING_S / self._dt_s))
         self._measure(self._answers.flush())
         self._note(self._meter.flush())
-        self._ends.finish()
+        self._maxima.finish()
         self._tiles.finish()
 
     def _measure(self, found: ResponseSamples | None) -> None:
@@ -171,7 +174,7 @@ class Measurement:
             return
         path_mm, answer_mm, extruding = found.path_mm, found.answer_mm, found.extruding
         self._spectra.add(path_mm, answer_mm, extruding)
-        self._ends.answered(path_mm, answer_mm)
+        self._maxima.answered(path_mm, answer_mm)
         if self._tracer is not None:
             self._tracer.wait(found.executed_mm, answer_mm)
         self._note(self._meter.push(path_mm, answer_mm, extruding))
@@ -217,15 +220,15 @@ class Measurement:
     def channels(self) -> list[Channel]:
         """Return the figures of every channel."""
         labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
-        meter, ends_mm = self._meter, self._ends.max_mm
+        meter, most_mm = self._meter, self._maxima.max_mm
         return [
             Channel(
                 name=name,
                 label=labels[name],
                 extruding=_figures(
-                    meter.contour_extruding[c], meter.tracking_extruding[c], ends_mm[c]
+                    meter.contour_extruding[c], meter.tracking_extruding[c], most_mm[c]
                 ),
-                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c], ends_mm[c]),
+                all_motion=_figures(meter.contour_all[c], meter.tracking_all[c], most_mm[c]),
                 residual_rms_um=1e3 * meter.residual[c].rms,
             )
             for c, name in enumerate(self._names)
@@ -237,11 +240,11 @@ class Measurement:
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
-        return self._groups(self._layers, self._ends.layers, None)
+        return self._groups(self._layers, self._maxima.layers, None)
 
     def features(self, names: Sequence[str]) -> list[GroupFigures]:
         """Return the figures by feature."""
-        return self._groups(self._features, self._ends.features, names)
+        return self._groups(self._features, self._maxima.features, names)
 
     def _groups(
         self, groups: GroupTally, ends_mm: dict[int, Array], names: Sequence[str] | None

@@ -53,6 +53,29 @@ def test_next_revision_of_an_own_machine(capsys) -> None:
     assert "firmware.kind: marlin -> reprapfirmware" in out
 
 
+def test_what_the_motors_bear_is_derived_anew_where_it_was_derived(capsys, tmp_path) -> None:
+    """A bed that bears less than the head, as config.g says (M201 X4000 Y1500)."""
+    section = json.loads((EXAMPLES / "reprapfirmware.json").read_text())
+    section |= {"print_accel_mm_s2": 10_000.0, "travel_accel_mm_s2": 10_000.0}
+    section["x"]["max_accel_mm_s2"], section["y"]["max_accel_mm_s2"] = 4000.0, 1500.0
+    reprap, config = tmp_path / "reprap.json", tmp_path / "printer.cfg"
+    reprap.write_text(json.dumps(section))
+    config.write_text(
+        "[printer]\nkinematics: cartesian\nmax_velocity: 300\nmax_accel: 3000\n"
+        + "".join(f"[stepper_{axis}]\nposition_max: 200\n" for axis in "xyz")
+    )
+    stillpath(capsys, "machines", "from-config", config, "--name", "mine")
+    stillpath(capsys, "machines", "set-firmware", "mine", reprap)
+    command = read_machine(stillpath(capsys, "machines", "mine")[1]).command
+    assert (command.of("x").accel_mm_s2, command.of("y").accel_mm_s2) == (6000.0, 2250.0)
+    # The built-in machine says 20 000 mm/s2, and that stays; `check` tells the least of both axes.
+    stillpath(capsys, "machines", "set-firmware", "ender3", reprap, "--as", "stated")
+    stated = read_machine(stillpath(capsys, "machines", "stated")[1]).command
+    assert stated == load_machine("ender3").command
+    told = " ".join(stillpath(capsys, "machines", "check", "stated")[1:])
+    assert "otherwise put 2250 there" in told
+
+
 def test_a_firmware_that_executes_no_stream_is_told_at_once(capsys, tmp_path) -> None:
     file = tmp_path / "firmware.json"
     file.write_text('{"kind": "marlin", "variant": "bambu"}')

@@ -175,7 +175,16 @@ def test_a_machine_of_another_firmware_becomes_one_with_marlin(capsys, tmp_path:
 
 def test_the_command_has_room_above_what_the_printer_allows(make, capsys) -> None:
     fast = M503.replace("X500.00 Y400.00", "X900.00 Y900.00").replace("P510", "P30000")
-    make(fast.replace("M201 X500.00", "M201 X40000.00"))
+    make(fast.replace("M201 X500.00 Y600.00", "M201 X40000.00 Y40000.00"))
     command = stored(capsys).command
     assert command.velocity_mm_s > 900
     assert command.accel_mm_s2 > 30000
+
+
+def test_an_axis_that_may_more_bears_more(make, capsys) -> None:
+    make(M503.replace("M204 P510", "M204 P3000"))
+    command = stored(capsys).command
+    # M201 X500 Y600, M203 X500 Y400
+    assert (command.accel_mm_s2, command.velocity_mm_s) == (750.0, 480.0)
+    assert (command.of("x").accel_mm_s2, command.of("x").velocity_mm_s) == (750.0, 600.0)
+    assert (command.of("y").accel_mm_s2, command.of("y").velocity_mm_s) == (900.0, 480.0)

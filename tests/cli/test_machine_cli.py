@@ -13,7 +13,7 @@ from stillpath.applications.machines.checks import check_before_job, differences
 from stillpath.applications.machines.klipper_config import read_printer_config
 from stillpath.applications.machines.store import MachineStore
 from stillpath.cli.main import run
-from stillpath.models.machine import CommandLimits, Machine
+from stillpath.models.machine import CommandLimits, Machine, MotorLimits
 from stillpath.models.store import builtin_machines
 from tests.cli.test_cli import compensate, one_line, pipeline, source
 from tests.service.machines import make_machine, make_plants
@@ -244,7 +244,11 @@ def test_a_machine_from_a_printer_cfg(store: MachineStore, config: Path, capsys)
 
 def test_what_the_motors_bear_is_derived_from_their_limits(store: MachineStore, config: Path):
     assert machines("from-config", config, "--name", "slow") == 0
-    slow = CommandLimits(velocity_mm_s=1.2 * 300, accel_mm_s2=1.5 * 4000, speed_step_mm_s=45.0)
+    # A diagonal asks one motor for sqrt(2) times what the head does.
+    motors = MotorLimits(accel_mm_s2=8486.0)
+    slow = CommandLimits(
+        velocity_mm_s=1.2 * 300, accel_mm_s2=1.5 * 4000, speed_step_mm_s=45.0, motors=motors
+    )
     assert store.current("slow").machine.command == slow
     fast = CONFIG.replace("max_velocity: 300", "max_velocity: 600")
     config.write_text(fast.replace("max_accel = 4000", "max_accel = 30000"))
@@ -252,6 +256,16 @@ def test_what_the_motors_bear_is_derived_from_their_limits(store: MachineStore, 
     command = store.current("fast").machine.command
     assert command.velocity_mm_s == pytest.approx(1.2 * 600)
     assert command.accel_mm_s2 == pytest.approx(1.5 * 30_000)
+
+
+def test_limits_by_axis_of_a_fork_are_told_apart(store: MachineStore, config: Path, capsys):
+    by_axis = "kinematics: limited_corexy\nmax_x_accel: 8000\nmax_y_accel: 3000"
+    config.write_text(CONFIG.replace("kinematics: corexy", by_axis))
+    assert machines("from-config", config, "--name", "heavy") == 2
+    told = capsys.readouterr().err
+    for words in ("limited_corexy", "kinematics: corexy", "max_accel: 3000", "max_x_accel"):
+        assert words in told
+    assert "heavy" not in store.names()
 
 
 def test_typed_in_resonances(store: MachineStore, config: Path):

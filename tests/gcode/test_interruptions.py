@@ -38,7 +38,10 @@ def written(piece: Piece, made: CompensatedPiece, factor: float) -> tuple[Moves,
 
 
 def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float:
-    """Largest change of velocity of X and Y within a ms when moves go from rest to rest, mm/s."""
+    """Largest change of velocity of X and Y within a ms when moves go from rest to rest, mm/s.
+
+    Of a CoreXY that of a motor.
+    """
     phases = plan_moves(moves, limits, machine)
     # RepRapFirmware holds moves back by some hundredths of a ms where they come too fast: late
     # steps, which this does not count.
@@ -49,7 +52,9 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     place, _ = sample_phases(phases, (float(phases.t_s[0]) - 20 * _SAMPLE_S, _SAMPLE_S, count))
     velocity = np.diff(place[:2], axis=1) / _SAMPLE_S
     reach = round(1e-3 / _SAMPLE_S)
-    return float(np.max(np.hypot(*(velocity[:, reach:] - velocity[:, :-reach])), initial=0.0))
+    x, y = velocity[:, reach:] - velocity[:, :-reach]
+    change = np.abs(x) + np.abs(y) if machine.kinematics == "corexy" else np.hypot(x, y)
+    return float(np.max(change, initial=0.0))
 
 
 @pytest.mark.parametrize(
@@ -72,6 +77,17 @@ def test_no_break_asks_for_more_than_the_motors_bear(
         for rows in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
             worst = max(worst, velocity_step(rows_of(moves, rows), limits, machine))
     assert worst <= times * machine.command.speed_step_mm_s, worst
+
+
+@pytest.mark.parametrize("kind", ["klipper", "reprapfirmware"])
+def test_nor_of_a_motor_of_a_corexy(kind: str) -> None:
+    machine = ender3_with(kind).model_copy(update={"kinematics": "corexy"})
+    moves, limits = written(*compensated(HEAD + BODY, machine), 1.0)
+    stream = np.flatnonzero(moves.limits_id == 0)
+    parts = [slice(max(k - _AROUND, 0), k) for k in stream[5::7]]
+    parts += [slice(k, k + _AROUND) for k in stream[5::7]]
+    worst = max(velocity_step(rows_of(moves, part), limits, machine) for part in parts)
+    assert worst <= machine.command.speed_step_mm_s
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 1.5, 2.0])

@@ -291,7 +291,10 @@ def test_tallies_are_the_whole_array_s() -> None:
         some, figures = feeds[::STRIDE], channels[name].extruding
         assert figures.contour_rms_um == pytest.approx(rms(contour[some]), rel=1e-6)
         ringing = dense[(since > 0) & (since <= 100)].max()
-        assert figures.contour_max_um == pytest.approx(max(contour[some].max(), ringing), rel=1e-6)
+        # What is written is looked at between the measured samples, too.
+        largest = dense[feeds].max() if name == "after" else contour[some].max()
+        assert largest > contour[some].max() or name == "before"
+        assert figures.contour_max_um == pytest.approx(max(largest, ringing), rel=1e-6)
         assert figures.tracking_rms_um == pytest.approx(rms(tracking[feeds]), rel=1e-6)
         everything = channels[name].all_motion
         assert everything.contour_rms_um == pytest.approx(rms(contour), rel=1e-6)

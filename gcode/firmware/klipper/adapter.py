@@ -38,7 +38,7 @@ class KlipperAdapter:
     @property
     def refusal(self) -> str | None:
         """The bed is too crooked for the machine's Z, or None."""
-        left, needed = self._stream.accel_mm_s2, self._machine.command.accel_mm_s2
+        left, needed = self._stream.accel_mm_s2, self._machine.command.every_way.accel_mm_s2
         if left >= needed:
             return None
         least = needed * self._machine.mesh_slope

@@ -59,7 +59,7 @@ def stream_limits(
         the limits of Z (klippy/extras/bed_mesh.py, kinematics/cartesian.py, 2026-08). Those limits
         divided by the slope never bind, however the bed lies, so that times stay as planned.
     """
-    accel = command.accel_mm_s2
+    accel = command.every_way.accel_mm_s2
     # The command keeps its speed axis by axis, Klipper its limit along the path.
     velocity_mm_s = math.hypot(command.velocity_mm_s, command.velocity_mm_s)
     if mesh_slope > 0.0:

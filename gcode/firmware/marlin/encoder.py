@@ -46,7 +46,7 @@ from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
 from stillpath.gcode.types import Limits, Phases
 from stillpath.models.firmware import Marlin
-from stillpath.models.machine import CommandLimits
+from stillpath.models.machine import CommandLimits, MotorLimits
 
 __all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 
@@ -84,7 +84,9 @@ def stream_limits(
     feed = 2.0 * own.feedrate_e_mm_s
     if own.linear_advance_k_s > 0.0:
         feed += 2.0 * max(advance_speed_mm_s(own, classic_jerk=jerk) for jerk in (False, True))
-    accel, step = command.accel_mm_s2, corner_step_mm_s(command)
+    x, y = command.of("x"), command.of("y")
+    accel, step = max(x.accel_mm_s2, y.accel_mm_s2), corner_step_mm_s(command)
+    motors = command.motors or MotorLimits()
     slope = mesh_slope + STEEPEST
     # Along a mesh Z takes a step within one segment, and none within the next.
     hop = STREAM_MESH_ACCEL_MM_S2 if mesh_slope > 0.0 else 0.0
@@ -92,18 +94,19 @@ def stream_limits(
     deviation_mm = (math.sqrt(2.0) - 1.0) * square_corner_mm_s(command) ** 2 / accel
     return replace(
         without_advance(own),
-        accel_x_mm_s2=accel,
-        accel_y_mm_s2=accel,
+        # Of motors, also on a CoreXY.
+        accel_x_mm_s2=motors.accel_mm_s2 or x.accel_mm_s2,
+        accel_y_mm_s2=motors.accel_mm_s2 or y.accel_mm_s2,
         accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel, hop),
         accel_e_mm_s2=STREAM_E_ACCEL_MM_S2,
-        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * command.velocity_mm_s),
-        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * command.velocity_mm_s),
+        feedrate_x_mm_s=max(own.feedrate_x_mm_s, _ROOM * (motors.velocity_mm_s or x.velocity_mm_s)),
+        feedrate_y_mm_s=max(own.feedrate_y_mm_s, _ROOM * (motors.velocity_mm_s or y.velocity_mm_s)),
         feedrate_e_mm_s=feed,
         print_accel_mm_s2=accel,
         travel_accel_mm_s2=accel,
         # It limits the step of each axis.
-        jerk_x_mm_s=round(step / math.sqrt(2.0), 2),
-        jerk_y_mm_s=round(step / math.sqrt(2.0), 2),
+        jerk_x_mm_s=round(corner_step_mm_s(x) / math.sqrt(2.0), 2),
+        jerk_y_mm_s=round(corner_step_mm_s(y) / math.sqrt(2.0), 2),
         jerk_z_mm_s=max(own.jerk_z_mm_s, slope * step),
         jerk_e_mm_s=max(own.jerk_e_mm_s, STREAM_E_JERK_MM_S),
         junction_deviation_mm=min(max(deviation_mm, DEVIATION_MM[0]), DEVIATION_MM[1]),
@@ -138,6 +141,7 @@ class MarlinEncoder:
     ) -> None:
         self._firmware = firmware
         self._command = command
+        self._fastest_mm_s = max(command.of(axis).velocity_mm_s for axis in ("x", "y"))
         self._mesh_slope = mesh_slope
         self._corexy = corexy
         self._releases = firmware.variant in ("2.0", "2.1")
@@ -186,9 +190,7 @@ class MarlinEncoder:
         start_mm, end_mm = start / UNITS_PER_MM, moves.position / UNITS_PER_MM
         ours = rows < 0
         limits_id, table = limits_in_force(piece, rows, limits)
-        speed = np.where(
-            ours, _DIAGONAL * self._command.velocity_mm_s, piece.moves.speed_mm_s[rows]
-        )
+        speed = np.where(ours, _DIAGONAL * self._fastest_mm_s, piece.moves.speed_mm_s[rows])
         steps, path = self._blocks(start_mm, end_mm)
 
         phases = self._plan(start_mm, end_mm, speed, limits_id, table)

@@ -74,29 +74,31 @@ def stream_limits(
     follows a bed mesh, though, and is asked for the slope times what X and Y do.
     """
     own = RepRapLimits.of(firmware, 0.0)
-    accel = command.accel_mm_s2
+    x, y = command.of("x"), command.of("y")
+    accel = max(x.accel_mm_s2, y.accel_mm_s2)
     # It limits the step of each axis.
-    jerk = round(corner_step_mm_s(command) / math.sqrt(2.0), 2)
+    jerks = [round(corner_step_mm_s(one) / math.sqrt(2.0), 2) for one in (x, y)]
     extruder = _E_JERK_SHARE * own.jerk_e_mm_s
     slope = mesh_slope + STEEPEST
-    climb = max(own.jerk_z_mm_s, _DIAGONAL * slope * jerk)
+    climb = max(own.jerk_z_mm_s, _DIAGONAL * slope * max(jerks))
     return replace(
         own,
-        accel_x_mm_s2=accel,
-        accel_y_mm_s2=accel,
+        # A CoreXY's motors are held to it as well.
+        accel_x_mm_s2=x.accel_mm_s2,
+        accel_y_mm_s2=y.accel_mm_s2,
         accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel),
         accel_e_mm_s2=max(own.accel_e_mm_s2, STREAM_E_ACCEL_MM_S2),
-        speed_x_mm_s=_DIAGONAL * command.velocity_mm_s,
-        speed_y_mm_s=_DIAGONAL * command.velocity_mm_s,
+        speed_x_mm_s=_DIAGONAL * x.velocity_mm_s,
+        speed_y_mm_s=_DIAGONAL * y.velocity_mm_s,
         min_speed_mm_s=LEAST_SPEED_MM_S,
         print_accel_mm_s2=accel,
         travel_accel_mm_s2=accel,
-        jerk_x_mm_s=jerk,
-        jerk_y_mm_s=jerk,
+        jerk_x_mm_s=jerks[0],
+        jerk_y_mm_s=jerks[1],
         jerk_z_mm_s=climb,
         jerk_e_mm_s=extruder,
-        max_jerk_x_mm_s=jerk,
-        max_jerk_y_mm_s=jerk,
+        max_jerk_x_mm_s=jerks[0],
+        max_jerk_y_mm_s=jerks[1],
         max_jerk_z_mm_s=climb,
         max_jerk_e_mm_s=extruder,
         jerk_policy=1.0,

@@ -1,8 +1,11 @@
-"""The largest contour errors after the ends of lines.
+"""The largest contour errors: what a measurement of every sixth sample would miss.
 
 A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
 it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
-They are few, so every sample is measured.
+
+While something is extruded, a contour error is never above the tracking error, which is known at
+every sample. So a sample whose tracking error is below the largest contour error so far needs no
+measurement, and the others are few.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.simulation.measures import ChosenMeter
 
-__all__ = ["RINGING_S", "LineEnds"]
+__all__ = ["RINGING_S", "Maxima"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,13 +26,17 @@ RINGING_S = 0.1
 _STILL_MM = 1e-9
 
 
-class LineEnds:
-    """Find the largest errors after the ends of lines, in all, by layer and by feature.
+class Maxima:
+    """Find the largest errors on lines and after their ends, in all, by layer and by feature.
+
+    Those of a layer are exact after the ends of its lines only.
 
     Parameters
     ----------
     dt_s : float
     channels : int
+    exact : int, optional
+        The channel whose largest errors on lines are found; None: of none.
 
     Attributes
     ----------
@@ -37,7 +44,10 @@ class LineEnds:
     layers, features : dict of int to ndarray, shape (channels,)
     """
 
-    def __init__(self, dt_s: float, channels: int) -> None:
+    def __init__(self, dt_s: float, channels: int, exact: int | None = None) -> None:
+        self._exact = exact
+        self._pending = np.zeros((3, 0), np.int64)
+        """Whether the samples that are not answered yet extrude, and their layer and feature."""
         self._errors = ChosenMeter(dt_s, channels=channels)
         self._reach = round(RINGING_S / dt_s)
         self._index = np.zeros(0, np.int64)
@@ -59,6 +69,10 @@ class LineEnds:
         """Take note of motion whose answers come later."""
         n = len(samples)
         path = samples.path_mm
+        if self._exact is not None:
+            marks = np.stack([samples.moves.layer, samples.moves.feature])[:, samples.row]
+            known = np.concatenate([samples.extruding[None], marks], dtype=np.int64)
+            self._pending = np.append(self._pending, known, axis=1)
         before = path[:, :1] if self._at is None else self._at
         moves = np.any(np.abs(np.diff(path, axis=1, prepend=before)) > _STILL_MM, axis=0)
         here = np.arange(n)
@@ -84,10 +98,26 @@ class LineEnds:
     def answered(self, path_mm: Array, answer_mm: Array) -> None:
         """Add the next answers, shapes (2, n) and (channels, 2, n), to what was noted."""
         upto = self._answered + path_mm.shape[1]
+        if self._exact is not None:
+            self._choose(np.hypot(*(answer_mm[self._exact] - path_mm)), self._exact)
         end = int(np.searchsorted(self._index, upto))
         at = self._index[self._fed : end] - self._answered
         self._answered, self._fed = upto, end
         self._note(self._errors.push(path_mm, answer_mm, at))
+
+    def _choose(self, tracking_mm: Array, channel: int) -> None:
+        """Choose what may be larger than what was found of its feature so far."""
+        n = len(tracking_mm)
+        (extruding, *of), self._pending = self._pending[:, :n], self._pending[:, n:]
+        chosen = np.zeros(n, np.bool_)
+        for feature in np.unique(of[1][extruding > 0]).tolist():
+            most = self.features[feature][channel] if feature in self.features else 0.0
+            chosen |= (of[1] == feature) & (tracking_mm > most)
+        at = np.flatnonzero(chosen & (extruding > 0))
+        index = np.append(self._index, self._answered + at)
+        order = np.argsort(index, kind="stable")
+        self._index = index[order]
+        self._groups = np.append(self._groups, np.stack(of)[:, at], axis=1)[:, order]
 
     def finish(self) -> None:
         """Say that the motion has ended."""
