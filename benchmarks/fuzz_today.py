@@ -50,6 +50,7 @@ def main() -> int:
     spent_s: list[float] = []
     long: list[float] = []
     good = put_back = 0
+    internal: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as name:
         cache = Path(name) / "cache"
         for machine, method in itertools.product(machines.values(), _METHODS):
@@ -67,6 +68,11 @@ def main() -> int:
             if outcome is not None:
                 good += outcome.written is not None
                 put_back += outcome.put_back
+                for reason in outcome.internal:
+                    if reason not in internal:
+                        print(f"\nREVERTED in file {number}, {kind}, {method}: {reason}", flush=True)
+                        _save(arguments.save, f"{kind}-{arguments.seed}-{number}.gcode", data)
+                    internal[reason] = internal.get(reason, 0) + 1
                 if spent_s[-1] > _MOST_CPU_S:
                     long.append(outcome.print_s)
                 # A file is tried again without each line that is refused.
@@ -84,6 +90,7 @@ def main() -> int:
         f"{len(spent_s)} files of {', '.join(kinds)}: {good} written, {put_back} pieces put back, "
         f"{sum(spent_s):.0f} s CPU (mean {statistics.fmean(spent_s):.3f}, most "
         f"{max(spent_s):.2f} s in file {spent_s.index(max(spent_s))}), "
+        f"{sum(internal.values())} of these pieces for errors of our own, "
         f"{len(failures)} kinds of failures in {sum(failures.values())} files"
     )
     if long:

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -37,8 +37,8 @@ from stillpath.pipeline.caution import caution_for, prediction_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
-from stillpath.pipeline.files import default_cache_dir
-from stillpath.pipeline.last_check.comparing import LastCheck
+from stillpath.pipeline.files import Discarding, default_cache_dir
+from stillpath.pipeline.last_check.comparing import LastCheck, LastCheckError
 from stillpath.pipeline.measuring.layer_files import LayerWriter
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
@@ -67,12 +67,18 @@ from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, tak
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
 from stillpath.version import __version__
 
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
 __all__ = ["compensate_file", "plan_file", "simulate_file"]
 
 T = TypeVar("T", bound=VerbatimPart)
 
 _BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
+_ALL = -1
+_MOST_REFUSED = 3
+"""Pieces that are reverted one by one after the last check; then all are."""
 
 
 def compensate_file(
@@ -139,8 +145,7 @@ def compensate_file(
     with opened as file:
         order = _Order(machine, options, cache_dir, progress)
         job, result = _final_job(file, order, source.name, trace)
-        file.spool.seek(0)
-        result = job.deliver(result, file.text)
+        job.deliver(file.text)
         if options.times == "new":
             file.container.delay(job.delay_s)
     return result.model_copy(update=file.sizes)
@@ -148,12 +153,43 @@ def compensate_file(
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """What a file is compensated with."""
+    """What a file is compensated with.
+
+    Attributes
+    ----------
+    refused : dict
+        Pieces that stay as sliced, by their first line (`_ALL`: every piece), and why.
+    """
 
     machine: Machine
     options: Options
     cache_dir: Path | None = None
     progress: ProgressCallback | None = None
+    refused: dict[int, str] = field(default_factory=dict)
+
+    def reverting(self, error: LastCheckError, began: Sequence[int]) -> _Order:
+        """Return an order without the piece in which the last check found fault.
+
+        Parameters
+        ----------
+        began : sequence of int
+            First lines of the compensated pieces, rising.
+
+        Raises
+        ------
+        LastCheckError
+            When every piece was reverted already.
+        """
+        if not began or _ALL in self.refused:
+            raise error
+        piece = max((line for line in began if line <= error.line), default=began[0])
+        if len(self.refused) == _MOST_REFUSED:
+            piece = _ALL
+        reason = (
+            f"line {error.line}: internal error (the last check refuses the compensated lines: "
+            f"{error.reason}); please report it with the file"
+        )
+        return replace(self, refused={**self.refused, piece: reason})
 
 
 def _final_job(
@@ -162,7 +198,10 @@ def _final_job(
     name: str,
     trace: Callable[[Trace], None] | None,
 ) -> tuple[_Job, Result]:
-    """Run jobs until what one writes fits `max_mb` and keeps the budget; return that one."""
+    """Run jobs until what one writes fits, keeps the budget and passes the check; return that one.
+
+    A piece that the last check refuses stays as sliced, as one that any other check refuses.
+    """
     # Within a budget a file may be written more than once: only the last time is traced.
     traced = None if _Job.has_budget(order.options) else trace
     budget: SpeedBudget | None = None
@@ -171,14 +210,20 @@ def _final_job(
         job = _Job(file.container.text, file.spool, order, layers, traced, budget)
         try:
             result = job.run(name, file.container.facts())
+            gentler = job.gentler
+            if gentler is None and traced is trace:
+                return job, job.checked(result)
         except TooLarge:
             order = replace(order, options=_fitting(order.options, name))
+        except LastCheckError as error:
+            # What was traced cannot be taken back.
+            if trace is not None:
+                raise
+            order = order.reverting(error, job.began)
         else:
-            budget = job.gentler
-            if budget is None and traced is trace:
-                return job, result
-            if budget is None:
-                budget, traced = job.same, trace
+            if gentler is None:
+                traced = trace
+            budget = gentler or job.same
         file.spool.seek(0)
         file.spool.truncate()
         layers = layers.anew() if layers is not None else None
@@ -233,7 +278,8 @@ class _Job:
         budget: SpeedBudget | None = None,
     ) -> None:
         machine, options = order.machine, order.options
-        self._layers = layers
+        self._refused, self._layers = order.refused, layers
+        self.began: list[int] = []
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._reports = ProgressReports(order.progress)
@@ -351,17 +397,28 @@ class _Job:
             self._say("done", 1.0)
         return self._result(name, size, facts)
 
-    def deliver(self, result: Result, text: BinaryIO) -> Result:
-        """Write the file with its new times; it is compared with the original meanwhile."""
+    def checked(self, result: Result) -> Result:
+        """Compare the file as it will be delivered with the original.
+
+        Raises
+        ------
+        LastCheckError
+        """
         if not self._changes:
-            self.retiming.copy(self._target, text, self.delay_s)
             return result
         shortest_mm = 2.0 * self._adapter.shortest_move_mm
-        check = LastCheck(text, self._source, self._machine, self._adapter.step_mm, shortest_mm)
-        self.retiming.copy(self._target, check, self.delay_s)
+        check = LastCheck(
+            Discarding(), self._source, self._machine, self._adapter.step_mm, shortest_mm
+        )
+        self.deliver(check)
         figures = check.finish()
         stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
         return result.model_copy(update={"last_check": figures, "stages": [*result.stages, stage]})
+
+    def deliver(self, text: SupportsWrite[bytes]) -> None:
+        """Write the file with its new times."""
+        self._target.seek(0)
+        self.retiming.copy(self._target, text, self.delay_s)
 
     def _chosen_paces(self, size: int) -> SpeedBudget:
         """Find how quick the print may be."""
@@ -417,6 +474,11 @@ class _Job:
         original_s = piece.phases.duration_s
         self._check_end(piece, original_s)
         self._sum.original_s += original_s
+        line = int(piece.moves.line[0])
+        refused = self._refused.get(line, self._refused.get(_ALL))
+        if refused is not None:
+            self._put_back(piece, original_s, refused)
+            return
         if self._sum.jumped:
             # Homed, say: the machine did not come here along the path.
             self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
@@ -434,6 +496,7 @@ class _Job:
             self._sum.time_s -= switched_s
             self._put_back(piece, original_s, reason)
             return
+        self.began.append(line)
         self._work.compensator.commit()
         self._verifier.passed(attempt.motion.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)

@@ -9,10 +9,18 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["default_cache_dir", "replacing"]
+__all__ = ["Discarding", "default_cache_dir", "replacing"]
 
 _NAME_PART = 40
 """Characters of a name that its temporary file carries on; names have at most 255 bytes."""
+
+
+class Discarding:
+    """A file to write to that keeps nothing."""
+
+    def write(self, data: bytes) -> int:
+        """Take bytes; return how many."""
+        return len(data)
 
 
 @contextlib.contextmanager

@@ -80,7 +80,8 @@ def draw(chart: Chart, width: float, height: float) -> str:
         [(x, y) for x, y in zip(line.x, line.y, strict=True) if y is not None and _shown(y, chart)]
         for line in chart.lines
     ]
-    xs = [x for row in (*chart.lines, *chart.bands) for x in row.x] or [0.0, 1.0]
+    xs = [x for line in chart.lines for x in line.x] or [0.0, 1.0]
+    xs += [x for band in chart.bands for x in band.x]
     ys = [y for line in points for _, y in line] or [1.0]
     ys += [y for band in chart.bands for y in (*band.low, *band.high) if _shown(y, chart)]
     ticks = _log_ticks(min(ys), max(ys)) if chart.log else _ticks(min(0.0, *ys), max(0.0, *ys), 5)

@@ -261,7 +261,7 @@ def _frequencies(machine: Machine, axis: str, dt_s: float) -> Frequencies:
     responses = [p.frequency_response(_FREQUENCIES_HZ) for p in (plants.nominal, *plants.members)]
     gain = np.abs(responses)
     phase_deg = np.degrees(np.unwrap(np.angle(responses), axis=1))
-    found: dict[str, Any] = {"f_hz": _FREQUENCIES_HZ}
+    found: dict[str, object] = {"f_hz": _FREQUENCIES_HZ}
     for name, unit, rows in (("gain", "", gain), ("phase", "_deg", phase_deg)):
         found[f"{name}{unit}"] = rows[0].tolist()
         found[f"{name}_low{unit}"] = rows.min(axis=0).tolist()

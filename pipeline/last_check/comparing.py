@@ -56,12 +56,14 @@ class LastCheckError(Exception):
     ----------
     line, written_line : int
         Lines of the original and of the written file, from 1.
+    reason : str
+        What was found there.
     """
 
     exit_code = 1
 
     def __init__(self, message: str, line: int, written_line: int) -> None:
-        self.line, self.written_line = line, written_line
+        self.line, self.written_line, self.reason = line, written_line, message
         super().__init__(
             f"the last check refuses the written file at its line {written_line} (line {line} of "
             f"the original): {message}. This is an error of Stillpath, nothing was written: "
@@ -69,11 +71,11 @@ class LastCheckError(Exception):
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self.args[0], self.line, self.written_line)
+        return _rebuilt, (self.args[0], self.line, self.written_line, self.reason)
 
 
-def _rebuilt(text: str, line: int, written_line: int) -> LastCheckError:
-    error = LastCheckError("", line, written_line)
+def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckError:
+    error = LastCheckError(reason, line, written_line)
     error.args = (text,)
     return error
 

@@ -20,6 +20,7 @@ from stillpath.gcode.types import Moves, Phases, ProgramBlock
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.result import Result
 from stillpath.pipeline.verbatim import plan_verbatim
 from tests.gcode.states import differences, has_code
 
@@ -44,6 +45,8 @@ class Outcome:
     """None: refused as a whole."""
     put_back: int = 0
     print_s: float = 0.0
+    internal: tuple[str, ...] = ()
+    """Why pieces were reverted for an error of our own."""
 
 
 def roomy(machine: Machine, half_mm: float = 5000.0) -> Machine:
@@ -61,17 +64,20 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
     # Ends of lines other than LF and CRLF are the interpreter's business alone.
     if b"\r" not in text.replace(b"\r\n", b"\n"):
         text = _tagged(text)
-    written, put_back, print_s = None, 0, 0.0
+    written, put_back, print_s, internal = None, 0, 0.0, ()
     for _ in range(8):
         try:
-            written, put_back, print_s = through_the_pipeline(text, machine, folder, method, cache)
+            written, result = through_the_pipeline(text, machine, folder, method, cache)
+            put_back = len(result.put_back)
+            print_s = max(result.original_time_s, result.time_s)
+            internal = tuple(p.reason for p in result.put_back if "internal error" in p.reason)
             break
         except GcodeError as error:
             refusals.append(error)
             if error.line is None:
                 break
             text = _without(text, {error.line})
-    return Outcome(text, refusals, written, put_back, print_s)
+    return Outcome(text, refusals, written, put_back, print_s, internal)
 
 
 def read_through(data: bytes, machine: Machine) -> GcodeError | None:
@@ -162,14 +168,8 @@ def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeErr
 
 def through_the_pipeline(
     text: bytes, machine: Machine, folder: Path, method: str, cache: Path
-) -> tuple[bytes, int, float]:
-    """Compensate a file; check lines, states and that nothing else is left behind.
-
-    Returns
-    -------
-    (bytes, int, float)
-        What was written, how many pieces were reverted, and how long the print takes.
-    """
+) -> tuple[bytes, Result]:
+    """Compensate a file; check lines, states and that nothing else is left behind."""
     source, target = folder / "in.gcode", folder / "out.gcode"
     target.unlink(missing_ok=True)
     source.write_bytes(text)
@@ -187,7 +187,7 @@ def through_the_pipeline(
     elif b"\r" not in text.replace(b"\r\n", b"\n"):
         problems = differences(text, written, machine)
         assert problems == [], problems[:5]
-    return written, len(result.put_back), max(result.original_time_s, result.time_s)
+    return written, result
 
 
 def _lasts_s(moves: Moves) -> np.ndarray:
