@@ -70,7 +70,9 @@ def main() -> int:
                 put_back += outcome.put_back
                 for reason in outcome.internal:
                     if reason not in internal:
-                        print(f"\nREVERTED in file {number}, {kind}, {method}: {reason}", flush=True)
+                        print(
+                            f"\nREVERTED in file {number}, {kind}, {method}: {reason}", flush=True
+                        )
                         _save(arguments.save, f"{kind}-{arguments.seed}-{number}.gcode", data)
                     internal[reason] = internal.get(reason, 0) + 1
                 if spent_s[-1] > _MOST_CPU_S:

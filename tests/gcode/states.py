@@ -23,7 +23,7 @@ _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
 _DUST_MM = 1e-9
 _XYZ = np.array([True, True, True, False])
-_STILL = re.compile(rb"\s*(?:N\d+\s*)?G0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
+_STILL = re.compile(rb"\s*(?:N\d+\s*)?G-?0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
 _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
     rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time"
@@ -170,7 +170,9 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
         return [f"became {new.text!r}"]
     problems = []
     kinds = {new.kind, old.kind}
-    if kinds in _DUSTY and _is_dust(old) and _is_dust(new):
+    # What a firmware swallows may be a move to it from where the stream stands, or none.
+    dust_mm = float(place_mm[:2].max()) if swallows else _DUST_MM
+    if kinds in _DUSTY and _is_dust(old, dust_mm) and _is_dust(new, dust_mm):
         return []
     if new.kind != old.kind:
         return [f"kind {new.kind}, not {old.kind}"]
@@ -200,9 +202,9 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
     return problems
 
 
-def _is_dust(state: State) -> bool:
+def _is_dust(state: State, dust_mm: float) -> bool:
     """Sums of relative E miss the absolute one by rounding errors, which are moves."""
-    return bool(np.max(np.abs(state.end_mm - state.start_mm)) < _DUST_MM)
+    return bool(np.max(np.abs(state.end_mm - state.start_mm)) < dust_mm)
 
 
 def _differ(
