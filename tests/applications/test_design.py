@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
+from scipy.signal import dfreqresp
 from starlette.testclient import TestClient
 
 from stillpath.applications.design import design as module
@@ -115,6 +116,25 @@ def test_axis_and_set(machine: Machine, off: DesignReport) -> None:
     assert pair.radius > 1
     assert pair.imag > 0
     assert pair.f_hz == pytest.approx(np.arctan2(pair.imag, pair.real) / (2 * np.pi * DT))
+
+
+def test_the_band_holds_the_set(machine: Machine, off: DesignReport) -> None:
+    found = off.frequencies
+    f_hz, gain = np.array(found.f_hz), np.array(found.gain)
+    low, high = np.array(found.gain_low), np.array(found.gain_high)
+    p = plant_set(machine.axes["x"], DT).nominal
+    _, expected = dfreqresp((p.a, p.b[:, None], p.c[None], p.d, DT), 2 * np.pi * f_hz * DT)
+    np.testing.assert_allclose(gain, np.abs(expected), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.exp(1j * np.radians(found.phase_deg)), expected / np.abs(expected), rtol=1e-6
+    )
+    assert np.all((low <= gain) & (gain <= high))
+    # Slow motion is on time in every plant; where nothing was measured they differ most.
+    assert abs(low[0] - 1) < 0.05 > abs(high[0] - 1)
+    assert max(np.abs(found.phase_low_deg[:1] + found.phase_high_deg[:1])) < 2
+    spread = high / low
+    assert spread[f_hz > 150].max() > 3 * spread[f_hz < 30].max()
+    assert not found.phase_measured
 
 
 def test_singular_values_are_those_of_the_dense_matrices(
@@ -346,9 +366,10 @@ def test_page_and_files(tmp_path: Path, ensemble: DesignReport) -> None:
     assert page.outside == []
     assert "<script" not in text
     assert "http" not in text.replace("http-equiv", "")
-    assert len(page.about) == 2 + 6
+    assert len(page.about) == 2 + 2 + 6
     assert all("against" in about for about in page.about)
-    for words in ("fbf ensemble", "mzv", "remark 4.5", "taken", "zv"):
+    assert text.count('class="band"') == 2
+    for words in ("fbf ensemble", "mzv", "remark 4.5", "taken", "zv", "no measurement told it"):
         assert words in text
     hostile = ensemble.model_copy(update={"machine_title": "<script>alert(1)</script>"})
     assert "<script" not in render_design(hostile)

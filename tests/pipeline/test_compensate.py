@@ -6,6 +6,7 @@ import gzip
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +15,15 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import INVERSIONS
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.encoding import as_moves
+from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import VerbatimPart
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file, plan_file
+from stillpath.pipeline.last_check.comparing import LastCheckError
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -390,3 +394,37 @@ def test_every_file(tmp_path: Path, cache: Path, shared_dir: Path, name: str) ->
         return
     assert refused.line is not None or "no moves" in str(refused)
     assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
+
+
+@pytest.mark.parametrize("spoilt", ["one piece", "every piece", "verbatim lines"])
+def test_what_the_last_check_refuses_stays_as_sliced(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, spoilt: str
+) -> None:
+    """A writer that adds a line: what it writes reads back well, only the last check sees it."""
+    data = b"".join(EXAMPLE.read_bytes().splitlines(keepends=True)[:900])
+    strange = b"M117 not of the file\n"
+    name = "verbatim" if spoilt == "verbatim lines" else "piece"
+    right, lines = getattr(StreamWriter, name), []
+
+    def wrong(self: StreamWriter, item: VerbatimPart, *given: Any) -> bytes:
+        text: bytes = right(self, item, *given)
+        if spoilt != "verbatim lines":
+            lines.append(int(item.moves.line[0]))
+            if spoilt == "one piece" and lines[-1] != lines[min(1, len(lines) - 1)]:
+                return text
+        return text + strange
+
+    monkeypatch.setattr(StreamWriter, name, wrong)
+    if spoilt == "verbatim lines":
+        with pytest.raises(LastCheckError, match="M117 not of the file"):
+            compensate(data, tmp_path, cache, method="shaper:mzv")
+        assert [p.name for p in tmp_path.iterdir()] == ["in.gcode"]
+        return
+    result, written = compensate(data, tmp_path, cache, method="shaper:mzv")
+    assert strange not in written
+    assert result.pieces > 3
+    assert result.last_check is not None
+    for one in result.put_back:
+        assert "internal error (the last check refuses the compensated lines: 'M117" in one.reason
+    assert [one.line_first for one in result.put_back] == sorted(set(lines))[: len(result.put_back)]
+    assert len(result.put_back) == (2 if spoilt == "one piece" else result.pieces)
