@@ -227,12 +227,15 @@ def test_words_set_the_limits_that_they_name() -> None:
         RepRapLimits.of(firmware(), 0.0), jerk_x_mm_s=4.0, jerk_policy=1.0, min_speed_mm_s=0.3
     )
     stream_commands = RepRapStreamCommands(firmware(), ADVANCE_S)
-    for limits in (own, stream_limits(firmware(), CommandLimits())):
+    # A limit that was written as 0 would leave that of the stream in force.
+    tiny = replace(own, accel_e_mm_s2=1e-9)
+    for limits in (own, tiny, stream_limits(firmware(), CommandLimits())):
         reader = Interpreter(machine_of(firmware(), advance_s=0.03))
         blocks = [*reader.push(stream_commands.limits(limits) + b"G1 X1 F600\n"), *reader.flush()]
-        row = blocks[0].limits[blocks[0].moves.limits_id[0]].as_row()
+        read = blocks[0].limits[blocks[0].moves.limits_id[0]]
         expected = replace(limits, pressure_advance_s=0.03).as_row()
-        assert row == pytest.approx(expected, abs=1e-6)
+        assert read.as_row() == pytest.approx(expected, abs=1e-6)
+        assert read.accel_e_mm_s2 == pytest.approx(limits.accel_e_mm_s2)
 
 
 def test_words_around_the_firmwares_own_shaper() -> None:

@@ -99,5 +99,7 @@ def _words(
 
 
 def _number(value: float) -> str:
-    text = f"{value:.6f}".rstrip("0").rstrip(".")
+    # A limit that rounds to 0 would not be taken.
+    decimals = 6 if abs(value) >= 1e-3 else 15
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
     return text or "0"
