@@ -31,7 +31,7 @@ def compensate_in_place(
     name : str
         What the report calls the file; slicers hand over temporary ones.
     tell : callable
-        Is report the stage and the share that is done; may raise to stop the work.
+        Is given the stage and the share that is done; may raise to stop the work.
 
     Raises
     ------

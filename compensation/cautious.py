@@ -100,10 +100,6 @@ class CautiousFbf:
         """Ask for at most this share of the machine's acceleration from now on."""
         return self._inner.ease(accel_share)
 
-    def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
-        """Acceleration that the command of a path (2, n) may ask for."""
-        return self._inner.accel_limit_mm_s2(y_d_mm)
-
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
     ) -> Array:

@@ -220,9 +220,9 @@ class PreviewFbf:
             )
         return np.stack([command.position_mm for command in self._last])
 
-    def accel_limit_mm_s2(self, y_d_mm: Array) -> float:
-        """Acceleration that the command of a path (2, n) may ask for, of the axis that may more."""
-        return max(self._accel_limits_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm]))
+    def accel_limits_mm_s2(self, y_d_mm: Array) -> tuple[float, float]:
+        """Acceleration that the command of X and of Y may ask for on a path (2, n)."""
+        return self._accel_limits_mm_s2([Extremes.of(p, p[0], p[0]) for p in y_d_mm])
 
     def _accel_limits_mm_s2(self, asked: list[Extremes]) -> tuple[float, float]:
         path_accel = max(one.accel for one in asked) / self._dt_s**2

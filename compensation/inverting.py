@@ -83,7 +83,7 @@ class InversionCompensator(Memoryless):
     ) -> None:
         self.name = kind
         self._dt_s = dt_s
-        self._limits = machine.command
+        self._limits = machine.command.of("x"), machine.command.of("y")
         self.filters = [
             _designed(kind, name, plant_set(machine.axes[name], dt_s).nominal, order)
             for name in ("x", "y")
@@ -115,7 +115,7 @@ class InversionCompensator(Memoryless):
     def _within_limits(
         self, axis: int, y_d: Array, rests: NDArray[np.int64]
     ) -> tuple[Array, float]:
-        dt, limits = self._dt_s, self._limits
+        dt, limits = self._dt_s, self._limits[axis]
         accel = speed = 0.0
         for cutoff_hz, fir in zip(self._ladder, self._firs[axis], strict=True):
             u = self.filters[axis].apply(y_d, fir)

@@ -67,6 +67,6 @@ class Overlay:
                 np.abs(np.diff(rows, order)).max(axis=1, initial=0.0) / self._dt_s**order
                 for rows in (u, wanted)
             )
-            if np.any(asked > np.maximum(own.max(), limits)):
+            if np.any(asked > np.maximum(own, limits)):
                 return False
         return True

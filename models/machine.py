@@ -66,7 +66,7 @@ class CommandLimits(Document):
     """What the motors of X and Y bear: no command asks for more, nor does a stream that breaks off.
 
     The written stream runs under these limits, so that the firmware itself keeps them whatever
-    happens: braking for a pause, going on behind it, at any line.
+    happens: braking for a pause, going on after it, at any line.
 
     The plain numbers hold for X as well as for Y. Along one axis more may be borne (`axes`, where
     each axis has a motor); where both motors move either axis (CoreXY), X and Y together may be

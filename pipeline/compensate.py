@@ -158,7 +158,7 @@ class _Order:
     Attributes
     ----------
     refused : dict
-        Pieces that stay as sliced, by their first line (`_ALL`: every piece), and why.
+        Why pieces stay as sliced, by one of their lines (`_ALL`: every piece).
     """
 
     machine: Machine
@@ -167,29 +167,35 @@ class _Order:
     progress: ProgressCallback | None = None
     refused: dict[int, str] = field(default_factory=dict)
 
-    def reverting(self, error: LastCheckError, began: Sequence[int]) -> _Order:
+    def reverting(self, error: LastCheckError, pieces: Sequence[tuple[int, int]]) -> _Order:
         """Return an order without the piece in which the last check found fault.
 
         Parameters
         ----------
-        began : sequence of int
-            First lines of the compensated pieces, rising.
+        pieces : sequence of (int, int)
+            First and last lines of the compensated pieces, rising.
 
         Raises
         ------
         LastCheckError
             When every piece was reverted already.
         """
-        if not began or _ALL in self.refused:
+        piece = next((first for first, last in pieces if last >= error.stream_line), None)
+        if piece is None or error.stream_line == 0 or _ALL in self.refused:
             raise error
-        piece = max((line for line in began if line <= error.line), default=began[0])
         if len(self.refused) == _MOST_REFUSED:
-            piece = _ALL
+            others = f"as the last check refused more than {_MOST_REFUSED} pieces, all are reverted"
+            return replace(self, refused={**self.refused, _ALL: others})
         reason = (
-            f"line {error.line}: internal error (the last check refuses the compensated lines: "
+            f"line {piece}: internal error (the last check refuses the compensated lines: "
             f"{error.reason}); please report it with the file"
         )
         return replace(self, refused={**self.refused, piece: reason})
+
+    def refusal(self, first: int, last: int) -> str | None:
+        """Return why a piece with these lines stays as sliced, if it does."""
+        found = (reason for line, reason in self.refused.items() if first <= line <= last)
+        return next(found, self.refused.get(_ALL))
 
 
 def _final_job(
@@ -213,13 +219,14 @@ def _final_job(
             gentler = job.gentler
             if gentler is None and traced is trace:
                 return job, job.checked(result)
-        except TooLarge:
-            order = replace(order, options=_fitting(order.options, name))
-        except LastCheckError as error:
-            # What was traced cannot be taken back.
-            if trace is not None:
+        except (TooLarge, LastCheckError) as error:
+            if isinstance(error, TooLarge):
+                order = replace(order, options=_fitting(order.options, name))
+            elif trace is not None:  # what was traced cannot be taken back
                 raise
-            order = order.reverting(error, job.began)
+            else:
+                order = order.reverting(error, job.compensated)
+            budget = budget and budget.again()
         else:
             if gentler is None:
                 traced = trace
@@ -278,8 +285,8 @@ class _Job:
         budget: SpeedBudget | None = None,
     ) -> None:
         machine, options = order.machine, order.options
-        self._refused, self._layers = order.refused, layers
-        self.began: list[int] = []
+        self._order, self._layers = order, layers
+        self.compensated: list[tuple[int, int]] = []
         self._source, self._target = source, target
         self._machine, self._options = machine, options
         self._reports = ProgressReports(order.progress)
@@ -393,8 +400,6 @@ class _Job:
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
-        if self.gentler is None:
-            self._say("done", 1.0)
         return self._result(name, size, facts)
 
     def checked(self, result: Result) -> Result:
@@ -405,6 +410,7 @@ class _Job:
         LastCheckError
         """
         if not self._changes:
+            self._say("done", 1.0)
             return result
         shortest_mm = 2.0 * self._adapter.shortest_move_mm
         check = LastCheck(
@@ -412,6 +418,7 @@ class _Job:
         )
         self.deliver(check)
         figures = check.finish()
+        self._say("done", 1.0)
         stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
         return result.model_copy(update={"last_check": figures, "stages": [*result.stages, stage]})
 
@@ -474,10 +481,12 @@ class _Job:
         original_s = piece.phases.duration_s
         self._check_end(piece, original_s)
         self._sum.original_s += original_s
-        line = int(piece.moves.line[0])
-        refused = self._refused.get(line, self._refused.get(_ALL))
-        if refused is not None:
-            self._put_back(piece, original_s, refused)
+        lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
+        refusal = self._order.refusal(*lines)
+        if refusal is not None:
+            if self._budget is not None:
+                next(self._budget.paced(piece))  # which counts it
+            self._put_back(piece, original_s, refusal)
             return
         if self._sum.jumped:
             # Homed, say: the machine did not come here along the path.
@@ -496,7 +505,7 @@ class _Job:
             self._sum.time_s -= switched_s
             self._put_back(piece, original_s, reason)
             return
-        self.began.append(line)
+        self.compensated.append(lines)
         self._work.compensator.commit()
         self._verifier.passed(attempt.motion.executed_mm)
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)

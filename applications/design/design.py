@@ -138,7 +138,7 @@ def design_report(
         tuned = tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers)
     curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
     guarded = lifted.weights if mode == "minimax" else plants.weights
-    limit = next((d.accel_limit_mm_s2(trial.y_d_mm) for d in designers.values()), None)
+    limit = next((d.accel_limits_mm_s2(trial.y_d_mm)[row] for d in designers.values()), None)
     path_peak, path_rms = trial.path_acceleration()
     return DesignReport.model_validate(
         {

@@ -73,7 +73,7 @@ class AxisFigures(_Figures):
 class Frequencies(_Figures):
     """Frequency response of the axis: its nominal plant, and the range of its set.
 
-    Gains in mm/mm, phases in degrees, unwrapped from 0 at the lowest frequency on; without a set
+    Gains in mm/mm, phases in degrees, unwrapped from the lowest frequency on; without a set
     low and high are the nominal plant's. Delays of the whole axis count in neither, as no command
     is designed against them.
     """

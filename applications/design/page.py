@@ -110,7 +110,7 @@ def _response_figures(report: DesignReport) -> list[_Figure]:
     """Return gain and phase of the axis, with the set as a band around the nominal plant."""
     found = report.frequencies
     several = len(report.plant.members) > 1
-    source = "measured" if found.phase_measured else "of the model: no measurement told it"
+    source = "measured" if found.phase_measured else "from the model; not measured"
     rows = (
         ("Gain", "nozzle over command, mm/mm", found.gain, found.gain_low, found.gain_high),
         ("Phase", source, found.phase_deg, found.phase_low_deg, found.phase_high_deg),
@@ -120,8 +120,8 @@ def _response_figures(report: DesignReport) -> list[_Figure]:
         unit = "gain" if title == "Gain" else "phase, °"
         line = Line(found.f_hz, middle, "after main", "")
         chart = Chart(
-            about=f"{title} of axis {report.axis.upper()} against frequency, with the range of "
-            f"{len(report.plant.members)} plants.",
+            about=f"{title} of axis {report.axis.upper()} against frequency"
+            + (f", with the range of {len(report.plant.members)} plants." if several else "."),
             x_title="Hz",
             y_title=unit,
             lines=[line],

@@ -125,7 +125,8 @@ def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None)
         plan_file(printed, target, machine, rate_hz=_RATE_HZ, progress=progress)
         with np.load(target) as motion:
             rows = np.stack([motion["x"], motion["y"]])
-    fastest = max(machine.command.velocity_mm_s, machine.firmware.fastest_mm_s)
+    by_axis = [machine.command.of(axis).velocity_mm_s for axis in ("x", "y")]
+    fastest = max(*by_axis, machine.firmware.fastest_mm_s)
     step = np.diff(rows)
     step[np.abs(step) > 2.0 * fastest / _RATE_HZ] = 0.0
     rows[:, 1:] = rows[:, :1] + np.cumsum(step, axis=1)

@@ -107,7 +107,7 @@ class BinaryGcode:
     text : BinaryIO
         Receives the G-code, at its present position.
     progress : callable
-        Is progress the share of the file that was read, now and then.
+        Is given the share of the file that was read, now and then.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from stillpath.gcode.slicers.facts import SlicerFacts, read_facts
 __all__ = ["Container", "ShareCallback", "open_text", "rewriting"]
 
 ShareCallback = Callable[[float], None]
-"""Is progress the share that is done, now and then; may raise to stop the work."""
+"""Is given the share that is done, now and then; may raise to stop the work."""
 
 _COMPARED_BYTES = 1 << 20
 _NAMES = {Kind.TEXT: "plain G-code", Kind.BGCODE: "binary G-code", Kind.THREEMF: "a 3MF package"}

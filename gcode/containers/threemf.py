@@ -63,8 +63,8 @@ class ThreeMf:
         The file; read again when another is written.
     text : BinaryIO
         Receives the G-code.
-    told : callable
-        Is told the share of the plate that was read, now and then.
+    progress : callable
+        Is given the share of the plate that was read, now and then.
     plate : int, optional
         Which plate; needed if several are sliced.
 

@@ -158,7 +158,7 @@ class Marlin(FirmwareFacts):
 
     @property
     def fastest_mm_s(self) -> float:
-        """Highest configured speed of X and Y."""
+        """Highest configured speed that X and Y both have."""
         return min(self.planner.max_feedrate_mm_s.x, self.planner.max_feedrate_mm_s.y)
 
     @property

@@ -4,7 +4,7 @@ Every line of our own stands by itself and carries `MARK`. Whoever deletes the l
 has the original, byte for byte.
 
 The file's own commands keep their meaning. Where it sets an acceleration, or a shaper, ours is set
-again after; before lines that may do anything (homing, macros, pauses, a change of tool) the
+again after it; before lines that may do anything (homing, macros, pauses, a change of tool) the
 printer gets back what the file has set, and after them ours again.
 """
 
@@ -76,7 +76,7 @@ class AdviceWriter:
         self._shaped = False
         self._own_shaper: dict[bytes, bytes] = {}
         """The file's own commands that set a shaper, the last of each form."""
-        # A line may hold others before it and after.
+        # A line may hold others before and after it.
         self._sets_shaper = re.compile(
             rb"\b%s\b(?:(?![GMT]\d)[^;])*" % adviser.shaper_word.encode(), re.IGNORECASE
         )

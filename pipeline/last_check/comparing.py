@@ -58,12 +58,15 @@ class LastCheckError(Exception):
         Lines of the original and of the written file, from 1.
     reason : str
         What was found there.
+    stream_line : int
+        Line of the original at which the last stream before begins; 0 where there is none.
     """
 
     exit_code = 1
 
     def __init__(self, message: str, line: int, written_line: int) -> None:
         self.line, self.written_line, self.reason = line, written_line, message
+        self.stream_line = 0
         super().__init__(
             f"the last check refuses the written file at its line {written_line} (line {line} of "
             f"the original): {message}. This is an error of Stillpath, nothing was written: "
@@ -118,7 +121,7 @@ class LastCheck:
         self._words = np.zeros(at.WORD_COUNT)
         self._idle: set[bytes] = set()
         """Lines of ours that leave place and modes as they are."""
-        self._streaming = False
+        self._streaming, self._stream_line = False, 0
         self._begun: deque[Place] = deque(maxlen=16)
         """Where the original was after its last lines within the stream."""
         self._wanted: Wanted | None = None
@@ -162,7 +165,9 @@ class LastCheck:
             self._rest = []
             self._compare_all()
         if expected := self._original.peek():
-            raise self._missing(self._original.text.line, expected)
+            error = self._missing(self._original.text.line, expected)
+            error.stream_line = self._stream_line
+            raise error
         if self._gap_line:
             self._close_gap("the end")
         gaps = list(self._gaps)
@@ -177,11 +182,15 @@ class LastCheck:
 
     def _compare_all(self) -> None:
         written = self._written
-        while not written.is_read:
-            if self._streaming:
-                self._stream()
-            else:
-                self._lines()
+        try:
+            while not written.is_read:
+                if self._streaming:
+                    self._stream()
+                else:
+                    self._lines()
+        except LastCheckError as error:
+            error.stream_line = self._stream_line
+            raise
 
     def _lines(self) -> None:
         """Follow what stands outside of streams: moves of both, and another line."""
@@ -223,6 +232,7 @@ class LastCheck:
             written.skip(behind)
             if line.startswith(_ON):
                 self._streaming, self._wanted = True, None
+                self._stream_line = original.line
                 self._begun.clear()
                 self._begun.append(self._original.place())
             return

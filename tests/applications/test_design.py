@@ -369,7 +369,14 @@ def test_page_and_files(tmp_path: Path, ensemble: DesignReport) -> None:
     assert len(page.about) == 2 + 2 + 6
     assert all("against" in about for about in page.about)
     assert text.count('class="band"') == 2
-    for words in ("fbf ensemble", "mzv", "remark 4.5", "taken", "zv", "no measurement told it"):
+    for words in (
+        "fbf ensemble",
+        "mzv",
+        "remark 4.5",
+        "taken",
+        "zv",
+        "from the model; not measured",
+    ):
         assert words in text
     hostile = ensemble.model_copy(update={"machine_title": "<script>alert(1)</script>"})
     assert "<script" not in render_design(hostile)

@@ -168,4 +168,5 @@ class MarlinAdapter:
         climb = np.abs(travel_mm[:, 2])
         steep = climb > STEEPEST * length
         fast = self._firmware.planner.max_feedrate_mm_s.z * length
-        return np.asarray(steep | (climb * self._command.velocity_mm_s > fast))
+        velocity_mm_s = max(self._command.of(axis).velocity_mm_s for axis in ("x", "y"))
+        return np.asarray(steep | (climb * velocity_mm_s > fast))

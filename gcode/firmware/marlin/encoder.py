@@ -85,7 +85,10 @@ def stream_limits(
     if own.linear_advance_k_s > 0.0:
         feed += 2.0 * max(advance_speed_mm_s(own, classic_jerk=jerk) for jerk in (False, True))
     x, y = command.of("x"), command.of("y")
-    accel, step = max(x.accel_mm_s2, y.accel_mm_s2), corner_step_mm_s(command)
+    accel, step = (
+        max(x.accel_mm_s2, y.accel_mm_s2),
+        max(corner_step_mm_s(x), corner_step_mm_s(y)),
+    )
     motors = command.motors or MotorLimits()
     slope = mesh_slope + STEEPEST
     # Along a mesh Z takes a step within one segment, and none within the next.
