@@ -209,7 +209,8 @@ def _final_job(
     A piece that the last check refuses stays as sliced, as one that any other check refuses.
     """
     # Within a budget a file may be written more than once: only the last time is traced.
-    traced = None if _Job.has_budget(order.options) else trace
+    again = _Job.has_budget(order.options) or order.options.max_mb is not None
+    traced = None if again else trace
     budget: SpeedBudget | None = None
     layers = file.layers
     while True:

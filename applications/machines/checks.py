@@ -287,6 +287,9 @@ def envelope_warnings(machine: Machine) -> list[str]:
             by_axis = axis in stated.axes and stated.axes[axis].accel_mm_s2 is not None
             place = f"axes.{axis}.accel_mm_s2" if by_axis else "accel_mm_s2"
             found[place] = (asked, min(most, found.get(place, (asked, most))[1]))
+    motors = [limits.motors and limits.motors.accel_mm_s2 for limits in (stated, derived)]
+    if motors[0] and motors[1] and motors[0] > _NOT_MORE * motors[1]:
+        found["motors.accel_mm_s2"] = (motors[0], motors[1])
     return [
         f"{machine.name}: a command may ask the motors for {asked:.0f} mm/s2 (command.{place}), "
         f"more than {_ACCEL_ROOM:g} times what the printer allows a file "

@@ -42,13 +42,16 @@ class KlipperAdapter:
         if left >= needed:
             return None
         least = needed * self._machine.mesh_slope
+        stated = (
+            "motors.accel_mm_s2" if needed < self._machine.command.accel_mm_s2 else "accel_mm_s2"
+        )
         return (
             f"the bed mesh rises by up to {self._machine.mesh_slope:g} mm per mm (mesh_slope), and "
             f"Z, which follows it, leaves X and Y an acceleration of {left:.0f} mm/s2 "
             f"(firmware.planner.max_z_accel_mm_s2 = "
             f"{self._firmware.planner.max_z_accel_mm_s2:g}); a command may ask for "
-            f"{needed:.0f} (command.accel_mm_s2): level the bed, raise max_z_accel in printer.cfg "
-            f"and here to {least:.0f}, or lower command.accel_mm_s2. Or use --method advise, which "
+            f"{needed:.0f} (command.{stated}): level the bed, raise max_z_accel in printer.cfg "
+            f"and here to {least:.0f}, or lower command.{stated}. Or use --method advise, which "
             "leaves all moves as they are and sets the firmware's own shaper."
         )
 
