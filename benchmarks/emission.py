@@ -25,8 +25,8 @@ from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
-from stillpath.pipeline import compensate
 from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.job import Attempt, Job, Order
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.result import Result
@@ -64,7 +64,7 @@ class Spread:
         return float(_BIN_UM * (1 + np.searchsorted(total, share * total[-1])))
 
 
-class Watched(compensate._Job):
+class Watched(Job):
     """The pipeline, with every verified piece measured."""
 
     def prepare(self) -> None:
@@ -74,7 +74,7 @@ class Watched(compensate._Job):
         """What of the extruding motion's distance lies along the command and across it."""
         self.late_s = self.off_grid_s = self.end_mm = 0.0
 
-    def _attempt(self, piece: Piece, paced: Piece) -> compensate._Attempt:
+    def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
         found = super()._attempt(piece, paced)
         self._watch(piece, found.made, found.executed)
         return found
@@ -121,7 +121,7 @@ def watched(
     """Compensate a file on the watched pipeline."""
     options = Options(tolerance_um=tolerance_um)
     with source.open("rb") as text, target.open("wb") as written:
-        job = Watched(text, written, compensate._Order(machine, options, cache))
+        job = Watched(text, written, Order(machine, options, cache))
         job.prepare()
         return job, job.run(source.name, SlicerFacts())
 

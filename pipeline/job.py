@@ -1,0 +1,724 @@
+"""One run of the pipeline over a file: read, compensated, written, read back and measured.
+
+A file is read block by block, cut into pieces and verbatim parts, and written in order. Every piece
+that was changed is read back from the bytes as written, planned by the firmware's rules and
+compared with what it should do; a piece that fails is written as sliced. All figures come from that
+motion.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, TypeVar
+
+import numpy as np
+
+from stillpath.compensation.base import DesignError
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.planning import intended, join_phases
+from stillpath.gcode.firmware.registry import adapter
+from stillpath.gcode.firmware.writing import StreamWriter
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
+from stillpath.gcode.plan import plan_moves
+from stillpath.gcode.sampler import sample_phases, sample_until
+from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.slicers.retiming import Retiming
+from stillpath.gcode.splitter import Splitter
+from stillpath.gcode.types import EventKind, Events, Moves, Phases
+from stillpath.models.confirmation import confirmation_text
+from stillpath.models.errors import ModelError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.caution import caution_for, prediction_note
+from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.files import Discarding, default_cache_dir
+from stillpath.pipeline.last_check.comparing import LastCheck, LastCheckError
+from stillpath.pipeline.measuring.layer_files import LayerWriter
+from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.points import MotionSamples, part_of
+from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.measuring.tracing import Trace
+from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.pacing.budget import SpeedBudget
+from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
+from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.piece_compensator import (
+    DT_S,
+    CompensatedPiece,
+    PieceCompensator,
+    Unfit,
+    as_executed,
+    deviation,
+)
+from stillpath.pipeline.progress import ProgressCallback, ProgressReports
+from stillpath.pipeline.reading import dialect_for, doubts, passed_over
+from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
+from stillpath.pipeline.selection import Selection, TooLarge
+from stillpath.pipeline.simulate import STANDING_S
+from stillpath.pipeline.totals import Totals
+from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
+from stillpath.version import __version__
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
+
+__all__ = ["Attempt", "Job", "Order"]
+
+T = TypeVar("T", bound=VerbatimPart)
+
+_BLOCK_BYTES = 1 << 17
+_CHUNK = 1 << 17
+_ALL = -1
+_MOST_REFUSED = 3
+"""Pieces that are reverted one by one after the last check; then all are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a file is compensated with.
+
+    Attributes
+    ----------
+    refused : dict
+        Why pieces stay as sliced, by one of their lines (`_ALL`: every piece).
+    """
+
+    machine: Machine
+    options: Options
+    cache_dir: Path | None = None
+    progress: ProgressCallback | None = None
+    refused: dict[int, str] = field(default_factory=dict)
+
+    def reverting(self, error: LastCheckError, pieces: Sequence[tuple[int, int]]) -> Order:
+        """Return an order without the piece in which the last check found fault.
+
+        Parameters
+        ----------
+        pieces : sequence of (int, int)
+            First and last lines of the compensated pieces, rising.
+
+        Raises
+        ------
+        LastCheckError
+            When every piece was reverted already.
+        """
+        piece = next((first for first, last in pieces if last >= error.stream_line), None)
+        if piece is None or error.stream_line == 0 or _ALL in self.refused:
+            raise error
+        if len(self.refused) == _MOST_REFUSED:
+            others = f"as the last check refused more than {_MOST_REFUSED} pieces, all are reverted"
+            return replace(self, refused={**self.refused, _ALL: others})
+        reason = (
+            f"line {piece}: internal error (the last check refuses the compensated lines: "
+            f"{error.reason}); please report it with the file"
+        )
+        return replace(self, refused={**self.refused, piece: reason})
+
+    def refusal(self, first: int, last: int) -> str | None:
+        """Return why a piece with these lines stays as sliced, if it does."""
+        found = (reason for line, reason in self.refused.items() if first <= line <= last)
+        return next(found, self.refused.get(_ALL))
+
+
+_SAID = (Unfit, GcodeError, DesignError, ModelError)
+"""What says of itself why a piece cannot be compensated."""
+_FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
+"""With those of our own: a piece that meets one stays as sliced, and the others are printed."""
+
+
+def _counting_rms_um(channel: Channel) -> float:
+    selected_um = channel.selected_rms_um
+    return channel.extruding.contour_rms_um if selected_um is None else selected_um
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """A piece as it may be written."""
+
+    made: CompensatedPiece
+    executed: Phases
+    gap_mm: np.ndarray
+    text: bytes
+    motion: MotionSamples
+
+
+class Job:
+    """State of one file on its way.
+
+    What is written waits in the target for its times: `retiming` knows how to copy it.
+    """
+
+    def __init__(
+        self,
+        source: BinaryIO,
+        target: BinaryIO,
+        order: Order,
+        layers: LayerWriter | None = None,
+        trace: Callable[[Trace], None] | None = None,
+        budget: SpeedBudget | None = None,
+    ) -> None:
+        machine, options = order.machine, order.options
+        self._order, self._layers = order, layers
+        self.compensated: list[tuple[int, int]] = []
+        self._source, self._target = source, target
+        self._machine, self._options = machine, options
+        self._reports = ProgressReports(order.progress)
+        self._clock = StageClock()
+        self._changes = options.method != "none"
+        self._adapter = adapter(machine)
+        self._rounds = max(self._adapter.step_mm[:2]) > 0.0
+        if self._changes and self._adapter.refusal is not None:
+            raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
+        self._design(order.cache_dir or default_cache_dir())
+        dialect = dialect_for(machine, options.dialect)
+        self._length = LengthGuard(source, machine, dialect)
+        self._reader = Interpreter(machine, dialect=dialect)
+        self._checker = Interpreter(machine, dialect=dialect)
+        self._splitter = Splitter(machine, compensate=self._changes)
+        self._selection = Selection(options.where, machine)
+        self._operation = Operation(machine)
+        self._budget = budget
+        self._pairs: BudgetMeasurement | None = None
+        self._measurement = self._measuring(trace)
+        if self._changes:
+            self._verifier = Verifier(machine, options.tolerance_um)
+            self._writer = StreamWriter(self._adapter, stamp(machine, options))
+        ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
+        self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
+        self._sum = Totals()
+        self._sum.warnings += doubts(source, machine, options.dialect)
+        if options.budget_um is not None and not self._changes:
+            self._sum.warnings.append("The method none changes nothing: the budget was not used.")
+
+    def _design(self, cache_dir: Path) -> None:
+        """Tune the reference shaper and design the command."""
+        machine, options = self._machine, self._options
+        # A method that cannot be designed says so before the reference shaper takes its seconds.
+        tuned_first = options.method.startswith("shaper:")
+        if self._changes and not tuned_first:
+            self._say("designing", 0.0)
+            with self._clock.stage("design"):
+                self._work = PieceCompensator(machine, options)
+        self._say("tuning the shaper to compare with", 0.0)
+        with self._clock.stage("reference shaper"):
+            self._shaper = cached_shaper(machine, cache_dir, DT_S)
+            chosen = caution_for(machine, options, self._shaper, cache_dir, DT_S)
+        self._caution = chosen[0] if chosen else None
+        self._choice = chosen[1] if chosen else None
+        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
+        if tuned_first or self._caution is not None:
+            self._work = PieceCompensator(machine, options, self._shaper, self._caution)
+
+    def _measuring(self, trace: Callable[[Trace], None] | None) -> Measurement:
+        """Return the measurement of the written file; with a budget, of every pace as well."""
+        take_layer = self._layers.add if self._layers else None
+        size = self._source.seek(0, io.SEEK_END)
+        if self.has_budget(self._options):
+            self._pairs = BudgetMeasurement(
+                self._machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
+            )
+            return self._pairs
+        return Measurement(
+            self._machine,
+            DT_S,
+            self._shaper,
+            compensated=True,
+            take_layer=take_layer,
+            trace=trace,
+            size=size,
+        )
+
+    @staticmethod
+    def has_budget(options: Options) -> bool:
+        """Tell whether paces are chosen."""
+        return options.budget_um is not None and options.method != "none"
+
+    @property
+    def gentler(self) -> SpeedBudget | None:
+        """What the file must be written with instead, where it exceeds its budget."""
+        if self._budget is None or self._pairs is None:
+            return None
+        return self._budget.gentler(self._pairs.sums())
+
+    @property
+    def same(self) -> SpeedBudget | None:
+        """What the file was written with."""
+        return self._budget.again() if self._budget is not None else None
+
+    @property
+    def delay_s(self) -> float:
+        """How much later than the original the written file is where the pipeline has come to."""
+        return self._sum.time_s - self._sum.original_s
+
+    def run(self, name: str, facts: SlicerFacts) -> Result:
+        """Write the file, but for its times, and return what it measures.
+
+        Raises
+        ------
+        GcodeError, TooLarge
+        """
+        size = max(self._source.seek(0, io.SEEK_END), 1)
+        if self._pairs is not None and self._budget is None:
+            self._budget = self._chosen_paces(size)
+        self._source.seek(0)
+        for item in self._selected():
+            self._point = self._operation.at(item.moves)
+            self._measurement.operate_at(self._point)
+            if isinstance(item, Piece):
+                self._piece(item)
+            else:
+                self._verbatim(item)
+            self._operation.passed(item.moves)
+            self._say("compensating", self._source.tell() / size)
+        if self._sum.moves == 0:
+            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
+        if self._changes:
+            text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
+            self._wait(switching_s(self._checker.push(text)))
+            self._emit(text)
+        self._measurement.finish()
+        if self._layers is not None:
+            self._layers.finish(self._reader.feature_names)
+        return self._result(name, size, facts)
+
+    def checked(self, result: Result) -> Result:
+        """Compare the file as it will be delivered with the original.
+
+        Raises
+        ------
+        LastCheckError
+        """
+        if not self._changes:
+            self._say("done", 1.0)
+            return result
+        shortest_mm = 2.0 * self._adapter.shortest_move_mm
+        check = LastCheck(
+            Discarding(), self._source, self._machine, self._adapter.step_mm, shortest_mm
+        )
+        self.deliver(check)
+        figures = check.finish()
+        self._say("done", 1.0)
+        stage = StageTime(stage="last check", cpu_s=round(check.cpu_s, 4))
+        return result.model_copy(update={"last_check": figures, "stages": [*result.stages, stage]})
+
+    def deliver(self, text: SupportsWrite[bytes]) -> None:
+        """Write the file with its new times."""
+        self._target.seek(0)
+        self.retiming.copy(self._target, text, self.delay_s)
+
+    def _chosen_paces(self, size: int) -> SpeedBudget:
+        """Find how quick the print may be."""
+        self._source.seek(0)
+        with self._clock.stage("budget"):
+            found = take_samples(
+                self._source,
+                self._machine,
+                dialect_for(self._machine, self._options.dialect),
+                lambda read: self._say("choosing speeds", read / size),
+            )
+            return SpeedBudget.chosen(
+                found, self._machine, self._options, self._shaper, self._caution
+            )
+
+    def _selected(self) -> Iterator[Piece | VerbatimPart]:
+        for item in self._items():
+            before_s, names = self._sum.original_s, self._reader.feature_names
+            yield from self._timed(self._selection.divide(item, names))
+            if isinstance(item, Piece) and self._options.where != "all":
+                # The sliced file does not stand still where it was divided.
+                self._sum.original_s = before_s + item.phases.duration_s
+
+    def _items(self) -> Iterator[Piece | VerbatimPart]:
+        while True:
+            with self._clock.stage("read"):
+                data = self._source.read(_BLOCK_BYTES)
+                blocks = self._reader.push(data) if data else self._reader.flush()
+            for block in blocks:
+                if np.any(block.events.kind == EventKind.STAMP):
+                    row = int(np.argmax(block.events.kind == EventKind.STAMP))
+                    raise GcodeError(
+                        "this file was already processed by stillpath; compensate the original",
+                        line=int(block.events.line[row]),
+                    )
+                yield from self._timed(self._splitter.push(block))
+            if not data:
+                yield from self._timed(self._splitter.flush())
+                return
+
+    def _timed(self, items: Iterator[T]) -> Iterator[T]:
+        while True:
+            with self._clock.stage("plan"):
+                item = next(items, None)
+            if item is None:
+                return
+            yield item
+
+    def _piece(self, piece: Piece) -> None:
+        delay_s = self.delay_s
+        self._sum.pieces += 1
+        self._sum.moves += len(piece.moves)
+        original_s = piece.phases.duration_s
+        self._check_end(piece, original_s)
+        self._sum.original_s += original_s
+        lines = int(piece.moves.line[0]), int(piece.moves.line[-1])
+        refusal = self._order.refusal(*lines)
+        if refusal is not None:
+            if self._budget is not None:
+                next(self._budget.paced(piece))  # which counts it
+            self._put_back(piece, original_s, refusal)
+            return
+        if self._sum.jumped:
+            # Homed, say: the machine did not come here along the path.
+            self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
+            self._sum.jumped = False
+        switched_s = self._switched_off_s()
+        for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
+            try:
+                attempt = self._attempt(piece, paced)
+                break
+            except Unfit as error:
+                reason = str(error)
+            except GcodeError as error:  # its line is one of what was written
+                reason = f"the firmware would refuse the compensated lines: {error.message}"
+        else:
+            self._sum.time_s -= switched_s
+            self._put_back(piece, original_s, reason)
+            return
+        self.compensated.append(lines)
+        self._work.compensator.commit()
+        self._verifier.passed(attempt.motion.executed_mm)
+        self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
+        with self._clock.stage("measure"):
+            # The last sample of an item is the first one of the next.
+            self._measure_piece(piece, part_of(attempt.motion, 0, len(attempt.motion) - 1))
+        late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
+        self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
+
+    def _switched_off_s(self) -> float:
+        """Stand still where a piece that comes now begins with a line that makes the machine stand.
+
+        Before it is compensated: vibration dies down meanwhile.
+        """
+        lines = self._writer.switching_off
+        seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
+        if seconds > 0.0:
+            self._wait(seconds)
+        return seconds
+
+    def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
+        """Compensate and write a piece at a pace and read it back; or leave everything as it was.
+
+        Parameters
+        ----------
+        piece, paced : Piece
+            As it came, and as its moves are planned now.
+        """
+        writer, checker = copy.copy(self._writer), None
+        try:
+            with self._clock.stage("compensate"):
+                made = self._work.compensate(paced, self._point)
+            with self._clock.stage("write"):
+                text = self._writer.piece(piece, made.encoded, self._checker.extruder_mm)
+            with self._clock.stage("read back"):
+                checker = self._checker.snapshot()
+                executed = self._read_back(text)
+                gap_mm = deviation(made, executed)
+                self._verifier.check_motion(piece, made, gap_mm, executed)
+            with self._clock.stage("measure"):
+                motion = self._motion(piece, paced, made, executed)
+                if self._budget is None:
+                    self._verifier.check_gain(motion, self._point)
+        except _FAULTS as error:
+            self._writer = writer
+            if checker is not None:
+                self._checker = checker
+            if isinstance(error, _SAID):
+                raise
+            raise Unfit(
+                f"line {int(piece.moves.line[0])}: internal error ({type(error).__name__}: "
+                f"{error}); please report it with the file"
+            ) from error
+        return Attempt(made, executed, gap_mm, text, motion)
+
+    def _motion(
+        self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
+    ) -> MotionSamples:
+        """Planned and executed motion of a piece on one grid of real time."""
+        asked = self._asked(paced, paced.phases)
+        planned, position, row, extruding = as_executed(made, asked, executed)
+        came = planned
+        if self._rounds:
+            moved = replace(paced.phases, t_s=made.encoded.row_start_s)
+            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
+        return self._samples(piece, row, planned, position, extruding, came)
+
+    def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
+        if self._budget is None or self._pairs is None:
+            self._measurement.add(written)
+            return
+        phases = piece.phases
+        grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
+        path, row = sample_phases(self._asked(piece, phases), grid)
+        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+        sliced = self._samples(piece, row, path, came, feeding(phases)[row], came)
+        self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
+        self._budget.correct(self._pairs.sums())
+
+    def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
+        """Let a piece stay as sliced."""
+        phases = piece.phases
+        row_s = phases.accel_s + phases.cruise_s + phases.decel_s
+        extruding_s = float(np.sum(row_s[feeding(phases)]))
+        self._sum.put_back.append(
+            PutBack(
+                line_first=int(piece.moves.line[0]),
+                line_last=int(piece.moves.line[-1]),
+                seconds=seconds,
+                extruding_seconds=extruding_s,
+                reason=reason,
+            )
+        )
+        self._sum.original_s -= seconds
+        self._sum.moves -= len(piece.moves)
+        if self._budget is not None:
+            self._budget.passed(-seconds)
+        self._verbatim(piece)
+
+    def _verbatim(self, verbatim: VerbatimPart) -> None:
+        text = verbatim.text
+        if self._changes:
+            text = self._writer.verbatim(verbatim, self._checker.extruder_mm)
+            with self._clock.stage("read back"):
+                blocks = self._checker.push(text)
+            # Lines of ours make it stand too, or its own longer than they did.
+            self._wait(switching_s(blocks) - switching_s([verbatim]))
+        self._emit(text, verbatim, self.delay_s)
+        self._sum.moves += len(verbatim.moves)
+        self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
+        with self._clock.stage("plan"):
+            parts = list(plan_verbatim(verbatim, self._machine))
+        seconds = sum(takes_s(part) for part in parts)
+        self._check_end(verbatim, seconds)
+        if self._budget is not None:
+            self._budget.passed(seconds)
+        with self._clock.stage("measure"):
+            for part in parts:
+                if part is None:
+                    self._measurement.jump()
+                    self._observe(None)
+                elif isinstance(part, Phases):
+                    self._measure_verbatim(verbatim, part)
+                else:
+                    self._stand(part)
+
+    def _check_end(self, item: VerbatimPart, seconds: float) -> None:
+        lines: Moves | Events = item.moves if len(item.moves) else item.events
+        if len(lines):
+            self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
+
+    def _measure_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
+        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        motion_s = phases.duration_s
+        self._sum.original_s += motion_s
+        self._sum.time_s += motion_s
+        feeds = feeding(phases)
+        extruding_s = float(np.sum(duration[feeds]))
+        self._sum.extruding_s += extruding_s
+        if isinstance(verbatim, LeftOut):
+            self._sum.left_out_s += motion_s
+            self._sum.left_out_extruding_s += extruding_s
+        else:
+            self._sum.passed_motion_s += motion_s
+        if np.any(feeds) and not isinstance(verbatim, LeftOut):
+            self._sum.passed_s += extruding_s
+            first = phases.move_index[int(np.argmax(feeds))]
+            self._sum.passed_line = self._sum.passed_line or int(verbatim.moves.line[first])
+        until = np.where(feeds, phases.t_s + duration, -np.inf)
+        asked = self._asked(verbatim, phases)
+        samples = max(round(motion_s / DT_S), 1)
+        for start in range(0, samples, _CHUNK):
+            n = min(_CHUNK, samples - start)
+            grid = (start * DT_S, DT_S, n)
+            path, row, extruding = sample_until(asked, grid, until, axes=3)
+            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+            at = phases.move_index[row]
+            self._measurement.add(self._samples(verbatim, at, path, came, extruding, came))
+            self._observe(path[:2])
+
+    def _samples(
+        self,
+        item: Piece | VerbatimPart,
+        row: np.ndarray,
+        planned: np.ndarray,
+        executed: np.ndarray,
+        extruding: np.ndarray,
+        sliced: np.ndarray,
+    ) -> MotionSamples:
+        """Return the samples of an item whose moves have been counted.
+
+        `sliced` is how the sliced file is executed, where the firmware rounds.
+        """
+        return MotionSamples(
+            path_mm=planned[:2],
+            executed_mm=executed[:2],
+            z_mm=planned[2],
+            extruding=extruding,
+            row=row,
+            moves=item.moves,
+            first_move=self._sum.moves - len(item.moves),
+            sliced_mm=sliced if self._rounds else None,
+        )
+
+    def _asked(self, item: Piece | VerbatimPart, phases: Phases) -> Phases:
+        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._adapter.step_mm)
+
+    def _stand(self, dwell_s: float) -> None:
+        """Let the machine stand where it is."""
+        self._sum.original_s += dwell_s
+        self._wait(dwell_s)
+
+    def _wait(self, dwell_s: float) -> None:
+        """Let the machine stand in the written file."""
+        self._sum.time_s += dwell_s
+        if dwell_s <= 0.0:
+            return
+        stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
+        if stood is not None:
+            self._observe(stood)
+
+    def _observe(self, command: np.ndarray | None) -> None:
+        if not self._changes:
+            return
+        self._verifier.passed(command)
+        if command is None:
+            self._sum.jumped = True
+            return
+        if self._sum.jumped and command.shape[1]:
+            self._work.compensator.reset(command[:, 0])
+            self._sum.jumped = False
+        self._work.compensator.observe(command)
+
+    def _read_back(self, text: bytes) -> Phases:
+        """Plan the written lines of a piece by the firmware's rules."""
+        blocks = self._checker.push(text)
+        parts = [(block.moves, block.limits) for block in blocks if len(block.moves)]
+        if len(parts) == 1:
+            return plan_moves(parts[0][0], parts[0][1], self._machine)
+        planner = self._adapter.planner()
+        phases = [planner.push_moves(moves, limits) for moves, limits in parts]
+        phases.append(planner.flush())
+        return join_phases(phases)
+
+    def _emit(
+        self, text: bytes, item: VerbatimPart | None = None, delay_s: float | np.ndarray = 0.0
+    ) -> None:
+        self._sum.written += len(text)
+        most_mb = self._options.max_mb
+        if most_mb is not None and self._sum.written > 1e6 * most_mb:
+            raise TooLarge
+        self._target.write(text)
+        self.retiming.push(text, item, delay_s)
+
+    def _say(self, stage: str, fraction: float) -> None:
+        self._reports.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
+
+    def _shaper_warnings(self) -> Iterator[str]:
+        if self._writer.shaper_unknown:
+            yield (
+                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
+                "is switched off and stays off; set it again after the print."
+            )
+        if self._writer.shaper_note is not None:
+            yield self._writer.shaper_note
+
+    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
+        """Yield a warning where the firmware's shaper, without compensation, would do better."""
+        ours, shaper = rms_um["after"], rms_um["shaper"]
+        compared = self._budget is None and not self._options.method.startswith("shaper:")
+        if not compared or ours < max(shaper, NEGLIGIBLE_UM):
+            return
+        yield (
+            f"The firmware's own shaper would serve this file better: {self._shaper.label} alone "
+            f"would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
+            "Print it as sliced with that shaper, or let --method advise write the commands"
+        )
+
+    def _channels(self) -> list[Channel]:
+        """Return the figures of the whole print, with what counts where a part is compensated."""
+        channels = self._measurement.channels()
+        if self._options.where != "all":
+            features = self._measurement.features(self._reader.feature_names)
+            rms_um = self._selection.rms_um(features)
+            channels = [
+                c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
+            ]
+        if self._choice is not None:
+            channels = [self._choice.ranged(channel) for channel in channels]
+        return channels
+
+    def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
+        total, measured = self._sum, self._measurement
+        channels = self._channels()
+        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
+        notes = [*self._standing, *self._operation.notes()]
+        if self._changes:
+            warnings += self._shaper_warnings()
+            warnings += total.left_alone()
+            warnings += self._outdone({c.name: _counting_rms_um(c) for c in channels})
+            notes += total.left_out(self._options.where)
+        shaper, budget = self._shaper, None
+        if self._budget is not None and self._pairs is not None:
+            names, sums = self._reader.feature_names, self._pairs.sums()
+            budget = self._budget.figures(sums, names, total.original_s, total.time_s)
+            warnings += self._budget.warnings(sums, names)
+            notes.append(self._pairs.note)
+        return Result(
+            version=__version__,
+            machine=self._machine.name,
+            machine_title=self._machine.title,
+            machine_revision=self._machine.revision,
+            settings=self._options.model_dump(exclude_none=True),
+            source_name=name,
+            channels=channels,
+            best_shaper=shaper.label,
+            original_time_s=total.original_s,
+            time_s=total.time_s,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
+            original_bytes=size,
+            written_bytes=total.written,
+            segments=total.segments,
+            segments_per_s=total.segments / total.compensated_s if total.compensated_s else 0.0,
+            peak_segments_per_s=total.peak_rate,
+            peak_velocity_mm_s=total.peak_velocity,
+            peak_accel_mm_s2=total.peak_accel,
+            emission_rms_um=1e3 * np.sqrt(total.gap2 / max(total.gap_count, 1)),
+            emission_max_um=1e3 * total.gap_max,
+            filament_error_mm=total.filament_error,
+            compensated_s=total.compensated_s,
+            extruding_s=total.extruding_s,
+            pieces=total.pieces,
+            put_back=total.put_back,
+            put_back_extruding_share=total.put_back_share,
+            left_out_s=total.left_out_s,
+            left_out_extruding_s=total.left_out_extruding_s,
+            left_alone_s=total.left_alone_s if self._changes else 0.0,
+            left_alone_extruding_s=total.left_alone_extruding_s if self._changes else 0.0,
+            warnings=warnings,
+            notes=notes,
+            confirmation=confirmation_text(self._machine) if self._changes else "",
+            layers=measured.layers(),
+            features=measured.features(self._reader.feature_names),
+            track=measured.track(),
+            spectra=measured.spectra(),
+            layer_views=measured.layer_views(),
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            budget=budget,
+        )
