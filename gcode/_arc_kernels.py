@@ -206,7 +206,8 @@ def arc(
         angle = -2.0 * pi if clockwise else 2.0 * pi
     elif clockwise:
         angle -= 2.0 * pi
-    nothing = nothing and not whole
+    # A full turn back, rounded, is none either.
+    nothing = (nothing or (rule == _MARLIN_2_1 and angle == 0.0)) and not whole
     turns = 0
     if mask & (1 << _P) and _MARLIN_2_0 <= rule <= _MARLIN_2_1 and not nothing:
         turns = int(max(0.0, min(w[_P], 65535.0)))

@@ -149,6 +149,11 @@ MINUS_ZERO = (
     "G-0 Z1.600000\nG1 X137.602 Y157.403 E0.11812\n"
 )
 """G-0 is G0, whose speed is the file's."""
+NO_TURN = (
+    "G91\nG0 X100.0 Y100 F30\nG0 X100.001 Y92 E-0.11247 F18000\nG1 X106 E0.19595\n"
+    "G1 X87 Y100.61055 E-0.22675\nG1 X100.7 E0.13458 F600\nG2 X100 Y100.0 I-0.032 J-0.032 E.05\n"
+)
+"""An arc by an angle that rounds to a full turn, less a full turn."""
 NO_STEPS = "M83\nG1 F4200 X103.493 Y97.659 E1959.16539\nG1 X103.484 Y97.658\n"
 NO_TIME = (
     "M83\nG1 X120.613 Y120.554 E5.2601\nG1 X120.619 Y120.224 E5.27322\n"
@@ -174,7 +179,17 @@ def test_what_was_found_on_reprapfirmware(tmp_path: Path, cache: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
-    [NO_TIME, NO_STEPS, FLOW, RETRACTION, SWALLOWED, SMALL_LETTER, THERE_AND_BACK, MINUS_ZERO],
+    [
+        NO_TIME,
+        NO_STEPS,
+        FLOW,
+        RETRACTION,
+        SWALLOWED,
+        SMALL_LETTER,
+        THERE_AND_BACK,
+        MINUS_ZERO,
+        NO_TURN,
+    ],
 )
 def test_what_was_found_on_marlin(text: str, tmp_path: Path, cache: Path) -> None:
     data = tagged(text.encode())
