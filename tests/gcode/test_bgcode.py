@@ -133,9 +133,9 @@ def test_without_checksums_damage_is_still_found(tmp_path: Path):
         (binary([]) + struct.pack("<HHIIH", 1, 4, 1, 1, 0) + b"a" * 5, ["block 6", "CRC32"]),
         (
             binary([], checked=False) + struct.pack("<HHIIH", 1, 4, 1, 1, 0) + b"a",
-            ["block 6", "way 4", "plain G-code"],
+            ["block 6", "compression 4", "plain G-code"],
         ),
-        (binary([]) + block(1, b"G28\n", parameters=b"\3\0"), ["block 6", "way 3", "MeatPack"]),
+        (binary([]) + block(1, b"G28\n", parameters=b"\3\0"), ["block 6", "encoding 3", "MeatPack"]),
         (binary([]) + struct.pack("<HHI", 1, 0, 1 << 31), ["block 6", "2147483648 bytes"]),
         (b"GCDE\1\0", ["ends inside the header"]),
     ],
