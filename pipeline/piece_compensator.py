@@ -57,7 +57,7 @@ _SOFT_S = (2e-3, 4e-3, 8e-3)
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Filament is smoothed over so many times its mm per mm, before and after, and no further."""
 _ROUNDED = 1.0 + 1e-9
-_EXTRUDING_EXCESS_MM = 15e-3
+_EXTRUDING_EXCESS_MM = 20e-3
 _TRAVEL_EXCESS_MM = 200e-3
 """How far the executed motion may be from the command beyond the tolerance, at worst."""
 

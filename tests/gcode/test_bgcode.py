@@ -135,7 +135,10 @@ def test_without_checksums_damage_is_still_found(tmp_path: Path):
             binary([], checked=False) + struct.pack("<HHIIH", 1, 4, 1, 1, 0) + b"a",
             ["block 6", "compression 4", "plain G-code"],
         ),
-        (binary([]) + block(1, b"G28\n", parameters=b"\3\0"), ["block 6", "encoding 3", "MeatPack"]),
+        (
+            binary([]) + block(1, b"G28\n", parameters=b"\3\0"),
+            ["block 6", "encoding 3", "MeatPack"],
+        ),
         (binary([]) + struct.pack("<HHI", 1, 0, 1 << 31), ["block 6", "2147483648 bytes"]),
         (b"GCDE\1\0", ["ends inside the header"]),
     ],

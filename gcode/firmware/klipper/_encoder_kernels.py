@@ -15,6 +15,8 @@ RUSH = 0.5
 MOST_LOST = 0.8
 """The law of losses holds where a ramp fits into its segment: more than this part of its time is
 not believed to be lost."""
+CATCH_UP = 0.1
+"""What a stretch is late is made up for by so much of every segment's planned time."""
 _ROUNDS = 3
 _SETTLED_MM_S = 1e-4
 """A speed that changes by less is as good as it gets: F has steps of 1.7e-3 mm/s and more."""
@@ -77,14 +79,15 @@ def assign_speeds(
     (v1 - v2)^2 / (2 a v) at a step between speeds v1 and v2; that loss is taken off first. What
     is lost by braking at the end of a segment hangs on the next one: `braking_s` holds what is
     expected, or was found by the run before, and is renewed. A stretch starts when the rest
-    before it is over: its times move with that.
+    before it is over: its times move with that. Where a segment cannot keep its time, what is owed
+    is made up for by those after it, little by little.
     """
     now = start_s
     before = 0.0
     before_accel = 1.0
     pending = -1
     pending_entry = 0.0
-    late = 0.0
+    late = owed = 0.0
     count = len(length_mm)
     for i in range(count):
         if not ours[i]:
@@ -128,9 +131,14 @@ def assign_speeds(
         if i > 0 and not ours[i - 1]:
             # The stretch starts when its rest is over, whenever that is.
             late = now + planned_s[i] - end_s[i]
+            owed = 0.0
+        made_up = min(owed, CATCH_UP * planned_s[i])
+        owed -= made_up
+        late -= made_up
         available = end_s[i] + late - now - correction_s[i]
         least = max(length_mm[i] / speed_mm_s[i], RUSH * planned_s[i])
         if available < least:
+            owed += least - available
             late += least - available
             available = least
         behind = i > 0 and ours[i - 1]

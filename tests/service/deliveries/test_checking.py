@@ -143,7 +143,7 @@ def _travel(status: dict[str, Any]) -> None:
         (_not_wrapped, "PAUSE", "include stillpath.cfg", False),
         (_m600, "M600", "include stillpath-m600.cfg", False),
         (_old_klipper, "CANCEL_PRINT", "include stillpath.cfg", False),
-        (_old_klipper_in_wrong_order, "PAUSE, CANCEL_PRINT", "behind your own", False),
+        (_old_klipper_in_wrong_order, "PAUSE, CANCEL_PRINT", "after your own", False),
         (_travel, "[stepper_x] position_max", "travel.x.max_mm", False),
     ],
 )
