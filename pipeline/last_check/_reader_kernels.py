@@ -228,6 +228,17 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
 
 
 @kernel(allocates=False)
+def compare_before(before: Any, behind: Any, state: Any, place_mm: Any, filament_mm: float) -> int:
+    """Compare the states before a line of a stream, of which the original knows both.
+
+    Where filament counts anew before it, it does so behind it too.
+    """
+    if isnan(before[FED]) or isnan(state[FED]):
+        behind[FED] = nan
+    return compare(before, state, WITHIN, place_mm, filament_mm)
+
+
+@kernel(allocates=False)
 def ours(
     text: Any,
     at: int,
@@ -281,7 +292,7 @@ def ours(
         if next_at < 0:
             break
         if is_wanted and rests:
-            found = compare(before, state, WITHIN, place_mm, filament_mm)
+            found = compare_before(before, behind, state, place_mm, filament_mm)
             if found != SAME:
                 return at, lines, True, found
         move(state, words, mask)

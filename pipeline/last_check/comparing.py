@@ -126,7 +126,8 @@ class LastCheck:
         """Where the original was after its last lines within the stream."""
         self._wanted: Wanted | None = None
         self._earlier: deque[bytes] = deque(maxlen=64)
-        """Lines that were taken for the first of several with their text; perhaps they were not."""
+        """Lines taken for the first of several with their text, or for ours; perhaps they were not.
+        """
         self._kept = self._compared = 0
         self._gap_line = 0
         self._gaps: list[str] = []
@@ -299,6 +300,8 @@ class LastCheck:
                     if self._came_already():
                         return
                     raise self._strange(code, wanted.code)
+                if self._earlier:
+                    self._earlier.append(code)
                 self._after.carry_out(code)
                 if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
                     self._idle.add(line)
@@ -320,6 +323,8 @@ class LastCheck:
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
                 # Before it too: where E is absolute, what was fed too much comes back with it.
+                if np.isnan(wanted.before[at.FED] + self._after.state[at.FED]):
+                    self._before.state[at.FED] = NAN
                 self._check(wanted.before, at.WITHIN, code, wanted.line, "before")
             if not held_back:
                 self._after.carry_out(code)
@@ -372,6 +377,7 @@ class LastCheck:
             states.append(self._wanted.before)
         for state in states:
             state[at.FED] = NAN
+        self._original.forget_ahead()  # which counts filament from earlier on
 
     def _take(self, wanted: Wanted, *, compared: bool) -> None:
         """Go on after a line that was waited for."""
@@ -379,8 +385,8 @@ class LastCheck:
             self._count(wanted.line)
         else:
             self._kept += 1
-        # A line for the shaper may be ours: lines before the file's own may still come.
-        if _SHAPER.search(wanted.code) is None:
+        # A line that we write too may be ours: lines before the file's own may still come.
+        if not (_IN_STREAM.match(wanted.code) or _SHAPER.search(wanted.code)):
             self._original.perhaps.clear()
         self._original.forget_ahead()
         self._wanted = None

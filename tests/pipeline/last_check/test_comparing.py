@@ -337,6 +337,44 @@ G1 F1800 X118.606 Y121.167 E320.665
 M105
 G1 X118.38 Y122.034 E320.69506
 """
+OUR_OWN_F = """\
+M83
+G1 X115.552 Y116.6 E.00452\rM204 S800
+G1 X133.932 Y100.66 E1.24601
+G1 X133.932 Y100.66 E1.24601
+G1M204 S600
+G1 F1500
+G1 X89.282 Y114.409 E.63564
+"""
+OUR_OWN_LIMITS = """\
+G28 G90
+G0 F9000 X111.255 Y116.123
+G0 F9000 X111.255 Y116.123
+M205 J.013 B20000
+G0 X112.28 Y115.529 G0 X112.28 Y115.529 M900 K.05
+T0\rG1 X117.217 Y118.922 E159.26582
+"""
+UNKNOWN_BEFORE = """\
+M83
+RESTORE_GCODE_STATE NAME=s MOVE=1 MOVE_SPEED=50
+G1 X100 Y100.0 E0.01021
+G90
+G01 X100.068 Y101.409 E0.00734
+M400
+G01 X100.0
+G01 X100 E0.18624
+G1X113.806Y101.6E0.35175F1800
+G01E0.00349
+G3 X101.2 Y101.10904 I0.674 J0.278 E.05
+"""
+EXPRESSION = """\
+G1 X2.121 Y2.121
+G1 X1.928 Y2.298
+{global.x}
+G1
+G1 X-0.261 Y2.989
+G1 X-0.521 Y2.954\rG1 X-0.776 Y2.898
+"""
 ODD_SHAPER = """\
 GM593 P"none"
 G28
@@ -411,6 +449,12 @@ G1X100.64044Y102.24233E-0.31294
         pytest.param("reprapfirmware", SLOW_FLOW, id="slow flow"),
         # Repeated as the file's own line for the shaper.
         pytest.param("reprapfirmware", ODD_SHAPER, id="odd shaper"),
+        # Lines of the file with the text of ours, after others of which nobody knows.
+        pytest.param("klipper", OUR_OWN_F, id="our own F"),
+        pytest.param("klipper", OUR_OWN_LIMITS, id="our own limits"),
+        pytest.param("reprapfirmware", EXPRESSION, id="expression"),
+        # What was fed is known before a line that stands still, but not since when.
+        pytest.param("marlin", UNKNOWN_BEFORE, id="unknown before"),
     ],
 )
 def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache: Path) -> None:
@@ -418,6 +462,7 @@ def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache:
     source.write_text(text)
     options = Options(method="shaper:mzv")
     result = compensate_file(source, target, machine_of(kind), options, cache_dir=cache)
+    assert not any("internal error" in piece.reason for piece in result.put_back)
     assert result.pieces > len(result.put_back)
     assert result.last_check is not None
     assert result.last_check.kept_lines > 2
