@@ -26,8 +26,9 @@ from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.files import default_cache_dir
-from stillpath.pipeline.job import Attempt, Job, Order
+from stillpath.pipeline.job import Attempt, Job
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.order import Order
 from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.verbatim import last_length_mm

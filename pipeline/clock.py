@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator
+from typing import TypeVar
 
 __all__ = ["StageClock"]
+
+T = TypeVar("T")
 
 
 class StageClock:
@@ -29,3 +32,13 @@ class StageClock:
             yield
         finally:
             self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start
+
+    def each(self, name: str, items: Iterator[T]) -> Iterator[T]:
+        """Yield items, and count what it takes to come by each of them."""
+        while True:
+            with self.stage(name):
+                try:
+                    item = next(items)
+                except StopIteration:
+                    return
+            yield item

@@ -13,10 +13,11 @@ from pathlib import Path
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
-from stillpath.pipeline.job import Job, Order
+from stillpath.pipeline.job import Job
 from stillpath.pipeline.last_check.comparing import LastCheckError
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
+from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -29,15 +29,13 @@ from stillpath.gcode.sampler import sample_phases, sample_until
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
-from stillpath.gcode.types import EventKind, Events, Moves, Phases
-from stillpath.models.confirmation import confirmation_text
+from stillpath.gcode.types import Events, Moves, Phases
 from stillpath.models.errors import ModelError
-from stillpath.models.machine import Machine
-from stillpath.pipeline.caution import caution_for, prediction_note
+from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
 from stillpath.pipeline.files import Discarding, default_cache_dir
-from stillpath.pipeline.last_check.comparing import LastCheck, LastCheckError
+from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.measuring.layer_files import LayerWriter
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
@@ -45,9 +43,11 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
+from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.pacing.samples import take_samples
+from stillpath.pipeline.parts import FileParts
 from stillpath.pipeline.piece_compensator import (
     DT_S,
     CompensatedPiece,
@@ -56,86 +56,27 @@ from stillpath.pipeline.piece_compensator import (
     as_executed,
     deviation,
 )
-from stillpath.pipeline.progress import ProgressCallback, ProgressReports
-from stillpath.pipeline.reading import dialect_for, doubts, passed_over
-from stillpath.pipeline.result import Channel, PutBack, Result, StageTime
+from stillpath.pipeline.progress import ProgressReports
+from stillpath.pipeline.reading import dialect_for, doubts
+from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.simulate import STANDING_S
+from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
-from stillpath.pipeline.verifying import NEGLIGIBLE_UM, Verifier
-from stillpath.version import __version__
+from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["Attempt", "Job", "Order"]
+__all__ = ["Attempt", "Job"]
 
-T = TypeVar("T", bound=VerbatimPart)
-
-_BLOCK_BYTES = 1 << 17
 _CHUNK = 1 << 17
-_ALL = -1
-_MOST_REFUSED = 3
-"""Pieces that are reverted one by one after the last check; then all are."""
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """What a file is compensated with.
-
-    Attributes
-    ----------
-    refused : dict
-        Why pieces stay as sliced, by one of their lines (`_ALL`: every piece).
-    """
-
-    machine: Machine
-    options: Options
-    cache_dir: Path | None = None
-    progress: ProgressCallback | None = None
-    refused: dict[int, str] = field(default_factory=dict)
-
-    def reverting(self, error: LastCheckError, pieces: Sequence[tuple[int, int]]) -> Order:
-        """Return an order without the piece in which the last check found fault.
-
-        Parameters
-        ----------
-        pieces : sequence of (int, int)
-            First and last lines of the compensated pieces, rising.
-
-        Raises
-        ------
-        LastCheckError
-            When every piece was reverted already.
-        """
-        piece = next((first for first, last in pieces if last >= error.stream_line), None)
-        if piece is None or error.stream_line == 0 or _ALL in self.refused:
-            raise error
-        if len(self.refused) == _MOST_REFUSED:
-            others = f"as the last check refused more than {_MOST_REFUSED} pieces, all are reverted"
-            return replace(self, refused={**self.refused, _ALL: others})
-        reason = (
-            f"line {piece}: internal error (the last check refuses the compensated lines: "
-            f"{error.reason}); please report it with the file"
-        )
-        return replace(self, refused={**self.refused, piece: reason})
-
-    def refusal(self, first: int, last: int) -> str | None:
-        """Return why a piece with these lines stays as sliced, if it does."""
-        found = (reason for line, reason in self.refused.items() if first <= line <= last)
-        return next(found, self.refused.get(_ALL))
-
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """What says of itself why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
 """With those of our own: a piece that meets one stays as sliced, and the others are printed."""
-
-
-def _counting_rms_um(channel: Channel) -> float:
-    selected_um = channel.selected_rms_um
-    return channel.extruding.contour_rms_um if selected_um is None else selected_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +153,6 @@ class Job:
             chosen = caution_for(machine, options, self._shaper, cache_dir, DT_S)
         self._caution = chosen[0] if chosen else None
         self._choice = chosen[1] if chosen else None
-        self._standing = [prediction_note(machine, chosen[1])] if chosen else []
         if tuned_first or self._caution is not None:
             self._work = PieceCompensator(machine, options, self._shaper, self._caution)
 
@@ -286,7 +226,7 @@ class Job:
         self._measurement.finish()
         if self._layers is not None:
             self._layers.finish(self._reader.feature_names)
-        return self._result(name, size, facts)
+        return self._summary().result(name, size, facts, self._clock)
 
     def checked(self, result: Result) -> Result:
         """Compare the file as it will be delivered with the original.
@@ -328,37 +268,12 @@ class Job:
             )
 
     def _selected(self) -> Iterator[Piece | VerbatimPart]:
-        for item in self._items():
+        for item in FileParts(self._source, self._reader, self._splitter, self._clock):
             before_s, names = self._sum.original_s, self._reader.feature_names
-            yield from self._timed(self._selection.divide(item, names))
+            yield from self._clock.each("plan", self._selection.divide(item, names))
             if isinstance(item, Piece) and self._options.where != "all":
                 # The sliced file does not stand still where it was divided.
                 self._sum.original_s = before_s + item.phases.duration_s
-
-    def _items(self) -> Iterator[Piece | VerbatimPart]:
-        while True:
-            with self._clock.stage("read"):
-                data = self._source.read(_BLOCK_BYTES)
-                blocks = self._reader.push(data) if data else self._reader.flush()
-            for block in blocks:
-                if np.any(block.events.kind == EventKind.STAMP):
-                    row = int(np.argmax(block.events.kind == EventKind.STAMP))
-                    raise GcodeError(
-                        "this file was already processed by stillpath; compensate the original",
-                        line=int(block.events.line[row]),
-                    )
-                yield from self._timed(self._splitter.push(block))
-            if not data:
-                yield from self._timed(self._splitter.flush())
-                return
-
-    def _timed(self, items: Iterator[T]) -> Iterator[T]:
-        while True:
-            with self._clock.stage("plan"):
-                item = next(items, None)
-            if item is None:
-                return
-            yield item
 
     def _piece(self, piece: Piece) -> None:
         delay_s = self.delay_s
@@ -379,7 +294,9 @@ class Job:
             self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
             self._sum.jumped = False
         switched_s = self._switched_off_s()
-        for paced in self._timed(self._budget.paced(piece)) if self._budget else (piece,):
+        for paced in (
+            self._clock.each("plan", self._budget.paced(piece)) if self._budget else (piece,)
+        ):
             try:
                 attempt = self._attempt(piece, paced)
                 break
@@ -629,96 +546,20 @@ class Job:
     def _say(self, stage: str, fraction: float) -> None:
         self._reports.say(stage, fraction, self._sum.time_s if hasattr(self, "_sum") else 0.0)
 
-    def _shaper_warnings(self) -> Iterator[str]:
-        if self._writer.shaper_unknown:
-            yield (
-                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
-                "is switched off and stays off; set it again after the print."
-            )
-        if self._writer.shaper_note is not None:
-            yield self._writer.shaper_note
-
-    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
-        """Yield a warning where the firmware's shaper, without compensation, would do better."""
-        ours, shaper = rms_um["after"], rms_um["shaper"]
-        compared = self._budget is None and not self._options.method.startswith("shaper:")
-        if not compared or ours < max(shaper, NEGLIGIBLE_UM):
-            return
-        yield (
-            f"The firmware's own shaper would serve this file better: {self._shaper.label} alone "
-            f"would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
-            "Print it as sliced with that shaper, or let --method advise write the commands"
-        )
-
-    def _channels(self) -> list[Channel]:
-        """Return the figures of the whole print, with what counts where a part is compensated."""
-        channels = self._measurement.channels()
-        if self._options.where != "all":
-            features = self._measurement.features(self._reader.feature_names)
-            rms_um = self._selection.rms_um(features)
-            channels = [
-                c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
-            ]
-        if self._choice is not None:
-            channels = [self._choice.ranged(channel) for channel in channels]
-        return channels
-
-    def _result(self, name: str, size: int, facts: SlicerFacts) -> Result:
-        total, measured = self._sum, self._measurement
-        channels = self._channels()
-        warnings = [*total.warnings, *passed_over(self._reader), *measured.warnings()]
-        notes = [*self._standing, *self._operation.notes()]
-        if self._changes:
-            warnings += self._shaper_warnings()
-            warnings += total.left_alone()
-            warnings += self._outdone({c.name: _counting_rms_um(c) for c in channels})
-            notes += total.left_out(self._options.where)
-        shaper, budget = self._shaper, None
+    def _summary(self) -> Summary:
+        budget = None
         if self._budget is not None and self._pairs is not None:
-            names, sums = self._reader.feature_names, self._pairs.sums()
-            budget = self._budget.figures(sums, names, total.original_s, total.time_s)
-            warnings += self._budget.warnings(sums, names)
-            notes.append(self._pairs.note)
-        return Result(
-            version=__version__,
-            machine=self._machine.name,
-            machine_title=self._machine.title,
-            machine_revision=self._machine.revision,
-            settings=self._options.model_dump(exclude_none=True),
-            source_name=name,
-            channels=channels,
-            best_shaper=shaper.label,
-            original_time_s=total.original_s,
-            time_s=total.time_s,
-            slicer=facts.slicer,
-            slicer_time_s=facts.estimate_s,
-            original_bytes=size,
-            written_bytes=total.written,
-            segments=total.segments,
-            segments_per_s=total.segments / total.compensated_s if total.compensated_s else 0.0,
-            peak_segments_per_s=total.peak_rate,
-            peak_velocity_mm_s=total.peak_velocity,
-            peak_accel_mm_s2=total.peak_accel,
-            emission_rms_um=1e3 * np.sqrt(total.gap2 / max(total.gap_count, 1)),
-            emission_max_um=1e3 * total.gap_max,
-            filament_error_mm=total.filament_error,
-            compensated_s=total.compensated_s,
-            extruding_s=total.extruding_s,
-            pieces=total.pieces,
-            put_back=total.put_back,
-            put_back_extruding_share=total.put_back_share,
-            left_out_s=total.left_out_s,
-            left_out_extruding_s=total.left_out_extruding_s,
-            left_alone_s=total.left_alone_s if self._changes else 0.0,
-            left_alone_extruding_s=total.left_alone_extruding_s if self._changes else 0.0,
-            warnings=warnings,
-            notes=notes,
-            confirmation=confirmation_text(self._machine) if self._changes else "",
-            layers=measured.layers(),
-            features=measured.features(self._reader.feature_names),
-            track=measured.track(),
-            spectra=measured.spectra(),
-            layer_views=measured.layer_views(),
-            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            budget = self._budget, self._pairs
+        return Summary(
+            machine=self._machine,
+            options=self._options,
+            totals=self._sum,
+            measurement=self._measurement,
+            selection=self._selection,
+            operation=self._operation,
+            reader=self._reader,
+            writer=self._writer if self._changes else None,
+            shaper=self._shaper,
+            choice=self._choice,
             budget=budget,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,37 @@ class Totals:
         self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
         end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * last_length_mm(executed)
         self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
+
+    def figures(self, *, compensates: bool) -> dict[str, Any]:
+        """Return the fields of `Result` that are sums, or follow from them.
+
+        Parameters
+        ----------
+        compensates : bool
+            Else the file is only measured, and nothing of it is left alone.
+        """
+        return {
+            "original_time_s": self.original_s,
+            "time_s": self.time_s,
+            "written_bytes": self.written,
+            "segments": self.segments,
+            "segments_per_s": self.segments / self.compensated_s if self.compensated_s else 0.0,
+            "peak_segments_per_s": self.peak_rate,
+            "peak_velocity_mm_s": self.peak_velocity,
+            "peak_accel_mm_s2": self.peak_accel,
+            "emission_rms_um": 1e3 * np.sqrt(self.gap2 / max(self.gap_count, 1)),
+            "emission_max_um": 1e3 * self.gap_max,
+            "filament_error_mm": self.filament_error,
+            "compensated_s": self.compensated_s,
+            "extruding_s": self.extruding_s,
+            "pieces": self.pieces,
+            "put_back": self.put_back,
+            "put_back_extruding_share": self.put_back_share,
+            "left_out_s": self.left_out_s,
+            "left_out_extruding_s": self.left_out_extruding_s,
+            "left_alone_s": self.left_alone_s if compensates else 0.0,
+            "left_alone_extruding_s": self.left_alone_extruding_s if compensates else 0.0,
+        }
 
     @property
     def put_back_s(self) -> float:

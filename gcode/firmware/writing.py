@@ -7,6 +7,7 @@ shaper, modes) is set before its first line and restored before any line that co
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,21 +92,24 @@ class StreamWriter:
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set behind the last piece."""
-        self.shaper_unknown = False
+        self._shaper_unknown = False
 
-    @property
-    def shaper_note(self) -> str | None:
-        """What became of the shapers that the file itself sets; None: it sets none."""
-        if not self._shaper_names:
-            return None
-        said = ", ".join(
-            f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
-            for name, (line, count) in self._shaper_names.items()
-        )
-        return (
-            f"The file sets the firmware's input shaper: {said}. Compensation and shaper do not "
-            "add up: in compensated stretches it is off, around them as the file sets it."
-        )
+    def shaper_warnings(self) -> Iterator[str]:
+        """Yield what became of the firmware's shaper, and of those that the file itself sets."""
+        if self._shaper_unknown:
+            yield (
+                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
+                "is switched off and stays off; set it again after the print."
+            )
+        if self._shaper_names:
+            said = ", ".join(
+                f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
+                for name, (line, count) in self._shaper_names.items()
+            )
+            yield (
+                f"The file sets the firmware's input shaper: {said}. Compensation and shaper do "
+                "not add up: in compensated stretches it is off, around them as the file sets it."
+            )
 
     @property
     def switching_off(self) -> bytes:
@@ -483,7 +487,7 @@ class StreamWriter:
         self._shaper_off = False
         stated = self._stream_commands.shaper_on
         if not self._shaper_is_known:
-            self.shaper_unknown = True
+            self._shaper_unknown = True
             self._shaper_off = True
             return b""
         lines = (stated or b"") + b"".join(self._shaper_lines.values())

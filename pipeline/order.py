@@ -1,0 +1,65 @@
+"""What a file is compensated with, and which of its pieces stay as sliced after the last check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from stillpath.models.machine import Machine
+from stillpath.pipeline.last_check.comparing import LastCheckError
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.progress import ProgressCallback
+
+__all__ = ["Order"]
+
+_ALL = -1
+_MOST_REFUSED = 3
+"""Pieces that are reverted one by one after the last check; then all are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What a file is compensated with.
+
+    Attributes
+    ----------
+    refused : dict
+        Why pieces stay as sliced, by one of their lines (`_ALL`: every piece).
+    """
+
+    machine: Machine
+    options: Options
+    cache_dir: Path | None = None
+    progress: ProgressCallback | None = None
+    refused: dict[int, str] = field(default_factory=dict)
+
+    def reverting(self, error: LastCheckError, pieces: Sequence[tuple[int, int]]) -> Order:
+        """Return an order without the piece in which the last check found fault.
+
+        Parameters
+        ----------
+        pieces : sequence of (int, int)
+            First and last lines of the compensated pieces, rising.
+
+        Raises
+        ------
+        LastCheckError
+            When every piece was reverted already.
+        """
+        piece = next((first for first, last in pieces if last >= error.stream_line), None)
+        if piece is None or error.stream_line == 0 or _ALL in self.refused:
+            raise error
+        if len(self.refused) == _MOST_REFUSED:
+            others = f"as the last check refused more than {_MOST_REFUSED} pieces, all are reverted"
+            return replace(self, refused={**self.refused, _ALL: others})
+        reason = (
+            f"line {piece}: internal error (the last check refuses the compensated lines: "
+            f"{error.reason}); please report it with the file"
+        )
+        return replace(self, refused={**self.refused, piece: reason})
+
+    def refusal(self, first: int, last: int) -> str | None:
+        """Return why a piece with these lines stays as sliced, if it does."""
+        found = (reason for line, reason in self.refused.items() if first <= line <= last)
+        return next(found, self.refused.get(_ALL))

@@ -1,0 +1,66 @@
+"""A file in its parts, as it is read: pieces that may be compensated, and what stays verbatim."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import BinaryIO
+
+import numpy as np
+
+from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.splitter import Splitter
+from stillpath.gcode.types import EventKind, ProgramBlock
+from stillpath.pipeline.clock import StageClock
+
+__all__ = ["FileParts"]
+
+_BLOCK_BYTES = 1 << 17
+
+
+class FileParts:
+    """Read a file from where it is, block by block.
+
+    Parameters
+    ----------
+    source : binary file
+    reader : Interpreter
+    splitter : Splitter
+    clock : StageClock
+        Counts reading and planning.
+    """
+
+    def __init__(
+        self, source: BinaryIO, reader: Interpreter, splitter: Splitter, clock: StageClock
+    ) -> None:
+        self._source, self._reader, self._splitter = source, reader, splitter
+        self._clock = clock
+
+    def __iter__(self) -> Iterator[Piece | VerbatimPart]:
+        """Yield the parts in order.
+
+        Raises
+        ------
+        GcodeError
+            The file was compensated before.
+        """
+        while True:
+            with self._clock.stage("read"):
+                data = self._source.read(_BLOCK_BYTES)
+                blocks = self._reader.push(data) if data else self._reader.flush()
+            for block in blocks:
+                _refuse_compensated(block)
+                yield from self._clock.each("plan", self._splitter.push(block))
+            if not data:
+                yield from self._clock.each("plan", self._splitter.flush())
+                return
+
+
+def _refuse_compensated(block: ProgramBlock) -> None:
+    stamped = np.flatnonzero(block.events.kind == EventKind.STAMP)
+    if len(stamped):
+        raise GcodeError(
+            "this file was already processed by stillpath; compensate the original",
+            line=int(block.events.line[stamped[0]]),
+        )

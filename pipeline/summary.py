@@ -1,0 +1,138 @@
+"""The result of a job: its figures and what must be said with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from stillpath.gcode.firmware.writing import StreamWriter
+from stillpath.gcode.interpreter import Interpreter
+from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.models.confirmation import confirmation_text
+from stillpath.models.machine import Machine
+from stillpath.pipeline.caution import Choice, prediction_note
+from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.reference_shaper import BestShaper
+from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.pacing.budget import SpeedBudget
+from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
+from stillpath.pipeline.reading import passed_over
+from stillpath.pipeline.result import Channel, Result, StageTime
+from stillpath.pipeline.selection import Selection
+from stillpath.pipeline.totals import Totals
+from stillpath.pipeline.verifying import NEGLIGIBLE_UM
+from stillpath.version import __version__
+
+__all__ = ["Summary"]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a job knows at its end.
+
+    Attributes
+    ----------
+    writer : StreamWriter or None
+        None: the file stays as it is, and is only measured.
+    choice : Choice or None
+        The mixture chosen for the machine's set; None: none was.
+    budget : (SpeedBudget, BudgetMeasurement) or None
+    """
+
+    machine: Machine
+    options: Options
+    totals: Totals
+    measurement: Measurement
+    selection: Selection
+    operation: Operation
+    reader: Interpreter
+    writer: StreamWriter | None
+    shaper: BestShaper
+    choice: Choice | None
+    budget: tuple[SpeedBudget, BudgetMeasurement] | None
+
+    def result(self, name: str, size: int, facts: SlicerFacts, clock: StageClock) -> Result:
+        """Return the result for a file of that name and size in bytes."""
+        channels = self._channels()
+        figures = None
+        if self.budget is not None:
+            budget, pairs = self.budget
+            total_s = self.totals.original_s, self.totals.time_s
+            figures = budget.figures(pairs.sums(), self.reader.feature_names, *total_s)
+        measured = self.measurement
+        return Result(
+            version=__version__,
+            machine=self.machine.name,
+            machine_title=self.machine.title,
+            machine_revision=self.machine.revision,
+            settings=self.options.model_dump(exclude_none=True),
+            source_name=name,
+            channels=channels,
+            best_shaper=self.shaper.label,
+            slicer=facts.slicer,
+            slicer_time_s=facts.estimate_s,
+            original_bytes=size,
+            **self.totals.figures(compensates=self.writer is not None),
+            warnings=list(self._warnings(channels)),
+            notes=list(self._notes()),
+            confirmation=confirmation_text(self.machine) if self.writer is not None else "",
+            layers=measured.layers(),
+            features=measured.features(self.reader.feature_names),
+            track=measured.track(),
+            spectra=measured.spectra(),
+            layer_views=measured.layer_views(),
+            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+            budget=figures,
+        )
+
+    def _channels(self) -> list[Channel]:
+        """Return the figures of the whole print, with what counts where a part is compensated."""
+        channels = self.measurement.channels()
+        if self.options.where != "all":
+            features = self.measurement.features(self.reader.feature_names)
+            rms_um = self.selection.rms_um(features)
+            channels = [
+                c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
+            ]
+        if self.choice is not None:
+            channels = [self.choice.ranged(channel) for channel in channels]
+        return channels
+
+    def _warnings(self, channels: list[Channel]) -> Iterator[str]:
+        yield from self.totals.warnings
+        yield from passed_over(self.reader)
+        yield from self.measurement.warnings()
+        if self.writer is not None:
+            yield from self.writer.shaper_warnings()
+            yield from self.totals.left_alone()
+            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
+        if self.budget is not None:
+            budget, pairs = self.budget
+            yield from budget.warnings(pairs.sums(), self.reader.feature_names)
+
+    def _notes(self) -> Iterator[str]:
+        if self.choice is not None:
+            yield prediction_note(self.machine, self.choice)
+        yield from self.operation.notes()
+        if self.writer is not None:
+            yield from self.totals.left_out(self.options.where)
+        if self.budget is not None:
+            yield self.budget[1].note
+
+    def _outdone(self, rms_um: dict[str, float]) -> Iterator[str]:
+        """Yield a warning where the firmware's shaper, without compensation, would do better."""
+        ours, shaper = rms_um["after"], rms_um["shaper"]
+        compared = self.budget is None and not self.options.method.startswith("shaper:")
+        if compared and ours >= max(shaper, NEGLIGIBLE_UM):
+            yield (
+                f"The firmware's own shaper would serve this file better: {self.shaper.label} "
+                f"alone would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
+                "Print it as sliced with that shaper, or let --method advise write the commands"
+            )
+
+
+def _counting_rms_um(channel: Channel) -> float:
+    selected_um = channel.selected_rms_um
+    return channel.extruding.contour_rms_um if selected_um is None else selected_um
