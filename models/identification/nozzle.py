@@ -71,6 +71,15 @@ class Frame:
         s = 1j * f_hz / self.f_hz
         return np.asarray(self.mass_ratio * s * s / (s * s + 2 * self.zeta * s + 1))
 
+    def reaction_gradient(self, f_hz: Array) -> ComplexArray:
+        """Return dR by log f, log zeta and the mass ratio, shape (len(f_hz), 3)."""
+        s = 1j * f_hz / self.f_hz
+        unit = s * s / (s * s + 2 * self.zeta * s + 1)
+        slope = -2 * self.mass_ratio * unit * unit
+        return np.stack(
+            [slope * (self.zeta * s + 1) / (s * s), slope * self.zeta / s, unit], axis=1
+        )
+
     def over_bed(self, measured: FrequencyResponse) -> FrequencyResponse:
         """Return the response of the nozzle over the bed."""
         more = 1 + self.reaction(measured.f_hz)
@@ -104,13 +113,18 @@ class _Found:
         (f, zeta), mu = np.exp(self.vector[2:4]), self.vector[4]
         return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
 
-    def model(self, f_hz: Array) -> ComplexArray:
-        first = 5 if self.shaken else 2
+    def model_and_gradient(self, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
+        """Return the response, shape (len(f_hz),), and its derivatives, (len(f_hz), parameters)."""
         late = np.exp(self.vector[0] - 2j * np.pi * f_hz * self.vector[1])
-        held = self.structure.response(self.vector[first:], f_hz)
-        frame = self.frame
-        felt = held if frame is None else held / (1 + frame.reaction(f_hz) * held)
-        return np.asarray(late * felt)
+        frame, first = self.frame, 5 if self.shaken else 2
+        felt, gradient = self.structure.response_and_gradient(self.vector[first:], f_hz)
+        if frame is not None:
+            held, part = felt, 1 / (1 + frame.reaction(f_hz) * felt)
+            felt = held * part
+            by_frame = -frame.reaction_gradient(f_hz) * (felt * felt)[:, None]
+            gradient = np.concatenate([by_frame, gradient * (part * part)[:, None]], axis=1)
+        by_level = np.stack([felt, -2j * np.pi * f_hz * felt], axis=1)
+        return late * felt, late[:, None] * np.concatenate([by_level, gradient], axis=1)
 
 
 def _start(data: ResponseData, frame_hz: float | None) -> _Found:
@@ -150,13 +164,19 @@ def _polished(data: ResponseData, start: _Found) -> _Found:
     high = np.concatenate([ends[:, 1], frame[:, 1], high])
 
     def residual(vector: Array) -> Array:
-        error = replace(start, vector=vector).model(data.f_hz) - data.response
+        error = replace(start, vector=vector).model_and_gradient(data.f_hz)[0] - data.response
         unusual = (vector[3:4] - np.log(_START[0])) / _ZETA_SPREAD if start.shaken else vector[:0]
         return np.concatenate([data.weight * error.real, data.weight * error.imag, unusual])
+
+    def jacobian(vector: Array) -> Array:
+        slope = replace(start, vector=vector).model_and_gradient(data.f_hz)[1]
+        slope = data.weight[:, None] * slope
+        unusual = np.eye(len(vector))[3:4] / _ZETA_SPREAD if start.shaken else slope.real[:0]
+        return np.concatenate([slope.real, slope.imag, unusual])
 
     margin = 1e-6 * (high - low)
     inside = np.clip(start.vector, low + margin, high - margin)
     solution = least_squares(
-        residual, inside, bounds=(low, high), loss="soft_l1", x_scale="jac", max_nfev=80
+        residual, inside, jacobian, (low, high), loss="soft_l1", x_scale="jac", max_nfev=80
     )
     return replace(start, vector=np.asarray(solution.x, np.float64), cost=float(solution.cost))

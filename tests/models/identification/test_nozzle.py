@@ -55,6 +55,19 @@ def test_a_frame_is_found_and_its_motion_taken_out(
     assert np.linalg.norm((over_bed - true)[low]) < 0.2 * felt_off
 
 
+def test_derivatives_are_those_of_differences() -> None:
+    frame, step = Frame(14.0, 0.15, 0.11), 1e-6
+    log_f_hz, log_zeta = np.log(frame.f_hz), np.log(frame.zeta)
+
+    def reaction(by: np.ndarray) -> np.ndarray:
+        f_hz, zeta = np.exp([log_f_hz + by[0], log_zeta + by[1]])
+        return Frame(float(f_hz), float(zeta), frame.mass_ratio + by[2]).reaction(F_HZ)
+
+    differences = [(reaction(step * by) - reaction(-step * by)) / (2 * step) for by in np.eye(3)]
+    gradient = frame.reaction_gradient(F_HZ)
+    np.testing.assert_allclose(gradient, np.transpose(differences), rtol=1e-6, atol=1e-7)
+
+
 def test_a_frame_that_stands_firm_is_not_invented() -> None:
     s = 1j * F_HZ
     modes = ((50.0, 0.06, 1.3), (95.0, 0.05, -0.3))
