@@ -341,7 +341,10 @@ def test_a_killed_writer_leaves_a_readable_store(store: MachineStore, tmp_path: 
         )
         assert writer.stdout is not None
         writer.stdout.readline()
-        time.sleep(0.02 + 0.2 * chance.random())
+        written = len(list(root.rglob("*.json")))
+        while len(list(root.rglob("*.json"))) == written and writer.poll() is None:
+            time.sleep(0.005)
+        time.sleep(0.1 * chance.random())
         writer.send_signal(signal.SIGKILL)
         writer.wait()
         writer.stdout.close()

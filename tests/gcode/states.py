@@ -7,6 +7,7 @@ machine as it was in the original: position, filament, modes, F and limits.
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,7 +29,7 @@ _TIMES = re.compile(
     rb"M73 |;TIME|;PRINT\.TIME|;Print Time|;PRINTING_TIME|;REMAINING_TIME|; estimated |; model "
     rb"|; (?:Calculated|Estimated)\S+ Build Time|; --- print time|;estimated_time"
 )
-_OWN = (b"; stillpath", b"; Processed by stillpath")
+_OWN = (b"; stillpath: ", b"; stillpath, held back: ", b"; Processed by stillpath ")
 _DUSTY = ({-1, EventKind.MODE}, {-1, EventKind.UNKNOWN})
 POSITION_MM = 2e-6
 FILAMENT_MM = 1e-4
@@ -134,7 +135,13 @@ def states(data: bytes, machine: Machine) -> list[State]:
 
 
 def differences(original: bytes, written: bytes, machine: Machine) -> list[str]:
-    """Say where the written file treats a line of the (tagged) original differently."""
+    """Say where the written file treats a line of the (tagged) original differently.
+
+    Both may begin with the same byte order mark, though not with the same line.
+    """
+    if original.startswith(BOM_UTF8):
+        assert written.startswith(BOM_UTF8)
+        original, written = (text.removeprefix(BOM_UTF8) for text in (original, written))
     before = {_tag(s.text): s for s in states(original, machine) if _tag(s.text) is not None}
     after = states(written, machine)
     comments = [s.text for s in after if not has_code(s.text) and not s.text.startswith(_OWN)]
