@@ -93,6 +93,7 @@ def test_it_filters_as_the_prediction_does(extra: ModuleType, accel: float, batc
     assert set(moving[1:].tolist()) <= command.keys()
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_print(extra: ModuleType) -> None:
     taps = np.stack([design_taps([mode(45.0, 0.05)], np.ones(1), 150.0)] * 2)
     ours = extra.Filter(given(taps), [(-1e3, 1e3)] * 2)

@@ -38,7 +38,9 @@ def rms(result: Result, feature: str) -> dict[str, float]:
     return next(g.contour_rms_um for g in result.features if g.name == feature)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [k if k == "klipper" else pytest.param(k, marks=pytest.mark.slow) for k in KINDS]
+)
 def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     machine = ender3_with(kind)
     all_of_it = run(gear, tmp_path / "all.gcode", machine)

@@ -216,6 +216,7 @@ def test_6_broken_input(what: str, base: Machine) -> None:
     assert fitting == [what]
 
 
+@pytest.mark.slow
 def test_6_whole_files_of_the_same_kind_are_accepted(base: Machine) -> None:
     files = [quick_raw("x"), quick_raw("y")]
     found = identify_files(files, base, ReadSettings.model_validate(QUICK_SETTINGS))

@@ -174,6 +174,7 @@ def test_a_level_that_only_the_fit_shows() -> None:
         one(quick_raw("x", sensor=weak))
 
 
+@pytest.mark.slow
 def test_axes_of_the_sensor_that_seem_exchanged() -> None:
     swapped = Sensor(rate_hz=500.0, rotation=((0, 1, 0), (1, 0, 0), (0, 0, -1)))
     files = [quick_raw(axis, sensor=swapped) for axis in "xy"]
@@ -260,6 +261,7 @@ def test_a_sensor_whose_range_ended() -> None:
     assert one(clipped_at(2 * most)).warnings == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "warned"), [(0.6, True), (0.2, False)])
 def test_motion_across_the_tested_axis(share: float, warned: bool) -> None:
     log, other = quick_log("x"), quick_log("x", one_mode(25.0, 0.06))
@@ -269,6 +271,7 @@ def test_motion_across_the_tested_axis(share: float, warned: bool) -> None:
     assert any("across axis x the sensor moved" in w for w in found.warnings) == warned
 
 
+@pytest.mark.slow
 def test_one_axis_measured_twice() -> None:
     files = [quick_raw("x"), quick_raw("y", sensor=Sensor(rate_hz=500.0, rotation=TURNED_ROUND_Z))]
     with pytest.raises(ModelError, match=r"raw_data_x_.*, raw_data_y_.*: .*measured twice"):
@@ -496,6 +499,7 @@ def test_whoever_listens_can_stop_it() -> None:
         identify(read(quick_raw("x")), SETTINGS, progress=stop)
 
 
+@pytest.mark.slow
 def test_same_files_same_plants() -> None:
     files = [quick_raw("x"), quick_raw("y")]
     first, again = (identify(read(*files), SETTINGS) for _ in range(2))

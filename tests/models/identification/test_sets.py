@@ -105,6 +105,7 @@ def test_amplitudes_are_members() -> None:
     assert 0.97 < found.fit.modes[0].f_hz / 47.0 < 1.01
 
 
+@pytest.mark.slow
 def test_what_lies_within_the_scatter_of_repeats_adds_no_member() -> None:
     repeats = [response(plant(f), i, label="75") for i, f in enumerate((0.985, 1.0, 1.015))]
     near = response(plant(1.003), 7, label="110")
@@ -127,6 +128,7 @@ def test_a_set_has_at_most_fifteen_plants() -> None:
     assert max(frequencies) == pytest.approx(47.0 * 1.04, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_spectra_make_a_set_of_what_explains_them() -> None:
     one = spectrum_set([spectrum(plant())], TEST, axis="x")
     assert one.plants.provenance is not None

@@ -12,7 +12,6 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import drive_spectrum, klipper_psd
 from stillpath.models.identification.frame import without_frame
 from stillpath.models.identification.readers import read_measurements
-from stillpath.models.identification.shaper_choice import choose_shaper_of
 from stillpath.models.identification.spectrum_fit import (
     explain_spectra,
     fit_spectrum,
@@ -66,8 +65,9 @@ def check_usable(fit: Fit) -> None:
     assert 0 < fit.trust_below_hz <= fit.band_hz[1]
 
 
-@pytest.mark.parametrize("test", [LEGACY, SWEEPING], ids=["legacy", "sweeping"])
-@pytest.mark.parametrize("noise", [60.0, 400.0])
+@pytest.mark.parametrize(
+    ("test", "noise"), [(LEGACY, 400.0), (SWEEPING, 60.0)], ids=["legacy", "sweeping"]
+)
 @pytest.mark.parametrize(
     ("modes", "gains"),
     [(OUT_OF_BAND, (0.6, 0.3, 0.1)), (NARROW, (0.7, 0.3)), (CLOSE, (0.4, 0.4, 0.2))],
@@ -88,6 +88,7 @@ def test_modes_of_a_simulated_spectrum(
             assert mode.zeta == pytest.approx(zeta, rel=0.4 if close else 0.15)
 
 
+@pytest.mark.slow
 def test_trials_tell_what_each_order_leaves() -> None:
     fit = fit_spectrum(simulated(OUT_OF_BAND, (0.75, 0.2, 0.05), LEGACY), LEGACY)
     assert [t.order for t in fit.trials] == [1, 2, 3, 4]
@@ -96,6 +97,7 @@ def test_trials_tell_what_each_order_leaves() -> None:
     assert [t.order for t in alone.trials] == [1, 2]
 
 
+@pytest.mark.slow
 def test_members_stand_for_what_explains_the_spectrum() -> None:
     """Every member fits about as well; the truth lies within what they say of |G| and phase."""
     truth, spectrum = (
@@ -163,6 +165,7 @@ def test_wrong_level_is_told() -> None:
     assert fit.modes[0].zeta == pytest.approx(0.015, rel=0.1)
 
 
+@pytest.mark.slow
 def test_tables_of_a_machine_that_was_changed_between_them_are_told() -> None:
     first = replace(simulated(NARROW, (0.7, 0.3), LEGACY), source="before.csv")
     again = replace(simulated(NARROW, (0.7, 0.3), LEGACY, noise=80.0), source="again.csv")
@@ -178,6 +181,7 @@ def test_tables_of_a_machine_that_was_changed_between_them_are_told() -> None:
     assert note.startswith(("before.csv and after.csv differ by", "again.csv and after.csv differ"))
 
 
+@pytest.mark.slow
 def test_column_that_follows_the_drive() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     assert driven_column(spectrum) == "x"
@@ -188,6 +192,7 @@ def test_column_that_follows_the_drive() -> None:
         fit_spectrum(turned, LEGACY, column="q")
 
 
+@pytest.mark.slow
 def test_coupled_axes_are_told() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     coupled = replace(spectrum, psd={**spectrum.psd, "y": 0.3 * spectrum.psd["x"]})
@@ -213,34 +218,6 @@ def test_refit_keeps_the_structure() -> None:
     for mode, (f, zeta) in zip(member.modes, moved, strict=True):
         assert mode.f_hz == pytest.approx(f, rel=0.005)
         assert mode.zeta == pytest.approx(zeta, rel=0.15)
-
-
-def real_tables(folder: Path) -> list[Path]:
-    return sorted(folder.glob("measurements/*/resonances_*.csv"))
-
-
-@pytest.mark.shared
-@pytest.mark.slow
-def test_every_real_table(shared_dir: Path) -> None:
-    """Stable, DC gain 1, rms of most <= 1.1 dB; Klipper's own frequency among the modes."""
-    files = real_tables(shared_dir)
-    assert len(files) >= 45
-    met, residuals = [], []
-    for path in files:
-        (spectrum,) = read_measurements(path)
-        assert isinstance(spectrum, Spectrum)
-        fit = fit_spectrum(spectrum, LEGACY)
-        check_usable(fit)
-        assert fit.residual <= 2.6, path.name
-        residuals.append(fit.residual)
-        assert fit.order <= 4
-        best, _ = choose_shaper_of(spectrum)
-        if best.name == "mzv":
-            met.append(min(abs(m.f_hz / best.f_hz - 1) for m in fit.modes) < 0.1)
-    assert len(met) >= 20
-    assert np.mean(met) >= 0.95
-    # Where |G| is below a tenth the floor of a table is not explained (docs/identification.md).
-    assert np.quantile(residuals, [0.5, 0.75]).tolist() < [0.95, 1.1]
 
 
 @pytest.mark.slow
