@@ -32,7 +32,7 @@ from tests.integrations.live import (
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(PYTHON is None, reason=NO_KLIPPER)]
 
-MOVES = 400
+MOVES, WATCHED = 160, 20
 Export = Callable[[str], dict[str, Any]]
 
 TROUBLE = """
@@ -223,7 +223,7 @@ def test_its_memory_does_not_grow(klipper_live: Path, export: Export, tmp_path: 
     lines = ["G28", "G90", "G1 X20 Y20 F12000"]
     for k in range(MOVES):
         lines.append(f"G1 X{80 - 60 * (k % 2)} Y{20 + k % 60} F12000")
-        if k % 50 == 49:
+        if k % WATCHED == WATCHED - 1:
             # Limits in force, moves that pass, stands: every buffer is used.
             lines += ["G4 P1500", "SET_VELOCITY_LIMIT ACCEL=60000", "G1 X50 Y50", "WATCH"]
             lines += ["SET_VELOCITY_LIMIT ACCEL=5000"]
@@ -237,6 +237,6 @@ def test_its_memory_does_not_grow(klipper_live: Path, export: Export, tmp_path: 
     )
     log = (tmp_path / "klippy.log").read_text()
     found = np.array([row.split() for row in re.findall(r"watch: ([\d ]+)", log)], int)
-    assert len(found) == MOVES // 50
+    assert len(found) == MOVES // WATCHED
     first, last = found[3 : len(found) // 2], found[len(found) // 2 :]
     assert last.max(axis=0).tolist() == pytest.approx(first.max(axis=0).tolist(), rel=0.02)
