@@ -76,7 +76,7 @@ def test_steps_are_the_filtered_plan(
 
 
 @pytest.mark.parametrize(
-    ("event", "name"), zip(EVENTS, cycle(("ender3", "voron-v24-250")), strict=False)
+    ("event", "name"), list(zip(EVENTS, cycle(("ender3", "voron-v24-250")), strict=False))
 )
 def test_no_step_is_lost_whatever_happens(
     name: str,
