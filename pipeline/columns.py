@@ -23,6 +23,9 @@ class Table(Protocol):
     def write(self, columns: Mapping[str, np.ndarray]) -> None:
         """Add rows: arrays of one length by name, the same names in the same order every time."""
 
+    def clear(self) -> None:
+        """Take all rows back."""
+
 
 @contextlib.contextmanager
 def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
@@ -65,8 +68,9 @@ def csv_table(target: Path, formats: Mapping[str, str]) -> Iterator[Table]:
         Names of the columns and how a value is written, as ``%.3f``.
     """
     with replacing(target) as temporary, temporary.open("w", encoding="ascii", newline="\n") as out:
-        out.write(",".join(formats) + "\n")
-        yield _Csv(out, ",".join(formats.values()) + "\n")
+        names, line = (",".join(words) + "\n" for words in (formats, formats.values()))
+        out.write(names)
+        yield _Csv(out, len(names), line)
 
 
 class _Npz:
@@ -79,11 +83,21 @@ class _Npz:
             self._files[name].write(np.ascontiguousarray(values, self._types[name]).tobytes())
         self.rows += len(next(iter(columns.values())))
 
+    def clear(self) -> None:
+        for file in self._files.values():
+            file.seek(0)
+            file.truncate()
+        self.rows = 0
+
 
 class _Csv:
-    def __init__(self, file: IO[str], line: str) -> None:
-        self._file, self._line = file, line
+    def __init__(self, file: IO[str], header: int, line: str) -> None:
+        self._file, self._header, self._line = file, header, line
 
     def write(self, columns: Mapping[str, np.ndarray]) -> None:
         rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         self._file.write("".join(self._line % row for row in rows))
+
+    def clear(self) -> None:
+        self._file.seek(self._header)
+        self._file.truncate()

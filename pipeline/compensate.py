@@ -55,7 +55,8 @@ def compensate_file(
     layers : Path, optional
         Folder for layers.json and layers.bin (`pipeline.measuring.layer_files`).
     trace : callable, optional
-        Is given the motion as it is measured.
+        Is given the motion as it is measured; once more from its first sample where the last check
+        has a piece reverted.
 
     Returns
     -------
@@ -122,8 +123,6 @@ def _final_job(
         except (TooLarge, LastCheckError) as error:
             if isinstance(error, TooLarge):
                 order = replace(order, options=_fitting(order.options, name))
-            elif trace is not None:  # what was traced cannot be taken back
-                raise
             else:
                 order = order.reverting(error, job.compensated)
             budget = budget and budget.again()

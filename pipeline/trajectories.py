@@ -131,6 +131,9 @@ class _Window:
 
     def add(self, trace: Trace) -> None:
         count = len(trace.line)
+        if trace.first == 0:  # or once more from the beginning, with a section reverted
+            self._table.clear()
+            self.rows = 0
         first = max(self._first - trace.first, 0)
         last = count if self._stop is None else min(self._stop - trace.first, count)
         self.end_s = (trace.first + count) * DT_S

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stillpath.cli.main import run
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file, plan_file
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.trajectories import write_trajectories
+from stillpath.pipeline.trajectories import TrajectoryFormat, write_trajectories
 from stillpath.simulation.measures import contour_error
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
@@ -109,6 +111,33 @@ def test_the_same_bytes(source: Path, tmp_path: Path, cache: Path) -> None:
             )
             made.append(target.read_bytes())
         assert made[0] == made[1]
+
+
+@pytest.mark.parametrize("form", ["npz", "csv"])
+def test_a_section_that_the_last_check_reverts_is_as_sliced(
+    source: Path,
+    tmp_path: Path,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    form: TrajectoryFormat,
+) -> None:
+    right, target = StreamWriter.piece, tmp_path / f"t.{form}"
+
+    def wrong(self: StreamWriter, *given: Any) -> bytes:
+        return right(self, *given) + b"M117 not of the file\n"
+
+    monkeypatch.setattr(StreamWriter, "piece", wrong)
+    options, machine = Options(method="shaper:mzv"), load_machine("ender3")
+    rows = write_trajectories(source, target, machine, options, format=form, cache_dir=cache)
+    if form == "npz":
+        table = load(target)
+    else:
+        with target.open(newline="") as lines:
+            found = list(csv.DictReader(lines))
+        table = {name: np.array([float(row[name]) for row in found]) for name in found[0]}
+    assert {len(v) for v in table.values()} == {rows}
+    assert np.allclose(table["t_s"], 1e-3 * np.arange(rows))
+    assert np.array_equal(table["after_x_mm"], table["x_mm"])
 
 
 @pytest.mark.parametrize(
