@@ -23,7 +23,7 @@ def design(
     machine: MachineOption,
     axis: Annotated[str, typer.Option(help="x or y.")],
     basis: BasisOption = DEFAULT_BASIS,
-    robust: RobustOption = "off",
+    robust: RobustOption = "auto",
     report: Annotated[
         Path | None, typer.Option("--report", metavar="DIR", help="Folder for design.html, .json.")
     ] = None,

@@ -46,7 +46,7 @@ def trajectories(
         float | None, typer.Option("--to", metavar="S", help="Second of the print. [default: end]")
     ] = None,
     method: MethodOption = DEFAULT_METHOD,
-    robust: RobustOption = "off",
+    robust: RobustOption = "auto",
     budget_um: BudgetOption = None,
     plate: PlateOption = None,
     dialect: DialectOption = None,

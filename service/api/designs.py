@@ -28,7 +28,7 @@ async def _asked(
     caller: Reader,
     axis: Literal["x", "y"],
     basis: BasisName = DEFAULT_BASIS,
-    robust: RobustMode = "off",
+    robust: RobustMode = "auto",
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)
 

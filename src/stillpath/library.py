@@ -131,7 +131,7 @@ def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> 
 
 
 def design(
-    machine: Machine | str, axis: str, *, basis: str = DEFAULT_BASIS, robust: str = "off"
+    machine: Machine | str, axis: str, *, basis: str = DEFAULT_BASIS, robust: str = "auto"
 ) -> DesignReport:
     """Return what the design for one axis does, and what errors of its plant cost.
 

@@ -464,7 +464,7 @@ def test_api(client: Any, off: DesignReport) -> None:
     ):
         assert page.headers["content-type"].startswith("text/html")
         assert "Creality Ender 3, axis X" in page.text
-    assert client.calls == [("ender3", "x", "ce-opt", "off")] * 3
+    assert client.calls == [("ender3", "x", "ce-opt", "auto")] * 3
     client.get(f"{where}?axis=x&robust=minimax&basis=dct")
     assert client.calls[3:] == [("ender3", "x", "dct", "minimax")]
     for url, status, word in (
