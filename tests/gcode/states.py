@@ -22,7 +22,8 @@ __all__ = ["State", "differences", "states", "tagged"]
 
 _TAG = re.compile(rb";#(\d+)\s*$")
 _HELD = b"; stillpath, held back: "
-_DUST_MM = 1e-9
+_DUST_MM, _LAST_DIGIT_MM = 1e-9, 1e-5
+"""Of E in a stream, which an absolute E given in inches may not hit."""
 _XYZ = np.array([True, True, True, False])
 _STILL = re.compile(rb"\s*(?:N\d+\s*)?G-?0*[0-35](?!\d).*[XYZEIJK]", re.IGNORECASE)
 _TIMES = re.compile(
@@ -211,7 +212,8 @@ def _compare(old: State, new: State, place_mm: np.ndarray, swallows: bool) -> li
 
 def _is_dust(state: State, dust_mm: float) -> bool:
     """Sums of relative E miss the absolute one by rounding errors, which are moves."""
-    return bool(np.max(np.abs(state.end_mm - state.start_mm)) < dust_mm)
+    way_mm = np.abs(state.end_mm - state.start_mm)
+    return bool(np.all(way_mm < [dust_mm, dust_mm, dust_mm, max(dust_mm, _LAST_DIGIT_MM)]))
 
 
 def _differ(
