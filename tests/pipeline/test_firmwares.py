@@ -75,6 +75,19 @@ def test_a_move_of_less_than_a_step_alone(kind: str, tmp_path: Path, cache: Path
     assert differences(data, target.read_bytes(), machine_with(kind)) == []
 
 
+def test_a_turn_that_the_shaper_makes_shorter_than_marlins_least_move(
+    tmp_path: Path, cache: Path
+) -> None:
+    """Seen by fuzzing: nothing of .1 mm there and back was left to write."""
+    source = tmp_path / "in.gcode"
+    source.write_text("G1 X100 Y100 E0\nM221 S95\nG1 Y100.1\nG1 Y100.0\n")
+    options = Options(method="shaper:ei")
+    machine = machine_with("marlin")
+    result = compensate_file(source, tmp_path / "out.gcode", machine, options, cache_dir=cache)
+    (piece,) = result.put_back
+    assert piece.reason == "line 3: all moves round to zero at the resolution of a file"
+
+
 def test_marlins_g90_is_followed_by_m83(tmp_path: Path, cache: Path) -> None:
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(body("marlin"))

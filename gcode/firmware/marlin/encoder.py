@@ -224,13 +224,13 @@ class MarlinEncoder:
             phases = self._plan(start_mm, end_mm, chosen, limits_id, table)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
             miss = actual - predicted
-            if np.max(np.abs(np.cumsum(miss))) < _TIME_TOLERANCE_S:
+            if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             # Rates have steps: a full correction would swing to and fro.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
         encoded = encoded_piece(timeline, moves, limits, feedrate, phases)
         # What the first step from rest takes too long, the stretch begins later.
-        first = ours & np.append(True, ~ours[:-1])
+        first = ours & np.append(True, ~ours)[:-1]
         delay_s = np.zeros(len(timeline.groups))
         delay_s[moves.group[first]] = (actual - moves.planned_s)[first]
         counts = [group.last - group.first for group in timeline.groups]
