@@ -114,6 +114,10 @@ class StreamCommands(Protocol):
         """A second G or M in a line is no command of its own (not so in RepRapFirmware)."""
 
     @property
+    def ignores_subcodes(self) -> bool:
+        """G1.5 is a G1 (Marlin)."""
+
+    @property
     def factors_need_axes(self) -> bool:
         """M220 and M221 do not hold for moves of the extruder alone (RepRapFirmware)."""
 

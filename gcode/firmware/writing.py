@@ -25,6 +25,7 @@ __all__ = ["StreamWriter"]
 
 _BYTES_PER_LINE = 96
 _MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
+_MOVE_WITH_SUBCODE = re.compile(rb"^\s*(?:N\d+\s*)?G-?0*[0-35]\.\d", re.IGNORECASE)
 _FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
 _AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
 _FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
@@ -318,8 +319,10 @@ class StreamWriter:
 
     def _is_move(self, code: bytes) -> bool:
         """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
-        further = not self._stream_commands.one_command and _FURTHER_MOVE.search(code)
-        return bool(_MOVE.match(code) or further)
+        commands = self._stream_commands
+        further = not commands.one_command and _FURTHER_MOVE.search(code)
+        subcode = commands.ignores_subcodes and _MOVE_WITH_SUBCODE.match(code)
+        return bool(_MOVE.match(code) or further or subcode)
 
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:

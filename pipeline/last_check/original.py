@@ -180,7 +180,7 @@ class Original:
         """Return the next line with its end if it does nothing to place and modes; else nothing."""
         text = self.text
         line = text.data[text.at : text.data.find(b"\n", text.at) + 1]
-        return line if self.reader.leaves_alone(line.strip()) else b""
+        return line if self.reader.leaves_alone(line.rstrip()) else b""
 
     def wanted(self) -> Wanted:
         """Carry out what a stream may stand for, and the line after it, which must stay."""

@@ -313,20 +313,24 @@ class Reader:
 
 
 def code_of(line: bytes) -> bytes:
-    """Return a line without blanks around it, or nothing if it holds no command."""
-    code = line.strip()
+    """Return a line without blanks at its end, or nothing if it holds no command.
+
+    Those at its beginning tell whether it stands under a condition (RepRapFirmware).
+    """
+    line = line.rstrip()
+    code = line.lstrip()
     if code[:1] in (b"", b";", b"*"):
         return b""  # a sum alone is of no line
     if code[:1] in (b"N", b"n"):
         found = _LINE_NUMBER.match(code.upper())
         if found is not None and code[found.end() : found.end() + 1] in (b"", b";"):
             return b""
-    return code
+    return line
 
 
 def tells_times(code: bytes) -> bool:
     """Whether it is M73, whose numbers are new in the written file."""
-    return code[:3] == b"M73"
+    return code.lstrip()[:3] == b"M73"
 
 
 @lru_cache(maxsize=1024)  # slicers repeat themselves

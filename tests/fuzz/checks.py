@@ -7,6 +7,7 @@ file, with the machine in the same state at each of them.
 from __future__ import annotations
 
 import re
+import time
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -26,8 +27,9 @@ from tests.gcode.states import differences, has_code
 
 __all__ = ["Outcome", "interpreted", "read_through", "roomy", "through_the_pipeline", "walk"]
 
-_LONGEST_S = 300.0
-"""Lines whose moves last longer are taken out before the pipeline: every second of print costs."""
+_LONGEST_S, _LONGEST_PRINT_S = 300.0, 3.0 * 3600.0
+"""Lines whose moves last longer, and those that make a print longer, are taken out before the
+pipeline: every second of print costs."""
 
 _REPEATED = re.compile(rb"SET_INPUT_SHAPER|M572|M593|M900", re.IGNORECASE)
 _TICKS_MM_S = 0.02
@@ -44,9 +46,10 @@ class Outcome:
     written: bytes | None
     """None: refused as a whole."""
     put_back: int = 0
-    print_s: float = 0.0
     internal: tuple[str, ...] = ()
     """Why pieces were reverted for an error of our own."""
+    cpu_s: float = 0.0
+    """CPU time of reading it, and of the longest run: it runs again without each refused line."""
 
 
 def roomy(machine: Machine, half_mm: float = 5000.0) -> Machine:
@@ -57,19 +60,21 @@ def roomy(machine: Machine, half_mm: float = 5000.0) -> Machine:
 
 def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) -> Outcome:
     """Bring a damaged file through everything; what may not be is an AssertionError or worse."""
+    began = time.process_time()
     read_through(data, machine)
     text, refusals = without_refused(data, machine)
+    reading_s, runs_s = time.process_time() - began, [0.0]
     if text and not text.endswith(b"\n"):
         text += b"\n"  # the writer would add it before its footer
     # Ends of lines other than LF and CRLF are the interpreter's business alone.
     if b"\r" not in text.replace(b"\r\n", b"\n"):
         text = _tagged(text)
-    written, put_back, print_s, internal = None, 0, 0.0, ()
+    written, put_back, internal = None, 0, ()
     for _ in range(8):
+        began = time.process_time()
         try:
             written, result = through_the_pipeline(text, machine, folder, method, cache)
             put_back = len(result.put_back)
-            print_s = max(result.original_time_s, result.time_s)
             internal = tuple(p.reason for p in result.put_back if "internal error" in p.reason)
             break
         except GcodeError as error:
@@ -77,7 +82,10 @@ def walk(data: bytes, machine: Machine, folder: Path, method: str, cache: Path) 
             if error.line is None:
                 break
             text = _without(text, {error.line})
-    return Outcome(text, refusals, written, put_back, print_s, internal)
+        finally:
+            runs_s.append(time.process_time() - began)
+    cpu_s = reading_s + max(runs_s)
+    return Outcome(text, refusals, written, put_back, internal, cpu_s)
 
 
 def read_through(data: bytes, machine: Machine) -> GcodeError | None:
@@ -145,15 +153,18 @@ def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeErr
     refusals: list[GcodeError] = []
     reader = Interpreter(machine, strict_bounds=True)
     good = bytearray()
-    end = 0
+    end, total_s = 0, 0.0
     while end < len(data):
         start, end = end, data.find(b"\n", end) + 1 or len(data)
         ended = data[start:end]
         before = reader.snapshot()
         try:
             blocks = reader.push(ended) + ([] if ended.endswith(b"\n") else reader.flush())
-            slow = any(np.any(_lasts_s(b.moves) > _LONGEST_S) for b in blocks)
-            slow = slow or any(np.any(b.events.dwell_s > _LONGEST_S) for b in blocks)
+            times_s = np.concatenate(
+                [[0.0], *(t for b in blocks for t in (_lasts_s(b.moves), b.events.dwell_s))]
+            )
+            slow = bool(np.max(times_s) > _LONGEST_S)
+            slow = slow or total_s + float(np.sum(times_s)) > _LONGEST_PRINT_S
         except GcodeError as error:
             # Its frames would hold the reader that is given up here.
             error.__context__ = None
@@ -163,6 +174,7 @@ def without_refused(data: bytes, machine: Machine) -> tuple[bytes, list[GcodeErr
             reader = before
         else:
             good += ended
+            total_s += float(np.sum(times_s))
     return bytes(good), refusals
 
 

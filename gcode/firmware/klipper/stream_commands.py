@@ -29,6 +29,7 @@ class KlipperStreamCommands:
     folds_case = True
     coarse_extruder = False
     one_command = True
+    ignores_subcodes = False
     factors_need_axes = False
     shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"
     file_shaper_off = shaper_off

@@ -35,6 +35,7 @@ class MarlinStreamCommands:
     positioning_sets_extruder = True
     coarse_extruder = True
     one_command = True
+    ignores_subcodes = True
     factors_need_axes = False
     file_shaper_off = b"M593 F0\n"
 

@@ -39,6 +39,7 @@ class RepRapStreamCommands:
     folds_case = True
     coarse_extruder = False
     one_command = False
+    ignores_subcodes = False
     factors_need_axes = True
 
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:

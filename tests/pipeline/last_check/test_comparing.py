@@ -433,6 +433,18 @@ G1X100.64044Y102.24233E-0.31294
 ; LAYER_CHANGE
 """
 
+SUBCODE = """\
+G28
+G90
+M82
+G1 X50 Y50 F6000
+G1 X90 E1
+G0.837 E0.5
+G1 Y90 E2
+G1 X50 E3
+"""
+CONDITION = SUBCODE.replace("G0.837 E0.5", "if {x}\n G1 F7200") + "G1 Y50 E4\n"
+
 
 @pytest.mark.parametrize(
     ("kind", "text"),
@@ -455,6 +467,10 @@ G1X100.64044Y102.24233E-0.31294
         pytest.param("reprapfirmware", EXPRESSION, id="expression"),
         # What was fed is known before a line that stands still, but not since when.
         pytest.param("marlin", UNKNOWN_BEFORE, id="unknown before"),
+        # Marlin passes over the point and what is after it: this retracts.
+        pytest.param("marlin", SUBCODE, id="subcode"),
+        # Nobody knows which speed it is afterwards.
+        pytest.param("reprapfirmware", CONDITION, id="condition"),
     ],
 )
 def test_what_files_of_chance_found(kind: str, text: str, tmp_path: Path, cache: Path) -> None:
