@@ -61,6 +61,19 @@ class HostMoves:
     head: Array
     extruder: Array
 
+    def head_at(self, at_s: Array) -> Array:
+        """Where the plan has the head in X and Y at these times, (2, n), mm."""
+        begins_s = self.head[:, 0]
+        rows = self.head[np.maximum(np.searchsorted(begins_s, at_s, "right") - 1, 0)]
+        since_s = np.maximum(at_s - rows[:, 0], 0.0)
+        speeding_s = np.minimum(since_s, rows[:, 1])
+        cruising_s = np.clip(since_s - rows[:, 1], 0.0, rows[:, 2])
+        braking_s = np.clip(since_s - rows[:, 1] - rows[:, 2], 0.0, rows[:, 3])
+        start, cruise, accel = rows[:, 10], rows[:, 11], rows[:, 12]
+        way_mm = (start + 0.5 * accel * speeding_s) * speeding_s + cruise * cruising_s
+        way_mm += (cruise - 0.5 * accel * braking_s) * braking_s
+        return np.asarray((rows[:, 4:6] + rows[:, 7:9] * way_mm[:, None]).T)
+
 
 @dataclass(frozen=True)
 class Difference:

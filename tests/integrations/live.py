@@ -15,6 +15,7 @@ from stillpath.compensation.live_filter import LiveFilter
 from stillpath.models.machine import Machine
 from tests.integrations.interrupted import two_objects
 from tests.integrations.klipper_host import STEP_MM, Steps, printer_cfg, steps_of
+from tests.integrations.klipper_moves import HostMoves, recorded
 
 __all__ = [
     "EVENTS",
@@ -140,11 +141,22 @@ FILES: dict[str, Callable[[], str]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """A print as Klipper makes it, and with the extra; and what the host said."""
+    """A print as Klipper makes it, and with the extra; its plan, and what the host said."""
 
     plain: Steps
     live: Steps
+    plan: HostMoves
     log: str
+
+    def planned(self) -> tuple[Array, Array]:
+        """The plan from shortly before the print on: times, and places of X and Y, (2, n).
+
+        `FINE` samples are one of the filter.
+        """
+        first = (round(print_begins(self.plain.time_s) * 1e3) - 500) * FINE
+        ends_s = max(float(t[-1]) for t in self.plain.time_s)
+        at_s = np.arange(first, round(ends_s * 1e3 * FINE) + 50 * FINE) * 1e-3 / FINE
+        return at_s, self.plan.head_at(at_s)
 
 
 def print_with(
@@ -171,9 +183,10 @@ def both(
     """Print without and with the extra."""
     plain = "\n".join(line for line in text.split("\n") if not line.startswith("STILLPATH"))
     first = steps_of(plain, printer_cfg(machine, more), place, klipper)
+    plan = recorded(place)
     text = text + "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"  # the first of them makes all steps
     second = print_with(text, machine, export, place, klipper, more)
-    return Pair(first, second, (place / "klippy.log").read_text())
+    return Pair(first, second, plan, (place / "klippy.log").read_text())
 
 
 def stands(steps: Steps, least_s: float = 0.6) -> list[tuple[float, ...]]:
@@ -240,9 +253,10 @@ def predicted(plan: Array, given: dict[str, Any]) -> Array:
 
 def off_steps(prints: Pair, given: dict[str, Any], corexy: bool) -> Array:
     """By how many steps the motors stand off the filtered plan, (2, n), from the print on."""
-    first = (round(print_begins(prints.plain.time_s) * 1e3) - 500) * FINE
-    plan = prints.plain.sampled(1e-3 / FINE, corexy)[:, first:]
+    at_s, plan = prints.planned()
     x, y = predicted(plan, given)
     motors = np.stack((x + y, x - y) if corexy else (x, y))
-    at_s = (first + np.arange(plan.shape[1])) * 1e-3 / FINE + later(prints)
-    return np.asarray((prints.live.held(at_s) - motors) / STEP_MM)
+    stand = prints.live.held(at_s + later(prints))
+    # Steps count from where the motors stood at first, the plan from where they were homed.
+    stand -= stand[:, :1] - motors[:, :1]
+    return np.asarray((stand - motors) / STEP_MM)

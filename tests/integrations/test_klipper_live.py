@@ -61,12 +61,14 @@ def test_steps_are_the_filtered_plan(
 
     corexy = machine.kinematics == "corexy"
     begin, shift_s = print_begins(prints.plain.time_s), later(prints)
-    plan = prints.plain.sampled(1e-3 / FINE, corexy)[:, (round(begin * 1e3) - 500) * FINE :]
+    plan = prints.planned()[1]
     assert np.abs(predicted(plan, given) - plan).max() > 0.01
-    # Motors that round to whole steps are within half a step, .29 rms; the plan is known by steps.
+    # Motors that round to whole steps, here of .8 um, are within half a step, .29 rms; Klipper's
+    # own are up to 1 off its plan (times of steps are whole clock ticks).
     off = off_steps(prints, given, corexy)
-    assert np.sqrt(np.mean(off**2)) < 0.4
-    assert np.abs(off).max() < 2.0
+    assert np.sqrt(np.mean(off**2)) < 0.31
+    assert np.abs(off[:, ::FINE]).max() < 1.1
+    assert np.abs(off).max() < 1.6
 
     # Time and material: one shift for all of the print, of all other motors too.
     for ours, theirs in zip(prints.live.others_s, prints.plain.others_s, strict=True):
@@ -104,12 +106,9 @@ def test_limits_bring_the_plan_back(
     given["digest"] = export_digest(given)
     prints = both(two_objects(), machine, given, tmp_path, klipper_live)
     assert "limited 0.000 s" not in prints.log
-    first = (round(print_begins(prints.plain.time_s) * 1e3) - 500) * FINE
-    plan, found = (s.sampled(1e-3 / FINE)[:, first:] for s in (prints.plain, prints.live))
-    off_mm = shifted(found, later(prints) * 1e3 * FINE, plan.shape[1]) - predicted(plan, given)
-    # The prediction takes the plan from steps, whose edges look like acceleration at the limit.
-    assert np.sqrt(np.mean(off_mm**2)) < 3e-3
-    assert np.abs(off_mm).max() < 20e-3
+    off = off_steps(prints, given, corexy=False)
+    assert np.sqrt(np.mean(off**2)) < 0.4
+    assert np.abs(off).max() < 4.0
 
 
 def test_a_compensated_file_is_not_compensated_twice(
