@@ -92,6 +92,9 @@ def test_no_step_is_lost_whatever_happens(
     assert "stillpath: " + ("off" if event == "off" else "on") + " for" in prints.log
     assert "passing through" not in prints.log
     assert stands(prints.live) == stands(prints.plain)
+    # Z and the extruder make as many steps as without it.
+    live_s, plain_s = prints.live.others_s, prints.plain.others_s
+    assert [len(times) for times in live_s] == [len(times) for times in plain_s]
     bears, plain, live = machine.command, asked(prints.plain, machine), asked(prints.live, machine)
     # What Klipper plans beyond the limits passes; nothing is added to it.
     assert live.step_mm_s <= max(bears.speed_step_mm_s, 1.05 * plain.step_mm_s)
