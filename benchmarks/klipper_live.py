@@ -21,7 +21,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from stillpath.applications.live.design import DT_S, live_filter
+from stillpath.pipeline.live_design import DT_S, live_filter
 from stillpath.applications.live.export import write_export
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set

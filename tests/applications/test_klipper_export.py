@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.applications.live.design import design_live, live_filter
+from stillpath.pipeline.live_design import design_live, live_filter
 from stillpath.applications.live.export import write_export
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
