@@ -46,8 +46,9 @@ def compensate_file(
     ----------
     source, target : Path
         Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
-        name says so and the source's does not; with method `live` it is the source. It is written next to itself, under another name,
-        and renamed when it is complete; the source is only read. They may be the same file.
+        name says so and the source's does not; with method `live` it is a copy. It is written next
+        to itself, under another name, and renamed when it is complete; the source is only read.
+        They may be the same file.
     machine : Machine
     options : Options
     cache_dir : Path, optional
@@ -75,8 +76,8 @@ def compensate_file(
     """
     how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress}
     if options.method == "live":
-        place = {"plate": options.plate, "dialect": options.dialect}
-        result = simulate_live(source, machine, **place, **how, layers=layers, trace=trace)
+        how.update(plate=options.plate, dialect=options.dialect)
+        result = simulate_live(source, machine, **how, layers=layers, trace=trace)
         keep_file(source, target)
         return result
     if options.method == "advise":

@@ -7,6 +7,11 @@ from stillpath.pipeline.result import Channel, PrintWay, Result
 
 __all__ = ["file_way", "live_way"]
 
+_RAISED = (
+    "Pause, cancel, mesh, pressure advance, M220 and object exclusion do not run as usual, but "
+    "under raised limits"
+)
+
 
 def file_way(result: Result) -> PrintWay:
     """Return how the written file prints on a Klipper machine.
@@ -27,8 +32,7 @@ def file_way(result: Result) -> PrintWay:
             "the macros for PAUSE, RESUME and CANCEL_PRINT, installed once (docs/klipper.md)",
         ],
         lacks=[
-            "Pause, cancel, mesh, pressure advance, M220 and object exclusion do not run as usual, "
-            "but under raised limits",
+            _RAISED,
             "It does not fit another machine, nor this one once it has changed",
         ],
     )
@@ -53,14 +57,13 @@ def live_way(channel: Channel, machine: Machine, time_s: float, size: int) -> Pr
         file_bytes=size,
         needs=[
             "the extra of Stillpath in Klipper, installed once (docs/klipper-live.md)",
-            "the filter of this machine beside printer.cfg, made by stillpath klipper export "
-            f"--machine {machine.name}",
+            f"its filter, by stillpath klipper export --machine {machine.name}, beside printer.cfg",
             "Klipper's own input shaper switched off",
             "the file as sliced",
         ],
         lacks=[
-            "It does not compensate friction, ripple, or what mass and position change, and it has "
-            "no speed budget",
+            "It does not compensate friction, ripple, or what mass and position change",
+            "It does not keep a speed budget",
             "It does not check a file before it prints: one filter per axis serves all files",
             "It has not been tried on a printer yet",
         ],

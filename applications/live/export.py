@@ -13,7 +13,14 @@ from stillpath.pipeline.files import default_cache_dir, replacing
 from stillpath.pipeline.live_design import DT_S, LiveDesign, cached_live_design
 from stillpath.version import __version__
 
-__all__ = ["SCHEMA", "export_digest", "export_document", "export_text", "made_export", "write_export"]
+__all__ = [
+    "SCHEMA",
+    "export_digest",
+    "export_document",
+    "export_text",
+    "made_export",
+    "write_export",
+]
 
 SCHEMA = "stillpath-klipper/1"
 _DIGITS = 12

@@ -78,6 +78,6 @@ window.fetch = async (address, asking) => {
   if (!String(address).endsWith("/v1/machines")) return answer;
   const machines = await answer.json();
   for (const one of machines) if (one.name === "ender3") one.live_refusal = "it runs marlin";
-  return new Response(JSON.stringify(machines), { headers: { "Content-Type": "application/json" } });
+  return Response.json(machines);
 };
 """
