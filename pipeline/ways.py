@@ -57,7 +57,7 @@ def live_way(channel: Channel, machine: Machine, time_s: float, size: int) -> Pr
         file_bytes=size,
         needs=[
             "the extra of Stillpath in Klipper, installed once (docs/klipper-live.md)",
-            f"its filter, by stillpath klipper export --machine {machine.name}, beside printer.cfg",
+            f"the filter beside printer.cfg (stillpath klipper export --machine {machine.name})",
             "Klipper's own input shaper switched off",
             "the file as sliced",
         ],
