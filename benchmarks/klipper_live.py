@@ -21,12 +21,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from stillpath.applications.live.design import DT_S, live_filter
 from stillpath.applications.live.export import write_export
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.live_design import DT_S, live_filter
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 from stillpath.pipeline.simulate import simulate_file

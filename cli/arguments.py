@@ -38,7 +38,8 @@ METHODS = (
     "fbf, npz-ignore, zmetc, zpetc, ebzpetc, ts, none, "
     "shaper:zv, shaper:mzv, shaper:ei, shaper:2hump_ei, shaper:3hump_ei; any with +ripple "
     "appended undoes the machine's ripple too; or advise: leave all moves as they are and add "
-    "firmware commands for shaper and acceleration"
+    "firmware commands for shaper and acceleration; or live: leave the file as it is and predict "
+    "the compensation inside Klipper"
 )
 """The methods of `compensate`, in words."""
 
@@ -144,6 +145,13 @@ class CompensationOptions:
     ] = None
     budget_um: BudgetOption = None
     dialect: DialectOption = None
+    compare_live: Annotated[
+        bool,
+        typer.Option(
+            "--compare-live",
+            help="Report also what the compensation inside Klipper would make of the sliced file.",
+        ),
+    ] = False
     keep_times: Annotated[
         bool,
         typer.Option("--keep-times", help="Leave the slicer's times in the file as they are."),

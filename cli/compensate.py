@@ -107,22 +107,19 @@ def simulate(
     found = _machine(machine)
 
     from stillpath.cli.console import print_result, progress_shown
-    from stillpath.pipeline.compensate import simulate_file
 
-    found_filter = None
     if live:
-        from stillpath.applications.live.design import filter_of
-
-        found_filter = filter_of(found.machine)
+        from stillpath.pipeline.live_printing import simulate_live as simulated
+    else:
+        from stillpath.pipeline.compensate import simulate_file as simulated
     with progress_shown("stillpath") as progress:
-        result = simulate_file(
+        result = simulated(
             source,
             found.machine,
             plate=plate,
             dialect=read_as,
             progress=progress,
             layers=report,
-            live=found_filter,
         )
     result.warnings.extend(found.warnings)
     _write_report(result, report)

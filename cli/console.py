@@ -15,7 +15,7 @@ from stillpath.service.interruption import interruptible
 
 if TYPE_CHECKING:
     from stillpath.pipeline.progress import Progress
-    from stillpath.pipeline.result import AdviceFigures, BudgetFigures, Result
+    from stillpath.pipeline.result import AdviceFigures, BudgetFigures, PrintWay, Result
     from stillpath.pipeline.simulate import PlannedTime
 
 __all__ = ["budget_line", "print_planned", "print_result", "progress_shown", "shown"]
@@ -77,7 +77,7 @@ def print_result(result: Result, console: Console | None = None) -> None:
             f"size {result.original_bytes / 1e6:.2f} -> {result.written_bytes / 1e6:.2f} MB"
             + (
                 f", {result.segments_per_s:.0f} segments/s (peak {result.peak_segments_per_s:.0f})"
-                if result.advice is None
+                if result.segments
                 else ""
             )
         )
@@ -85,7 +85,11 @@ def print_result(result: Result, console: Console | None = None) -> None:
             console.print(budget_line(result.budget))
         if result.advice is not None:
             console.print(_advice_line(result.advice), markup=False)
-    if any(channel.name == "after" for channel in result.channels) and result.advice is None:
+    for way in result.ways:
+        console.print(_way_line(way))
+    if result.not_live:
+        console.print(f"not live: {result.not_live}", markup=False)
+    if result.pieces:
         console.print(
             f"reverted to the sliced lines: {len(result.put_back)} of {result.pieces} pieces "
             f"({100 * result.put_back_extruding_share:.2f} % of the extruding time); left alone by "
@@ -97,6 +101,17 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def _way_line(way: PrintWay) -> str:
+    """Return what is predicted for a way to print."""
+    range_um = way.contour_range_um
+    plants = "" if range_um is None else f", all plants {range_um[0]:.2f} - {range_um[1]:.2f}"
+    return (
+        f"{'printed as a file' if way.name == 'file' else 'printed live'}: contour rms "
+        f"{way.contour_rms_um:.2f} µm{plants}, max {way.contour_max_um:.2f} µm; print time "
+        f"{way.time_s:.1f} s, file {way.file_bytes / 1e6:.2f} MB"
+    )
 
 
 def left_alone(result: Result) -> str:

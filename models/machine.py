@@ -199,6 +199,21 @@ class Machine(Document):
         return hashlib.sha256(document.encode()).hexdigest()[:12]
 
     @property
+    def live_refusal(self) -> str | None:
+        """Why it cannot compensate while it prints (inside Klipper); None: it can."""
+        if self.firmware.kind != "klipper":
+            return (
+                f"machine {self.name} runs {self.firmware.kind}: only Klipper has print-time "
+                "compensation; print a compensated file instead"
+            )
+        if self.kinematics not in ("cartesian", "corexy"):
+            return (
+                f"machine {self.name} has {self.kinematics} kinematics: the extra of Klipper knows "
+                "cartesian and corexy; print a compensated file instead"
+            )
+        return None
+
+    @property
     def friction_mm(self) -> tuple[float, float]:
         """How far dry friction holds X and Y back."""
         return self.axes["x"].friction_mm or 0.0, self.axes["y"].friction_mm or 0.0

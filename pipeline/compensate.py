@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
 from stillpath.pipeline.job import Job
 from stillpath.pipeline.last_check.comparing import LastCheckError
+from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.order import Order
@@ -44,8 +46,9 @@ def compensate_file(
     ----------
     source, target : Path
         Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
-        name says so and the source's does not. It is written next to itself, under another name,
-        and renamed when it is complete; the source is only read. They may be the same file.
+        name says so and the source's does not; with method `live` it is a copy. It is written next
+        to itself, under another name, and renamed when it is complete; the source is only read.
+        They may be the same file.
     machine : Machine
     options : Options
     cache_dir : Path, optional
@@ -71,6 +74,12 @@ def compensate_file(
     DesignError, ModelError
         The method cannot be designed for this machine.
     """
+    how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress}
+    if options.method == "live":
+        how.update(plate=options.plate, dialect=options.dialect)
+        result = simulate_live(source, machine, **how, layers=layers, trace=trace)
+        keep_file(source, target)
+        return result
     if options.method == "advise":
         if trace is not None:
             raise GcodeError(
@@ -79,15 +88,9 @@ def compensate_file(
             )
         from stillpath.pipeline.advising.advise import advise_file
 
-        return advise_file(
-            source,
-            target,
-            machine,
-            options,
-            cache_dir=cache_dir,
-            progress=progress,
-            layers=layers,
-        )
+        return advise_file(source, target, machine, options, **how, layers=layers)
+    # First, as the target may be the source.
+    live = predict_live(source, machine, options, **how) if options.compare_live else None
     opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
     with opened as file:
         order = Order(machine, options, cache_dir, progress)
@@ -95,7 +98,8 @@ def compensate_file(
         job.deliver(file.text)
         if options.times == "new":
             file.container.delay(job.delay_s)
-    return result.model_copy(update=file.sizes)
+    result = result.model_copy(update=file.sizes)
+    return result if live is None else live.beside(result)
 
 
 def _final_job(

@@ -35,16 +35,17 @@ __all__ = [
 ]
 
 DEFAULT_TOLERANCE_UM = 2.0
+_LATER = {"budget_um": None, "where": "all", "max_mb": None, "compare_live": False}
 
 _PLAIN = (*COMPENSATORS, "none")
-_METHOD = rf"^(advise|({'|'.join(_PLAIN)})(\+ripple)?)$"
+_METHOD = rf"^(advise|live|({'|'.join(_PLAIN)})(\+ripple)?)$"
 
 
 def _known(method: str) -> str:
     if re.fullmatch(_METHOD, method) is None:
         raise ValueError(
             f"there is no such method, but {', '.join(_PLAIN)}, each also with +ripple appended, "
-            "and advise"
+            "advise, and live"
         )
     return method
 
@@ -63,7 +64,9 @@ class Options(BaseModel):
 
     `method` is `fbf`, an approximate inverse (`compensation.inversion`), `none`, or `shaper:NAME`
     with a firmware shaper's name; with `+ripple` appended the machine's ripple is undone as well.
-    `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`).
+    `advise` leaves every move as it is and adds firmware commands (`pipeline.advising`). `live`
+    leaves the file as it is and predicts what the extra inside Klipper makes of it
+    (`pipeline.live_printing`); `compare_live` adds that prediction to a compensated file's report.
     `basis`, `robust` and `along` are settings of `fbf`: `robust` says what it is designed for:
     the set of plants that explain the measurement, with as much of a shaper's smoothing as no
     member fares worse for (`auto`; a machine without a measured set: its one plant), the nominal
@@ -92,6 +95,22 @@ class Options(BaseModel):
     budget_um: BudgetUm | None = None
     where: Where = "all"
     max_mb: MaxMb | None = None
+    compare_live: bool = False
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Options:
+        if self.compare_live and self.method.split("+")[0] in ("advise", "live", "none"):
+            raise ValueError(
+                f"compare_live compares a compensated file: method {self.method} writes none; "
+                "choose fbf, or leave compare_live off"
+            )
+        whole = (self.where, self.max_mb, self.budget_um) == ("all", None, None)
+        if self.method == "live" and not whole:
+            raise ValueError(
+                "method live prints the file as sliced: it cannot be combined with where, max_mb "
+                "and budget_um, which are settings of a written file"
+            )
+        return self
 
     @model_validator(mode="after")
     def _one_selection(self) -> Options:
@@ -106,7 +125,7 @@ class Options(BaseModel):
     def _without_unused(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Digests of options are kept for long: what came later counts only where it is used.
         values: dict[str, Any] = handler(self)
-        for name, unused in (("budget_um", None), ("where", "all"), ("max_mb", None)):
+        for name, unused in _LATER.items():
             if values.get(name) == unused:
                 values.pop(name, None)
         return values
@@ -114,7 +133,8 @@ class Options(BaseModel):
 
 def stamp(machine: Machine, options: Options) -> str:
     """Return what a written file says of how it was made; the same stamp, the same bytes."""
-    settings = hashlib.sha256(options.model_dump_json(exclude={"plate"}).encode()).hexdigest()[:8]
+    chosen = options.model_dump_json(exclude={"plate", "compare_live"})
+    settings = hashlib.sha256(chosen.encode()).hexdigest()[:8]
     return (
         f"{__version__} machine={machine.name} model={machine.revision} "
         f"method={options.method} settings={settings}"

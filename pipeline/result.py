@@ -19,6 +19,7 @@ __all__ = [
     "GroupFigures",
     "LastCheckFigures",
     "LayerView",
+    "PrintWay",
     "PutBack",
     "Result",
     "StageTime",
@@ -237,6 +238,30 @@ class LastCheckFigures(_Figures):
     """Where the place was not compared, and why."""
 
 
+class PrintWay(_Figures):
+    """A way to print a file compensated: what is predicted, what it needs, what it does not do."""
+
+    name: str
+    """`file`: print the written file; `live`: print the file as sliced, which an extra inside
+    Klipper compensates while it prints."""
+    contour_rms_um: float
+    """Contour error while extruding, root mean square [um]; of all motion where nothing is
+    extruded."""
+    contour_range_um: tuple[float, float] | None
+    """The same, least and largest of all plants that explain the machine's measurement [um]; null
+    where that is not known."""
+    contour_max_um: float
+    """The same, largest [um]."""
+    time_s: float
+    """How long the print takes [s]."""
+    file_bytes: int
+    """Size of the file to print [bytes]."""
+    needs: list[str]
+    """What it needs, for a person."""
+    lacks: list[str]
+    """What it does not do, for a person."""
+
+
 class Result(_Figures):
     """Report of one job; `reports` turns it into HTML, the API returns it as JSON."""
 
@@ -325,6 +350,11 @@ class Result(_Figures):
     """What the budget bought, where there was one."""
     advice: AdviceFigures | None = None
     """What is advised, by method `advise`."""
+    ways: list[PrintWay] = []
+    """Both ways to print the file, where they were compared; the one, where it is to be printed
+    live; else empty."""
+    not_live: str = ""
+    """Why it cannot be printed live, where both ways were to be compared; empty: it can."""
     last_check: LastCheckFigures | None = None
     """What the last check compared; null where nothing was compensated."""
 

@@ -45,9 +45,11 @@ from stillpath.version import __version__
 
 __all__ = [
     "STANDING_S",
+    "FileMotion",
     "MotionPart",
     "PlannedTime",
     "TextMotion",
+    "measured",
     "plan_file",
     "simulate_file",
 ]
@@ -110,7 +112,7 @@ def plan_file(
     """
     if not (np.isfinite(rate_hz) and 0 < rate_hz <= 100_000):
         raise GcodeError(f"the rate of {rate_hz:g} samples per second is outside 0 to 100000")
-    motion = _Motion(source, plate, machine, dialect, 1.0 / rate_hz, progress)
+    motion = FileMotion(source, plate, machine, dialect, 1.0 / rate_hz, progress)
     with npz_table(target_npz, dict.fromkeys(_COLUMNS, "<f8")) as table:
         for part in motion:
             samples = part.samples
@@ -139,7 +141,7 @@ def simulate_file(
     clock = StageClock()
     with clock.stage("reference shaper"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-    motion = _Motion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
+    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
     with contextlib.ExitStack() as files:
         writer = None
@@ -156,7 +158,7 @@ def simulate_file(
             size=source.stat().st_size,
         )
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
-        seen = _measure(motion, stream, measurement, operation, clock)
+        seen = measured(motion, stream, measurement, operation, clock)
         measurement.finish()
         if writer is not None:
             writer.finish(motion.feature_names)
@@ -208,8 +210,8 @@ class _Seen:
             self.peak_velocity_mm_s = max(self.peak_velocity_mm_s, float(step.max()) / DT_S)
 
 
-def _measure(
-    motion: _Motion,
+def measured(
+    motion: FileMotion,
     stream: ShapedMotion | LiveMotion,
     measurement: Measurement,
     operation: Operation,
@@ -468,7 +470,7 @@ class TextMotion:
         return MotionPart(samples, path_mm, moves, self._held[0][0], jumped, self._shaping)
 
 
-class _Motion:
+class FileMotion:
     """Iterate over the sampled motion of a print file of any kind."""
 
     def __init__(

@@ -67,7 +67,7 @@ class Summary:
             machine=self.machine.name,
             machine_title=self.machine.title,
             machine_revision=self.machine.revision,
-            settings=self.options.model_dump(exclude_none=True),
+            settings=self.options.model_dump(exclude_none=True, exclude={"compare_live"}),
             source_name=name,
             channels=channels,
             best_shaper=self.shaper.label,

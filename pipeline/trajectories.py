@@ -81,6 +81,7 @@ def write_trajectories(
             f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
             "or later, and end after its start"
         )
+    options = options.model_copy(update={"compare_live": False})
     advised = options.method == "advise"
     names = ("after",) if advised else ("before", "after")
     with (

@@ -52,6 +52,7 @@ def render_report(result: Result) -> str:
     """Return the report as one HTML page."""
     script = asset(_PACKAGE, "report.js")
     features = sorted(result.features, key=lambda group: -group.seconds)
+    channels = {channel.name: channel for channel in result.channels}
     return rendered(
         _PACKAGE,
         "report.html.j2",
@@ -67,7 +68,8 @@ def render_report(result: Result) -> str:
             "number": _number,
         },
         result=result,
-        channels={channel.name: channel for channel in result.channels},
+        channels=channels,
+        writes="after" in channels and result.settings.get("method") != "live",
         headline=_headline(result.channels),
         rows=_rows(result.channels),
         features=features[:_FEATURES_SHOWN],

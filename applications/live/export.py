@@ -7,14 +7,20 @@ import json
 from pathlib import Path
 from typing import Any
 
-from stillpath.applications.live.design import DT_S, LiveDesign, design_live
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
 from stillpath.pipeline.files import default_cache_dir, replacing
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper
+from stillpath.pipeline.live_design import DT_S, LiveDesign, cached_live_design
 from stillpath.version import __version__
 
-__all__ = ["SCHEMA", "export_digest", "export_document", "write_export"]
+__all__ = [
+    "SCHEMA",
+    "export_digest",
+    "export_document",
+    "export_text",
+    "made_export",
+    "write_export",
+]
 
 SCHEMA = "stillpath-klipper/1"
 _DIGITS = 12
@@ -28,12 +34,26 @@ def write_export(machine: Machine, target: Path, cache_dir: Path | None = None) 
     DesignError
         If there is no print-time compensation for the machine.
     """
-    shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-    document = export_document(machine, design_live(machine, shaper))
-    text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    document = made_export(machine, cache_dir)
     with replacing(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(export_text(document), encoding="utf-8")
     return document
+
+
+def made_export(machine: Machine, cache_dir: Path | None = None) -> dict[str, Any]:
+    """Return the export of a machine; its design is kept in the cache.
+
+    Raises
+    ------
+    DesignError
+        As `write_export` does.
+    """
+    return export_document(machine, cached_live_design(machine, cache_dir or default_cache_dir()))
+
+
+def export_text(document: dict[str, Any]) -> str:
+    """Return an export as it is written."""
+    return json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
 
 def export_document(machine: Machine, design: LiveDesign) -> dict[str, Any]:

@@ -223,7 +223,7 @@ class Intake:
             source_name=upload.name,
             source_bytes=upload.size_bytes,
             source_sha256=upload.sha256,
-            result_name=_result_name(upload.name),
+            result_name=_result_name(upload.name, wanted.method),
             created_at=time.time(),
             webhook=wanted.webhook,
             printer=wanted.printer,
@@ -416,8 +416,10 @@ def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _result_name(source_name: str) -> str:
+def _result_name(source_name: str, method: str) -> str:
     """Name the result; printers tell a sliced package by both of its suffixes."""
+    if method == "live":
+        return source_name  # it is the source
     source = Path(source_name)
     suffix = ".gcode.3mf" if source_name.lower().endswith(".gcode.3mf") else source.suffix
     return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"

@@ -30,6 +30,9 @@ class MachineSummary(BaseModel):
     number: int | None = Field(default=None, description="Newest revision, if it is your own.")
     approved: int | None = Field(default=None, description="Newest approved revision.")
     problem: str | None = Field(default=None, description="What is damaged, if it is.")
+    live_refusal: str | None = Field(
+        default=None, description="Why it cannot print live, inside Klipper; null: it can."
+    )
 
     @classmethod
     def of(cls, machine: Machine) -> MachineSummary:
@@ -40,6 +43,7 @@ class MachineSummary(BaseModel):
             kinematics=machine.kinematics,
             revision=machine.revision,
             source=machine.source,
+            live_refusal=machine.live_refusal,
         )
 
     @classmethod

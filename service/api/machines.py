@@ -41,6 +41,7 @@ __all__ = [
     "look_up",
     "router",
     "store_revision",
+    "to_print_with",
 ]
 
 _LARGEST_BYTES = 4_000_000
@@ -78,6 +79,12 @@ def look_up(request: Request, name: str) -> Machine:
     """Return the newest state of a machine, approved or not; raise `Problem` if there is none."""
     with as_problems():
         return _machines(request).to_look_at(name).machine
+
+
+def to_print_with(request: Request, name: str) -> Machine:
+    """Return the machine that jobs are done with; raise `Problem` if there is none."""
+    with as_problems():
+        return _machines(request).for_job(name).machine
 
 
 def store_revision(

@@ -5,9 +5,17 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from stillpath.compensation.defaults import DEFAULT_BASIS, DEFAULT_METHOD
+from stillpath.models.complaints import complaint
 from stillpath.pipeline.options import (
     DEFAULT_TOLERANCE_UM,
     BasisName,
@@ -100,7 +108,8 @@ class JobQuery(BaseModel):
         description="`fbf` (limited-preview filtered basis functions), `npz-ignore`, `zmetc`, "
         "`zpetc`, `ebzpetc`, `ts` (approximate inverses), `shaper:NAME` (zv, mzv, ei, 2hump_ei, "
         "3hump_ei) or `none`; with `+ripple` appended the machine's ripple is undone as well. "
-        "`advise` leaves all moves as they are and adds firmware commands.",
+        "`advise` leaves all moves as they are and adds firmware commands. `live` leaves the file "
+        "as it is, which is then the result too, and predicts the compensation inside Klipper.",
     )
     basis: BasisName = Field(default=DEFAULT_BASIS, description="Basis functions of `fbf`.")
     robust: RobustMode = Field(
@@ -135,6 +144,11 @@ class JobQuery(BaseModel):
         default=None,
         description="Contour error that every feature may have, rms of the worst plant of the "
         "machine's set: the print becomes as fast as that allows. By default it keeps its speeds.",
+    )
+    compare_live: bool = Field(
+        default=False,
+        description="Whether the report of a compensated file says too what the compensation "
+        "inside Klipper would make of the sliced file (a quarter more computing time).",
     )
     plate: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
         default=None, description="Which plate of a 3MF package with several."
@@ -178,6 +192,15 @@ class JobQuery(BaseModel):
         description="Printer of `/v1/printers` that the result is sent to.",
     )
     print: bool = Field(default=False, description="Whether that printer starts to print it.")
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> JobQuery:
+        try:
+            self.options()
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            raise ValueError(complaint(first, repeat=False)) from None
+        return self
 
     def options(self) -> Options:
         """Return the settings of the compensation among the parameters."""

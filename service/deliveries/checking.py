@@ -44,7 +44,7 @@ _FIXED = frozenset(
     }
 )
 _RELATIVE = 1e-6
-_WITHOUT_STREAM = ("none", "advise")
+_WITHOUT_STREAM = ("none", "advise", "live")
 # What changes the motion or the vibration, of sections that hold more than that.
 _STEPPER = frozenset(
     {

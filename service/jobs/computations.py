@@ -100,6 +100,14 @@ def _list_loops(task: Task, progress: ProgressCallback) -> None:
     _write(task, [figures.model_dump(mode="json") for figures in loop_figures()])
 
 
+def _export_live(task: Task, progress: ProgressCallback) -> None:
+    """Write what `stillpath klipper export` writes."""
+    from stillpath.applications.live.export import write_export
+
+    progress_to(progress, "designing", 0.0)(0.0)
+    write_export(task.pinned().machine, task.target, task.cache_dir)
+
+
 def _trace(task: Task, progress: ProgressCallback) -> None:
     """Write the motion of another job; options: that job's `options`, `format` and times."""
     from stillpath.pipeline.options import Options
@@ -124,6 +132,7 @@ _WRITERS: dict[JobKind, Callable[[Task, ProgressCallback], None]] = {
     JobKind.DESIGN: _design,
     JobKind.CONTROLLER: _design_controller,
     JobKind.LOOPS: _list_loops,
+    JobKind.LIVE: _export_live,
     JobKind.TRAJECTORIES: _trace,
 }
 

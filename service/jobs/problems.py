@@ -24,6 +24,7 @@ _REFUSED = {
     JobKind.IDENTIFICATION: "The machine cannot be used",
     JobKind.DESIGN: "No such design",
     JobKind.CONTROLLER: "No such controller",
+    JobKind.LIVE: "It cannot print live",
 }
 """Titles, where what was asked cannot be computed."""
 

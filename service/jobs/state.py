@@ -52,6 +52,7 @@ class JobKind(StrEnum):
     DESIGN = "design"
     CONTROLLER = "controller"
     LOOPS = "loops"
+    LIVE = "live"
 
     @property
     def is_short(self) -> bool:

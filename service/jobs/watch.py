@@ -35,6 +35,7 @@ _SHORT_REMEDIES = {
     JobKind.DESIGN: "Give the machine fewer members or places",
     JobKind.CONTROLLER: "Give the machine fewer states or plants",
     JobKind.LOOPS: "Ask again",
+    JobKind.LIVE: "Give the machine fewer members",
 }
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.applications.live.design import design_live, live_filter
 from stillpath.applications.live.export import write_export
 from stillpath.cli.main import run
 from stillpath.compensation.base import DesignError
@@ -17,6 +16,7 @@ from stillpath.models.firmware import Marlin
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.live_design import design_live, live_filter
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.simulate import simulate_file

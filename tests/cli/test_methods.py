@@ -20,7 +20,7 @@ from stillpath.pipeline.options import MethodName, Options
 from stillpath.service.api.schemas import JobQuery
 
 ROOT = Path(__file__).parents[2]
-ALL = {*COMPENSATORS, "none", "advise"}
+ALL = {*COMPENSATORS, "none", "advise", "live"}
 
 
 def literal(path: str, name: str) -> Any:
@@ -37,7 +37,7 @@ def test_options_take_every_compensator_and_nothing_else():
     for name in COMPENSATORS:
         assert method.validate_python(name) == name
         assert method.validate_python(f"{name}+ripple") == f"{name}+ripple"
-    for name in ("none", "none+ripple", "advise"):
+    for name in ("none", "none+ripple", "advise", "live"):
         assert method.validate_python(name) == name
     for wrong in (
         "",
@@ -61,8 +61,9 @@ def test_what_slicers_call_says_which_option_is_wrong(tmp_path: Path):
 
 def test_the_help_names_them_all():
     listed = re.split(r"; any with", METHODS)[0]
-    assert {*listed.split(", "), "advise"} == ALL
+    assert {*listed.split(", "), "advise", "live"} == ALL
     assert "or advise: " in METHODS
+    assert "or live: " in METHODS
 
 
 def test_the_api_names_them_all():
@@ -76,16 +77,18 @@ def test_the_api_names_them_all():
 def test_the_page_offers_them_all():
     script = (ROOT / "service/web/views/new-job.js").read_text()
     block = script.split("const METHODS = [", 1)[1].split("];\n", 1)[0]
-    assert set(re.findall(r'\["([^"]+)", "', block)) == ALL
+    assert set(re.findall(r'\["([^"]+)", "', block)) == ALL - {"live"}
+    assert 'method: "live"' in script
 
 
-def test_cura_offers_them_all():
-    assert set(literal("integrations/cura/Stillpath.py", "_SETTINGS")["method"]["options"]) == ALL
+def test_cura_offers_all_that_write_a_file():
+    offered = literal("integrations/cura/Stillpath.py", "_SETTINGS")["method"]["options"]
+    assert set(offered) == ALL - {"live"}
 
 
 def test_octoprint_offers_all_that_change_a_file():
     offered = literal("integrations/octoprint/octoprint_stillpath/choices.py", "METHODS")
-    assert {name for name, _ in offered} == ALL - {"none"}
+    assert {name for name, _ in offered} == ALL - {"none", "live"}
 
 
 def test_every_place_has_the_same_defaults():

@@ -32,5 +32,5 @@ export function headline(report, channels) {
     rms.shaper === undefined ? null
       : h("div.figure", null, h("p.label", null, "Best-tuned shaper"), h("p.big", null, said("shaper"), h("small", null, " µm")), h("p.note", null, report.best_shaper)),
     h("div.figure", null, h("p.label", null, "Print time"), h("p.big", null, duration(report.time_s)),
-      h("p.note", null, rms.after === undefined || !Number.isFinite(change) ? "by the firmware's rules" : `${change >= 0 ? "+" : "−"}${Math.abs(change).toFixed(2)} % against the original`)));
+      h("p.note", null, rms.after === undefined || report.settings?.method === "live" || !Number.isFinite(change) ? "by the firmware's rules" : `${change >= 0 ? "+" : "−"}${Math.abs(change).toFixed(2)} % against the original`)));
 }

@@ -8,6 +8,7 @@ import { folded, longTable, table } from "../parts/table.js";
 import { headline } from "./headline.js";
 import { spectra, trackChart } from "./curves.js";
 import { trajectories } from "./trajectories.js";
+import { waysToPrint } from "./ways.js";
 
 /**
  * @param {any} job
@@ -21,6 +22,7 @@ export function reportSections(job, report, signal) {
   return [
     headline(report, channels),
     warnings(report),
+    waysToPrint(job, report),
     section("Error of the nozzle", report.notes.map((/** @type {string} */ note) => h("p", null, note)),
       report.confirmation ? h("p", null, `The machine's model: ${report.confirmation}.`) : null, errorTable(channels, labels),
       h("p.hint", null, "Contour: distance to the planned path. Tracking: distance to where the nozzle was planned to be at that moment.")),
@@ -38,7 +40,7 @@ export function reportSections(job, report, signal) {
 
 /** @param {string} title @param {...any} parts */
 function section(title, ...parts) {
-  return h("section", null, h("h2", null, title), parts);
+  return h("section", null, h("h2", null, title), parts.flat());
 }
 
 /** @param {any} report */
@@ -117,7 +119,7 @@ function advice(report) {
 
 /** @param {any} report @param {any[]} channels */
 function putBack(report, channels) {
-  if (report.advice || !channels.some((c) => c.name === "after")) return null;
+  if (report.advice || isLive(report) || !channels.some((c) => c.name === "after")) return null;
   const pieces = report.put_back;
   const byChoice = report.left_out_s ? h("p", null, `By choice (${report.settings.where}) ${duration(report.left_out_s)} of the print, ${duration(report.left_out_extruding_s)} of it extruding, stay as sliced.`) : null;
   const byRule = h("p", null, `By rule ${duration(report.left_alone_s || 0)} of the print (${(100 * (report.left_alone_s || 0) / (report.time_s || 1)).toFixed(2)} %), ${duration(report.left_alone_extruding_s || 0)} of it extruding, keep the file's own lines: after homing or an object's mark, say, or steep ones.`);
@@ -130,20 +132,26 @@ function putBack(report, channels) {
       `${p.line_first}–${p.line_last}`, duration(p.seconds), duration(p.extruding_seconds), p.reason], 20));
 }
 
+/** @param {any} report @returns {boolean} Whether no file was written, for it is to be printed live. */
+function isLive(report) {
+  return report.settings?.method === "live";
+}
+
 /** @param {any} report */
 function written(report) {
+  const compensates = !report.advice && !isLive(report);
   const facts = [
     ["Print time", `${duration(report.original_time_s)} → ${duration(report.time_s)}`],
     report.slicer_time_s ? ["By the slicer's estimate", `${duration(report.slicer_time_s)}${report.slicer ? ` (${report.slicer})` : ""}`] : null,
     ["Size", `${bytes(report.original_bytes)} → ${bytes(report.written_bytes)}`],
-    report.advice ? null : ["Compensated", `${duration(report.compensated_s)} of the print; ${duration(report.extruding_s)} extrude`],
+    !compensates ? null : ["Compensated", `${duration(report.compensated_s)} of the print; ${duration(report.extruding_s)} extrude`],
     report.segments ? ["Segments", `${grouped(report.segments)}, ${Math.round(report.segments_per_s)} per second, at most ${grouped(Math.round(report.peak_segments_per_s))}`] : null,
-    report.advice ? null : ["Command", `at most ${Math.round(report.peak_velocity_mm_s)} mm/s and ${grouped(Math.round(report.peak_accel_mm_s2))} mm/s²`],
-    report.advice ? null : ["Written motion against the command", `${um(report.emission_rms_um)} µm rms, ${um(report.emission_max_um)} µm max`],
+    !compensates ? null : ["Command", `at most ${Math.round(report.peak_velocity_mm_s)} mm/s and ${grouped(Math.round(report.peak_accel_mm_s2))} mm/s²`],
+    !compensates ? null : ["Written motion against the command", `${um(report.emission_rms_um)} µm rms, ${um(report.emission_max_um)} µm max`],
     ["Best shaper of this machine", report.best_shaper],
     ["Stillpath", report.version],
   ].filter((fact) => fact !== null);
-  return h("section", null, folded("The written file in figures", () => h("dl.facts", null, facts.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]).flat())));
+  return h("section", null, folded(isLive(report) ? "The file in figures" : "The written file in figures", () => h("dl.facts", null, facts.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]).flat())));
 }
 
 /** @param {string} name @param {string} label */

@@ -93,7 +93,8 @@ function subtitle(job) {
   return [
     h("a", { href: `#/machines/${encodeURIComponent(job.machine)}` }, job.machine),
     job.machine_revision ? h("span", null, " ", h("code", null, job.machine_revision)) : null,
-    ` · ${options.method ?? ""}${options.robust && options.robust !== "auto" ? `, ${options.robust}` : ""} · tolerance ${options.tolerance_um} µm`,
+    options.method === "live" ? " · to be printed live"
+      : ` · ${options.method ?? ""}${options.robust && options.robust !== "auto" ? `, ${options.robust}` : ""} · tolerance ${options.tolerance_um} µm`,
     ` · ${bytes(job.source_bytes)} · ${when(job.created_at)}`,
   ];
 }

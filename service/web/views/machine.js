@@ -6,6 +6,7 @@ import { number } from "../lib/format.js";
 import { fileLink } from "../lib/files.js";
 import { problemPanel } from "../lib/problem.js";
 import { folded } from "../parts/table.js";
+import { filterButton } from "../job/ways.js";
 import { measurementPanel } from "../machine/measurement.js";
 import { identifiedPlots, responsePlots } from "../machine/plots.js";
 import { revisionPanel } from "../machine/revisions.js";
@@ -29,6 +30,9 @@ export async function show({ main, signal, setTitle, params: [name] }) {
     h("section", null, h("h2", null, isOwn ? "New measurement" : "Measure yours"),
       measurementPanel({ machines, base: machine.name, own: isOwn, signal })),
     isOwn && machine.firmware.kind === "marlin" ? h("section", null, h("h2", null, "New settings"), settingsPanel({ machine: summary, signal })) : null,
+    h("section", null, h("h2", null, "Live printing"), summary.live_refusal
+      ? h("p", null, `It cannot print live: ${summary.live_refusal}.`)
+      : [h("p", null, "The extra inside Klipper compensates with this filter while the printer prints files as sliced."), filterButton(machine.name)]),
     h("section", null, folded("Travel and limits", () => facts(machine)),
       h("div.actions", null,
         fileLink({ text: "Document (JSON)", href: where, name: `${machine.name}.json` }))));

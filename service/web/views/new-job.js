@@ -38,13 +38,20 @@ export async function show({ main, signal, setTitle }) {
   const status = h("div", { "aria-live": "polite" });
   const ready = () => {
     send.disabled = !file || !machine;
+    const refusal = machines.find((/** @type {any} */ m) => m.name === machine)?.live_refusal ?? null;
+    way.refuse(refusal);
+    const live = way.isLive();
+    for (const part of written) part.hidden = live;
+    options.showFor(live);
+    fill(send, live ? "Predict" : method.value === "none" ? "Measure" : "Compensate");
   };
+  const way = wayToPrint(() => ready());
   const method = select("method", METHODS);
   const tolerance = h("input", { type: "number", id: "tolerance", name: "tolerance_um", min: "0.5", max: "50", step: "0.5", value: "2", required: true });
   const options = moreOptions();
-  method.addEventListener("change", () => {
-    fill(send, method.value === "none" ? "Measure" : "Compensate");
-  });
+  const written = [field("method", "Method", method),
+    field("tolerance", "Tolerance, µm", tolerance, "How far the written path may be from the computed one.")];
+  method.addEventListener("change", () => ready());
   const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {
     event.preventDefault();
     submit();
@@ -57,18 +64,22 @@ export async function show({ main, signal, setTitle }) {
         announce(`${chosen.name}, ${bytes(chosen.size)}, is chosen.`);
       },
     }),
-    h("div.fields.main-fields", null,
-      machinePicker(machines, machine, (name) => {
-        machine = name;
-        ready();
-      }),
-      field("method", "Method", method),
-      field("tolerance", "Tolerance, µm", tolerance, "How far the written path may be from the computed one.")),
+    h("div.fields", null, machinePicker(machines, machine, (name) => {
+      machine = name;
+      ready();
+    })),
+    way.element,
+    h("div.fields.main-fields", null, written),
     options.element,
     h("div.actions", null, send),
     status);
   fill(main, h("div.narrow", null, heading, form));
   ready();
+
+  /** @returns {string} Whether the report compares both ways: where both write or keep the motion. */
+  function compares() {
+    return way.isPossible() && !["none", "advise"].includes(method.value) ? "true" : "";
+  }
 
   async function submit() {
     if (!file || !machine) return;
@@ -84,7 +95,8 @@ export async function show({ main, signal, setTitle }) {
     fill(status, h("div.sending", null, bar, h("div.row", null, text,
       h("button", { type: "button", onclick: () => sending.abort() }, "Cancel"))));
     try {
-      const query = { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read() };
+      const query = way.isLive() ? { machine, method: "live", name, ...options.readFile() }
+        : { machine, method: method.value, tolerance_um: tolerance.value, name, ...options.read(), compare_live: compares() };
       const job = await upload("/v1/jobs", query, file, (share) => {
         bar.value = share;
         fill(text, share < 1 ? `Sending: ${Math.floor(100 * share)} % of ${bytes(file?.size)}` : "Received; being stored …");
@@ -116,23 +128,54 @@ function moreOptions() {
   const times = select("times", [["", [["new", "Follow the new motion"], ["kept", "Stay as they are"]]]]);
   const dialect = select("dialect", [["", DIALECTS]]);
   const fresh = h("input", { type: "checkbox", id: "fresh" });
+  const ofWritten = [
+    field("robust", "Design for", robust),
+    field("basis", "Basis functions", basis),
+    field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
+    field("budget", "Speed budget, µm", budget, "Contour error (rms) that every feature may have; the print becomes as fast as that allows."),
+    field("where", "Compensate", where, "The rest stays as sliced, and the file is smaller."),
+    field("max-mb", "Largest file, MB", most, "Compensates less, down to the outer walls, until the G-code fits."),
+    field("times", "The slicer's times", times)];
   const element = h("details.more", null, h("summary", null, "More options"),
-    h("div.fields", null,
-      field("robust", "Design for", robust),
-      field("basis", "Basis functions", basis),
-      field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
-      field("budget", "Speed budget, µm", budget, "Contour error (rms) that every feature may have; the print becomes as fast as that allows."),
-      field("where", "Compensate", where, "The rest stays as sliced, and the file is smaller."),
-      field("max-mb", "Largest file, MB", most, "Compensates less, down to the outer walls, until the G-code fits."),
+    h("div.fields", null, ofWritten,
       field("dialect", "File is written for", dialect),
-      field("times", "The slicer's times", times),
       field("plate", "Plate of a 3MF package", plate)),
     h("label.check", { for: "fresh" }, fresh, "Compute anew even if the same file was done before"));
+  const showFor = (/** @type {boolean} */ live) => ofWritten.forEach((part) => {
+    part.hidden = live;
+  });
+  const readFile = () => ({ plate: plate.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "" });
   const read = () => ({
     basis: basis.value, robust: robust.value, along: along.value, budget_um: budget.value, where: where.value, max_mb: most.value, plate: plate.value,
     times: times.value, dialect: dialect.value, fresh: fresh.checked ? "true" : "",
   });
-  return { element, read };
+  return { element, read, readFile, showFor };
+}
+
+/**
+ * The choice between a written file and live printing.
+ *
+ * @param {() => void} onChange
+ */
+function wayToPrint(onChange) {
+  /** @type {string | null} */
+  let refusal = null;
+  const radio = (/** @type {string} */ value, /** @type {boolean} */ checked) => h("input", { type: "radio", name: "way", id: `way-${value}`, value, checked, onchange: onChange });
+  const file = radio("file", true);
+  const live = radio("live", false);
+  const hint = h("p.hint", { id: "way-hint" });
+  live.setAttribute("aria-describedby", "way-hint");
+  const element = h("fieldset.way-choice", null, h("legend", null, "How you will print"),
+    h("label.check", { for: "way-file" }, file, "Print it as a file: you get a compensated file"),
+    h("label.check", { for: "way-live" }, live, "Print it live: the file stays as sliced, an extra inside Klipper compensates"), hint);
+  const refuse = (/** @type {string | null} */ reason) => {
+    refusal = reason;
+    live.disabled = reason !== null;
+    if (reason !== null) file.checked = true;
+    fill(hint, reason === null ? "" : `It cannot be printed live: ${reason}.`);
+    hint.hidden = reason === null;
+  };
+  return { element, refuse, isLive: () => live.checked, isPossible: () => refusal === null };
 }
 
 /**

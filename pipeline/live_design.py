@@ -7,9 +7,11 @@ than the shaper; the shaper itself is always among them, for a shaper is such a 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +23,26 @@ from stillpath.compensation.shapers import shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
-from stillpath.pipeline.caution import error_ranges, member_pairs, most_share, pair_weights
-from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.caution import (
+    error_ranges,
+    measured_set,
+    member_pairs,
+    most_share,
+    pair_weights,
+)
+from stillpath.pipeline.files import replacing
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
+from stillpath.pipeline.result import Channel
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.response import response
 
-__all__ = ["LiveDesign", "design_live", "filter_of", "live_filter"]
+__all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 
 Array = NDArray[np.float64]
 
 DT_S = 1e-3
+_VERSION = 1
+"""Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
 """Samples on either side; the longer one is for axes whose slowest mode rings below 25 Hz or so."""
@@ -75,6 +86,22 @@ class LiveDesign:
         """Return how many times the plan's acceleration the command's can be: sum |taps|."""
         return float(np.abs(self.taps[axis]).sum())
 
+    def ranged(self, channel: Channel, machine: Machine) -> Channel:
+        """Return what is measured of a file, with the range over the machine's set.
+
+        Parameters
+        ----------
+        channel : Channel
+            Named `before`, `after` (which is live) or `shaper`.
+        """
+        if not any(map(measured_set, machine.axes.values())):
+            return channel
+        name = "live" if channel.name == "after" else channel.name
+        usual_um, *ends_um = self.contour_um[name]
+        share = channel.extruding.contour_rms_um / max(usual_um, 1e-9)
+        low, high = (share * end_um for end_um in ends_um)
+        return channel.model_copy(update={"contour_range_um": (low, high)})
+
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:
     """Return the filter with the limits that the machine's document gives the command."""
@@ -94,26 +121,44 @@ def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:
     Raises
     ------
     DesignError
-        For a machine whose firmware is not Klipper.
+        For a machine that cannot print live (`Machine.live_refusal`).
     """
-    if machine.firmware.kind != "klipper":
-        raise DesignError(
-            f"machine {machine.name} runs {machine.firmware.kind}: only Klipper has print-time "
-            "compensation; use `stillpath compensate`"
-        )
+    if machine.live_refusal is not None:
+        raise DesignError(machine.live_refusal)
     return _Trial(machine, shaper).chosen()
 
 
-def filter_of(machine: Machine, cache_dir: Path | None = None) -> LiveFilter:
-    """Return what `stillpath klipper export` gives a machine, for a simulation.
+def cached_live_design(machine: Machine, directory: Path) -> LiveDesign:
+    """Return the filter of a machine, designed once per machine revision, which takes seconds.
+
+    It is a JSON file in `directory`, written whole or not at all. A file that cannot be read is
+    made again.
 
     Raises
     ------
     DesignError
         As `design_live` does.
     """
-    shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-    return live_filter(machine, design_live(machine, shaper).taps)
+    path = directory / f"live-{machine.revision}-v{_VERSION}.json"
+    if machine.live_refusal is None:
+        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+            return _read(path)
+    made = design_live(machine, cached_shaper(machine, directory, DT_S))
+    directory.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        text = json.dumps({**asdict(made), "taps": made.taps.tolist()})
+        temporary.write_text(text, encoding="utf-8")
+    return made
+
+
+def _read(path: Path) -> LiveDesign:
+    found = json.loads(path.read_text(encoding="utf-8"))
+    taps = np.array(found["taps"], dtype=float)
+    if taps.shape not in {(2, 2 * reach + 1) for reach in _REACHES} or not np.isfinite(taps).all():
+        raise ValueError(f"{path} holds no filter")
+    contour_um = {name: tuple(values) for name, values in found["contour_um"].items()}
+    given = {"taps": taps, "shares": tuple(found["shares"]), "contour_um": contour_um}
+    return LiveDesign(**{**found, **given, "shaper": BestShaper(**found["shaper"])})
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,180 @@
+"""What the extra inside Klipper makes of a file: by itself, or beside the compensated file."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from stillpath.compensation.base import DesignError
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.machine import Machine
+from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.files import default_cache_dir, replacing
+from stillpath.pipeline.live_design import LiveDesign, cached_live_design, live_filter
+from stillpath.pipeline.live_motion import LiveMotion
+from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.tracing import Trace
+from stillpath.pipeline.operating_point import Operation
+from stillpath.pipeline.options import Options
+from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.progress import Progress, ProgressCallback
+from stillpath.pipeline.reading import DialectName
+from stillpath.pipeline.result import PrintWay, Result, StageTime
+from stillpath.pipeline.simulate import STANDING_S, FileMotion, measured, simulate_file
+from stillpath.pipeline.ways import file_way, live_way
+
+__all__ = ["LivePrediction", "keep_file", "predict_live", "simulate_live"]
+
+_PACKED = (".bgcode", ".3mf")
+_STAGE = "live prediction"
+
+
+def simulate_live(
+    source: Path,
+    machine: Machine,
+    *,
+    plate: int | None = None,
+    dialect: DialectName | None = None,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+    layers: Path | None = None,
+    trace: Callable[[Trace], None] | None = None,
+) -> Result:
+    """Predict what a file does that is printed as sliced, with the extra inside Klipper.
+
+    Parameters and errors are those of `pipeline.simulate.simulate_file`.
+
+    Raises
+    ------
+    DesignError
+        The machine cannot print live, or the file sets the firmware's shaper.
+    """
+    clock = StageClock()
+    with clock.stage("design"):
+        design = cached_live_design(machine, cache_dir or default_cache_dir())
+    result = simulate_file(
+        source,
+        machine,
+        plate=plate,
+        dialect=dialect,
+        cache_dir=cache_dir,
+        progress=progress,
+        layers=layers,
+        trace=trace,
+        live=live_filter(machine, design.taps),
+    )
+    channels = [design.ranged(channel, machine) for channel in result.channels]
+    channels = [
+        c.model_copy(update={"label": "printed live"}) if c.name == "after" else c for c in channels
+    ]
+    (after,) = (channel for channel in channels if channel.name == "after")
+    way = live_way(after, machine, result.original_time_s, result.original_bytes)
+    stages = [StageTime(stage="design", cpu_s=round(clock.cpu_s["design"], 4)), *result.stages]
+    return result.model_copy(update={"channels": channels, "ways": [way], "stages": stages})
+
+
+def keep_file(source: Path, target: Path) -> None:
+    """Put a file as it is where a compensated one would be written.
+
+    Raises
+    ------
+    GcodeError
+        The target is called as if it were a file of another kind.
+    OSError
+    """
+    ends = source.suffix.lower(), target.suffix.lower()
+    if ends[0] != ends[1] and any(end in _PACKED for end in ends):
+        raise GcodeError(
+            f"method live leaves the file as it is: {target.name} must end like {source.name}"
+        )
+    with replacing(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+@dataclass(frozen=True, slots=True)
+class LivePrediction:
+    """What stands of live printing in the report of a compensated file.
+
+    Attributes
+    ----------
+    way : PrintWay or None
+        None: it cannot be printed live, and `refusal` says why.
+    cpu_s : float
+        What the prediction took.
+    """
+
+    way: PrintWay | None
+    refusal: str = ""
+    cpu_s: float = 0.0
+
+    def beside(self, result: Result) -> Result:
+        """Return the report of the compensated file with both ways to print."""
+        if self.way is None:
+            return result.model_copy(update={"not_live": self.refusal})
+        stage = StageTime(stage=_STAGE, cpu_s=round(self.cpu_s, 4))
+        ways, stages = [file_way(result), self.way], [*result.stages, stage]
+        return result.model_copy(update={"ways": ways, "stages": stages})
+
+
+def predict_live(
+    source: Path,
+    machine: Machine,
+    options: Options,
+    *,
+    cache_dir: Path | None = None,
+    progress: ProgressCallback | None = None,
+) -> LivePrediction:
+    """Predict for a file that is to be compensated what it does if it is printed live instead.
+
+    The figures are those of `simulate_live`.
+
+    Raises
+    ------
+    GcodeError
+        The file cannot be read as G-code of this machine, or moves nothing.
+    """
+    if machine.live_refusal is not None:
+        return LivePrediction(None, machine.live_refusal)
+    clock = StageClock()
+    with clock.stage(_STAGE):
+        try:
+            design = cached_live_design(machine, cache_dir or default_cache_dir())
+            way = _way(source, machine, options, design, _before(progress))
+        except DesignError as error:
+            return LivePrediction(None, str(error))
+    return LivePrediction(way, cpu_s=clock.cpu_s[_STAGE])
+
+
+def _way(
+    source: Path,
+    machine: Machine,
+    options: Options,
+    design: LiveDesign,
+    progress: ProgressCallback | None,
+) -> PrintWay:
+    size = source.stat().st_size
+    motion = FileMotion(
+        source, options.plate, machine, options.dialect, DT_S, progress, longest_stand_s=STANDING_S
+    )
+    measurement = Measurement(
+        machine, DT_S, design.shaper, compensated=True, names=("after",), size=size
+    )
+    live = LiveMotion(live_filter(machine, design.taps))
+    measured(motion, live, measurement, Operation(machine), StageClock())
+    measurement.finish()
+    (channel,) = measurement.channels()
+    return live_way(design.ranged(channel, machine), machine, motion.time_s, size)
+
+
+def _before(progress: ProgressCallback | None) -> ProgressCallback | None:
+    """Return a callback for work before that which fractions count: it shows that there is life."""
+    if progress is None:
+        return None
+    tell = progress
+
+    def say(now: Progress) -> None:
+        tell(replace(now, stage="predicting the live print", fraction=0.0, eta_s=None))
+
+    return say
