@@ -2,8 +2,8 @@
 
 As `fuzz.py` on each kind of firmware in turn, for some minutes or for a number of files. A failure
 is shown with the seed; with `--seed` it comes again. What fails: anything but a refusal, lines or
-states that differ, more CPU than 5 s for one file. Prints are at most 3 h long (`M203 X1` makes days
-of a few lines).
+states that differ, more CPU than 5 s for one file. Prints are at most 3 h long (`M203 X1` makes
+days of a few lines).
 
     python benchmarks/fuzz_today.py --seconds 110 [--seed 20261124] [--save DIR]
     python benchmarks/fuzz_today.py --files 20000 --firmware klipper

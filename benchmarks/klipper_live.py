@@ -2,8 +2,9 @@
 
 Needs `KLIPPY_PYTHON` (`tests/get-tools`); `STILLPATH_KLIPPER` may name a checkout of Klipper. Steps
 are rebuilt from what the host would send to the board, and compared with the filter applied to what
-the host plans without the extra. Contour errors are while extruding, on the machine's nominal plant:
-of the steps, and as `simulate --live` and `compensate` predict them. Exit status 1 where MISS.
+the host plans without the extra. Contour errors are while extruding, on the machine's nominal
+plant: of the steps, and as `simulate --live` and `compensate` predict them. Exit status 1 where
+MISS.
 """
 
 from __future__ import annotations

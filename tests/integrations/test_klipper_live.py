@@ -34,7 +34,6 @@ from tests.integrations.live import (
     predicted,
     print_begins,
     print_with,
-    shifted,
     stands,
     with_event,
 )
