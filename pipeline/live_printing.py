@@ -70,7 +70,7 @@ def simulate_live(
         c.model_copy(update={"label": "printed live"}) if c.name == "after" else c for c in channels
     ]
     (after,) = (channel for channel in channels if channel.name == "after")
-    way = live_way(after, machine, result.original_time_s, result.original_bytes)
+    way = live_way(after, result.original_time_s, result.original_bytes)
     stages = [StageTime(stage="design", cpu_s=round(clock.cpu_s["design"], 4)), *result.stages]
     return result.model_copy(update={"channels": channels, "ways": [way], "stages": stages})
 
@@ -165,7 +165,7 @@ def _way(
     measured(motion, live, measurement, Operation(machine), StageClock())
     measurement.finish()
     (channel,) = measurement.channels()
-    return live_way(design.ranged(channel, machine), machine, motion.time_s, size)
+    return live_way(design.ranged(channel, machine), motion.time_s, size)
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from stillpath.models.machine import Machine
 from stillpath.pipeline.result import Channel, PrintWay, Result
 
 __all__ = ["file_way", "live_way"]
@@ -38,7 +37,7 @@ def file_way(result: Result) -> PrintWay:
     )
 
 
-def live_way(channel: Channel, machine: Machine, time_s: float, size: int) -> PrintWay:
+def live_way(channel: Channel, time_s: float, size: int) -> PrintWay:
     """Return how the file as sliced prints with the extra inside Klipper.
 
     Parameters
@@ -57,7 +56,7 @@ def live_way(channel: Channel, machine: Machine, time_s: float, size: int) -> Pr
         file_bytes=size,
         needs=[
             "the extra of Stillpath in Klipper, installed once (docs/klipper-live.md)",
-            f"the filter beside printer.cfg (stillpath klipper export --machine {machine.name})",
+            "the filter of the machine beside printer.cfg (stillpath klipper export)",
             "Klipper's own input shaper switched off",
             "the file as sliced",
         ],
