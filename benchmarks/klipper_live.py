@@ -54,7 +54,7 @@ _MACHINES = ("ender3", "voron-v24-250", "voron-v0", "annex-k3")
 _MOST_STEPS, _MOST_BETWEEN, _RMS_STEPS = 1.1, 1.6, 0.31
 """Of .8 um, at the samples of the filter and between them. Rounding alone is half a step, .29 rms.
 """
-_AS_FILE, _MOST_LOAD = 1.6, 5.0
+_AS_FILE, _MOST_LOAD = 1.5, 5.0
 _EXTRUDES_S = 0.02
 _TOO_LARGE = {("voron-v0", "gear")}
 

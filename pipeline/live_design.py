@@ -41,15 +41,16 @@ __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 Array = NDArray[np.float64]
 
 DT_S = 1e-3
-_VERSION = 1
+_VERSION = 2
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
 """Samples on either side; the longer one is for axes whose slowest mode rings below 25 Hz or so."""
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _STRIDE, _NOTHING = 5, 1e-12
-_AS_GOOD = 1.05
-"""Of two filters as good as that the one with less bandwidth: it asks for less acceleration."""
+_AS_GOOD, _AS_SHARP = 1.05, 1.02
+"""The shortest filter that is as good as that, and of this length that with the least bandwidth
+that is as good as this: it asks for less acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,8 +194,11 @@ class _Trial:
         """Return the best that keeps the promise."""
         found = list(self._candidates())
         least = min(one.ratio for one in found)
-        good = [one for one in found if one.ratio <= _AS_GOOD * least]
-        best = min(good, key=lambda one: (one.taps.shape[1], one.corner_hz, one.ratio))
+        length = min(one.taps.shape[1] for one in found if one.ratio <= _AS_GOOD * least)
+        short = [one for one in found if one.taps.shape[1] == length]
+        least = min(one.ratio for one in short)
+        good = [one for one in short if one.ratio <= _AS_SHARP * least]
+        best = min(good, key=lambda one: (one.corner_hz, one.ratio))
         command = self._command(best.taps)
         ours = np.array([self._rms(y) for y in self._answers(command)])
         channels = {"before": self._path, "live": command, "shaper": self._smooth}

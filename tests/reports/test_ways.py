@@ -28,17 +28,17 @@ def text_of(result: Result) -> str:
 
 
 def test_both_ways_stand_side_by_side() -> None:
-    ways = [way("file", 0.92, (0.92, 11.0)), way("live", 1.67)]
+    ways = [way("file", 0.92, (0.92, 11.0)), way("live", 1.23)]
     result = make_result().model_copy(update={"ways": ways})
     said = text_of(result)
     assert "Two ways to print it Print it as a file" in said
     assert "0.92 µm; all plants 0.92 to 11.0 µm Largest 9.00 µm Print time 10 min 00 s" in said
-    assert "1.67 µm Largest" in said
+    assert "1.23 µm Largest" in said
     assert "0.65 MB You need a printer &lt;really&gt; What it does not do It does not fly" in said
 
 
 def test_a_live_report_tells_of_no_written_file() -> None:
-    live = {"ways": [way("live", 1.67)], "settings": {"method": "live"}}
+    live = {"ways": [way("live", 1.23)], "settings": {"method": "live"}}
     said = text_of(make_result().model_copy(update=live))
     assert "How to print it Print it live" in said
     assert "Print it as a file" not in said
