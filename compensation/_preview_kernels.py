@@ -52,7 +52,7 @@ def advance_window(
     z: NDArray[np.float64],
     committed: NDArray[np.float64],
 ) -> None:
-    """Bring z, the plants' states and the last two commands, behind a committed command, in place.
+    """Bring z, the plants' states and the last two commands, after a committed command, in place.
 
     `advance` takes the plants there without a command; `drive` is what z becomes by the command.
     """

@@ -21,7 +21,7 @@ def add_delayed(
 ) -> None:
     """Add a command, times each gain and shifted by so many samples, to `out`, all of shape (n,).
 
-    Before its first and behind its last sample the command stands; shifts below 0 are earlier.
+    Before its first and after its last sample the command stands; shifts below 0 are earlier.
     """
     n = len(command)
     # Block by block, so that what was written is still in the cache for the next pulse.

@@ -176,20 +176,20 @@ def solve_windows(
     tied : Tied
     """
     window, update = len(functions.basis), stepping.command.shape[1]
-    met = behind = 0
+    met = coming = 0
     waiting = first
     for w in range(first, last):
         start = w * update
         while met < len(stops) and stops[met, 1] <= start:
             met += 1
-        while behind < len(stops) and stops[behind, 0] < start + window:
-            behind += 1
-        if behind <= met and not careful[w]:
+        while coming < len(stops) and stops[coming, 0] < start + window:
+            coming += 1
+        if coming <= met and not careful[w]:
             continue
         _step(stepping, z, waiting, w, u)
         if not (memory.known[w] and _same(memory.z[w], z)):
             used, states, components = functions, z, len(targets)
-            if behind > met:
+            if coming > met:
                 used, components = rest_functions, len(rest_functions.filtered)
                 states = np.concatenate((np.dot(squeeze, z[:-2]), z[-2:]))
             tied = tied_window(
@@ -198,7 +198,7 @@ def solve_windows(
                 path[start : start + window],
                 targets[:components, start : start + window],
                 weight[start : start + window],
-                stops[met:behind] - start,
+                stops[met:coming] - start,
                 limits,
             )
             if not tied.kept:
@@ -357,11 +357,11 @@ def _tied_problem(
             sources[count : count + states] = _states(summed, reach, 0, s)
             count += states
         if m < rests and e > s:
-            behind = _states(summed, reach, s, e)
-            sources[count : count + states - 1] = behind[:-1]
+            ended = _states(summed, reach, s, e)
+            sources[count : count + states - 1] = ended[:-1]
             count += states - 1
-            position += behind[-2]
-            step = behind[-2] - behind[-1]
+            position += ended[-2]
+            step = ended[-2] - ended[-1]
             for i in range(n):
                 add_row(price * step[i], step, normal[i])
             if m == 0:
@@ -500,7 +500,7 @@ def extremes(
     -------
     accel, speed, low, high, mean_square : float
         Largest second and first difference, lowest and highest value, and the mean of the squared
-        second differences; with `stops` that behind the last sample is looked at too.
+        second differences; with `stops` that after the last sample is looked at too.
     """
     accel = speed = total = 0.0
     low = high = command[0]

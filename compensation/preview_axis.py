@@ -418,8 +418,8 @@ class PreviewAxis:
             slid = self._designs.lifted.mix @ (targets_mm - path)
             targets[:, : len(path)] += slid
             for component, gain in zip(slid, design.target_gain, strict=True):
-                behind = np.append(component, np.zeros(padding))
-                nodes += _products(behind, gain, update)
+                followed = np.append(component, np.zeros(padding))
+                nodes += _products(followed, gain, update)
         command = nodes @ design.spread.T
         state = nodes @ (design.state_drive @ design.spread).T
         weight = np.full(len(padded), WEIGHT_REST)

@@ -144,8 +144,8 @@ def run(buf: Any, stop: int, f: Any, i: Any, w: Any, rows: Any, tables: Any) -> 
             p = line_end(buf, p)
             i[I_END] = min(p + 1, stop)
             if byte_at(buf, start + 1) == 90 and byte_at(buf, start + 2) == 58:
-                z, behind = decimal(buf, start + 3)
-                if behind < 0 or behind != p or i[I_LAYER] < 0:
+                z, next_at = decimal(buf, start + 3)
+                if next_at < 0 or next_at != p or i[I_LAYER] < 0:
                     return HANDBACK
                 tables.layer_z[i[I_LAYER]] = z
                 put_event(i, rows, _HARMLESS)

@@ -90,7 +90,7 @@ def eight_digits(digits: Any) -> Any:
 def decimal(buf: Any, p: int) -> Any:
     """Read a number; return it and where it ends, or -1 where it is no plain one.
 
-    A plain number has up to 7 digits before and behind its point and none of it left out but
+    A plain number has up to 7 digits before and after its point and none of it left out but
     either part. It is read as a whole number over a power of ten, both exact, so that the quotient
     is the nearest double.
     """
@@ -99,7 +99,7 @@ def decimal(buf: Any, p: int) -> Any:
     if negative or c == 43:
         p += 1
     digits = word_at(buf, p) ^ _ZEROS
-    # The lowest byte that is no digit gets its high bit set; bytes behind it may lie.
+    # The lowest byte that is no digit gets its high bit set; bytes after it may lie.
     others = ((digits + _ABOVE_NINE) | digits) & _HIGH_BITS
     n = trailing_zeros(others) >> _THREE
     if n == _EIGHT:
@@ -110,10 +110,10 @@ def decimal(buf: Any, p: int) -> Any:
             return 0.0, -1
         whole = float(eight_digits(digits << (_64 - (n << _THREE))))
         return (-whole if negative else whole), p + np.int64(n)
-    behind = others & (others - _ONE)
-    if behind != np.uint64(0):
+    later = others & (others - _ONE)
+    if later != np.uint64(0):
         # Point and end are in the same eight characters: take the point out.
-        end = trailing_zeros(behind) >> _THREE
+        end = trailing_zeros(later) >> _THREE
         count = end - _ONE
         if count == np.uint64(0):
             return 0.0, -1
@@ -139,7 +139,7 @@ def decimal(buf: Any, p: int) -> Any:
 
 @kernel(allocates=False)
 def may_be_mark(buf: Any, p: int) -> bool:
-    """Tell whether a comment (p: behind its semicolon) may be one that `recall` knows."""
+    """Tell whether a comment (p: after its semicolon) may be one that `recall` knows."""
     c = byte_at(buf, p)
     while c == 32 or c == 59:
         p += 1
@@ -149,7 +149,7 @@ def may_be_mark(buf: Any, p: int) -> bool:
 
 @kernel(allocates=False)
 def line_end(buf: Any, p: int) -> int:
-    """Find the newline at or behind p."""
+    """Find the newline at or after p."""
     while True:
         other = word_at(buf, p) ^ _NEWLINES
         found = (other - _LOW_BITS) & ~other & _HIGH_BITS

@@ -33,7 +33,7 @@ def sweep(
 ) -> None:
     """Fill `position` and `row` (n) at t0 + (first + k) dt.
 
-    `position` has the first two rows or more of x y z e. Between phases and behind the last one
+    `position` has the first two rows or more of x y z e. Between phases and after the last one
     the tool stands where the phase before ended. `inside` (n), or nothing, tells which samples are
     not later than `until` of their phase.
     """
@@ -45,11 +45,11 @@ def sweep(
         # Samples k..stop - 1 belong to this move.
         stop = count
         if m + 1 < moves:
-            behind = t_s[m + 1]
-            stop = _place(behind, t0_s, dt_s, first, k, count)
-            while stop > k and t0_s + (first + stop - 1) * dt_s >= behind:
+            next_s = t_s[m + 1]
+            stop = _place(next_s, t0_s, dt_s, first, k, count)
+            while stop > k and t0_s + (first + stop - 1) * dt_s >= next_s:
                 stop -= 1
-            while stop < count and t0_s + (first + stop) * dt_s < behind:
+            while stop < count and t0_s + (first + stop) * dt_s < next_s:
                 stop += 1
         if stop == k:
             continue
@@ -107,9 +107,9 @@ def _passed(
     low: int,
     high: int,
 ) -> int:
-    """Return the first sample, low to high, behind a part of a move.
+    """Return the first sample, low to high, after a part of a move.
 
-    The part comes `before` seconds behind the move's begin, and `lasts` so long.
+    The part comes `before` seconds after the move's begin, and `lasts` so long.
     """
     at = _place(begin + before + lasts, t0_s, dt_s, first, low, high)
     while at > low and t0_s + (first + at - 1) * dt_s - begin - before > lasts:
@@ -184,19 +184,19 @@ def distances(
     begin, accel, cruise, decel = t_s[0], accel_s[0], cruise_s[0], decel_s[0]
     v0, v1, rate, eased = start_mm_s[0], cruise_mm_s[0], accel_mm_s2[0], s_curve[0]
     x, y, dx, dy = start_mm[0, 0], start_mm[0, 1], direction[0, 0], direction[0, 1]
-    behind = t_s[1] if moves > 1 else np.inf
+    next_s = t_s[1] if moves > 1 else np.inf
     t = -np.inf
     for g in range(len(first)):
         late, until = late_s[g], until_s[g]
         for k in range(first[g], first[g + 1] if g + 1 < len(first) else count):
             t = max(t, min(k * dt_s + late, until))
-            if t >= behind:
+            if t >= next_s:
                 while m + 1 < moves and t >= t_s[m + 1]:
                     m += 1
                 begin, accel, cruise, decel = t_s[m], accel_s[m], cruise_s[m], decel_s[m]
                 v0, v1, rate, eased = start_mm_s[m], cruise_mm_s[m], accel_mm_s2[m], s_curve[m]
                 x, y, dx, dy = start_mm[m, 0], start_mm[m, 1], direction[m, 0], direction[m, 1]
-                behind = t_s[m + 1] if m + 1 < moves else np.inf
+                next_s = t_s[m + 1] if m + 1 < moves else np.inf
             path = _way(t - begin, accel, cruise, decel, v0, v1, rate, eased)
             gap_x, gap_y = x + dx * path - points[0, k], y + dy * path - points[1, k]
             out[k] = np.sqrt(gap_x * gap_x + gap_y * gap_y)

@@ -175,7 +175,7 @@ _HASH_PRIME, _ONE, _29 = np.uint64(0x9E3779B97F4A7C15), np.uint64(1), np.uint64(
 
 @kernel(allocates=False)
 def line_hash(text: Any, start: int, stop: int) -> int:
-    """Hash the bytes to a positive int64; behind them there must be room of 8 bytes.
+    """Hash the bytes to a positive int64; after them there must be room of 8 bytes.
 
     As FNV-1a does, but eight bytes at a time: no two texts of up to eight have the same hash but
     for the bit of the sign.

@@ -67,8 +67,8 @@ def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterat
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
     moves = piece.moves
     done = 0
-    for first, behind in edges.reshape(-1, 2).tolist():
-        start, end = rows[first][0], rows[behind - 1][1]
+    for first, stop in edges.reshape(-1, 2).tolist():
+        start, end = rows[first][0], rows[stop - 1][1]
         if start > done:
             yield _left_out(piece, done, start)
         yield Piece.planned(_part(piece, start, end), _plan(piece, start, end, machine))

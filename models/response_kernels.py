@@ -69,7 +69,7 @@ def block_states(step: Array, drive: Array, state: Array, out: Array) -> None:
     step : ndarray, shape (m, 2)
         Eigenvalues, re and im, to the power of a block's samples.
     drive : ndarray, shape (blocks, 2 m)
-        What each block's commands add to the states behind it.
+        What each block's commands add to the states after it.
     state : ndarray, shape (m, 2)
         Carried on.
     out : ndarray, shape (blocks, 2 m)

@@ -122,9 +122,9 @@ class BandContent:
         return found
 
 
-def _span(before: NDArray[T], behind: NDArray[T], start: int, stop: int) -> NDArray[T]:
+def _span(before: NDArray[T], newer: NDArray[T], start: int, stop: int) -> NDArray[T]:
     """Return the samples start..stop - 1 of two arrays, the second being after the first."""
     held = before.shape[-1]
     if start >= held:
-        return behind[..., start - held : stop - held]
-    return np.concatenate([before[..., start:stop], behind[..., : max(stop - held, 0)]], axis=-1)
+        return newer[..., start - held : stop - held]
+    return np.concatenate([before[..., start:stop], newer[..., : max(stop - held, 0)]], axis=-1)

@@ -364,9 +364,9 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     last = command.shape[1] - 1
     for first, end in edges.reshape(-1, 2):
         # From the plan's own ends: the samples around a wipe may lie in a retraction at rest.
-        row, behind = timeline.row[first], timeline.row[end - 1] + 1
+        row, stop = timeline.row[first], timeline.row[end - 1] + 1
         begins = phases.start_mm[row, 3]
-        ends = phases.start_mm[behind, 3] if behind < len(phases) else command[3, last]
+        ends = phases.start_mm[stop, 3] if stop < len(phases) else command[3, last]
         span = slice(max(first - 1, 0), min(end, last) + 1)
         step = np.sqrt(np.sum(np.diff(command[:2, span]) ** 2, axis=0))
         way = np.concatenate([[0.0], np.cumsum(step)])

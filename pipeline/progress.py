@@ -39,7 +39,7 @@ class Progress:
 
 
 class Cancelled(Exception):
-    """Raised by a progress callback: stop the job and leave nothing behind."""
+    """Raised by a progress callback: stop the job and leave nothing after."""
 
 
 ProgressCallback = Callable[[Progress], None]

@@ -218,15 +218,15 @@ def motion_sums(
         rest[0], rest[1] = x[0], y[0]
     k = 0
     while k < n:
-        behind = k
-        while behind < n and _moved(x, y, behind, rest, still_mm):
-            behind += 1
+        next_k = k
+        while next_k < n and _moved(x, y, next_k, rest, still_mm):
+            next_k += 1
         # Where the path moves on, samples have no part in rests.
-        last = behind - 1 if shortest > 0 else k
+        last = next_k - 1 if shortest > 0 else k
         if k < last:
             _add_squares(x[k:last], y[k:last], points[:, :, k:last], extruding[k:last], sums)
             k = last
-        moved = behind > k
+        moved = next_k > k
         _add_sample(x, y, points, extruding, k, moved, shortest, window, rest, sums)
         k += 1
     if n > 0:

@@ -338,7 +338,7 @@ class _Axis:
     def _moved(self) -> str:
         """Say where the log has the mode that rings most, if no plant of the set has it there.
 
-        What is left behind compensated stops may be small also where the frequency is not right.
+        What rings after compensated stops may be small also where the frequency is not right.
         """
         log = self._logs[0]
         rows = np.flatnonzero(log.inside)

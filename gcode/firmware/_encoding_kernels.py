@@ -37,7 +37,7 @@ def lay_out(
     groups : ndarray of int64, shape (groups, 3)
         First row, one past the last row, and 1 for a rest.
     asked : ndarray of int64, shape (rows + 1, 4)
-        Where the file wants to be before the first row and behind every row, in units.
+        Where the file wants to be before the first row and after every row, in units.
     grid : ndarray of int64, shape (3,)
         Grid of X, Y and Z in units; the last end of every group is what the file wants.
     row, position, move_end_s, planned_s, group : ndarray

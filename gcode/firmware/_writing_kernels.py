@@ -53,14 +53,14 @@ def _put_number(buffer: NDArray[np.uint8], at: int, millionths: int) -> int:
         buffer[at] = 46
         thousandths = fraction // 1000
         fraction -= 1000 * thousandths
-        behind = _put_three(buffer, at + 1, _TRAILING, thousandths)
-        at = _put_three(buffer, at + 4, _TRAILING, fraction) if fraction else behind
+        shorter = _put_three(buffer, at + 1, _TRAILING, thousandths)
+        at = _put_three(buffer, at + 4, _TRAILING, fraction) if fraction else shorter
     return at
 
 
 @kernel(force_inline=True, allocates=False)
 def _put_three(buffer: NDArray[np.uint8], at: int, table: NDArray[np.uint8], number: int) -> int:
-    """Write the three bytes of a number below 1000; returns the byte behind those that count."""
+    """Write the three bytes of a number below 1000; returns the byte after those that count."""
     for k in range(3):
         buffer[at + k] = table[number, k]
     return at + int(table[number, 3])
@@ -85,7 +85,7 @@ def format_moves(
     `position` (n, 4) and `begin` (4,) are in 1e-6 mm; `origin` (n, 3) is where the G-code's zero
     lies. `fresh[i]` says that the modal feedrate is not ours before move i. Extruder values are
     relative and rounded to 1e-5 mm so that the sum never drifts. `line_end[i]` is where the text
-    of move i ends, `extruded[i]` the extruder's position [mm] behind it as written.
+    of move i ends, `extruded[i]` the extruder's position [mm] after it as written.
     """
     at = 0
     previous = begin

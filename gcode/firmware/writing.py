@@ -92,7 +92,7 @@ class StreamWriter:
         """The file's E where the printer's reads 0."""
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
-        """What the file had set behind the last piece."""
+        """What the file had set after the last piece."""
         self._shaper_unknown = False
 
     def shaper_warnings(self) -> Iterator[str]:
@@ -141,7 +141,7 @@ class StreamWriter:
         ----------
         verbatim : VerbatimPart
         extruder_mm : float
-            What the printer takes for E behind all that was written before.
+            What the printer takes for E after all that was written before.
 
         Raises
         ------
@@ -216,8 +216,8 @@ class StreamWriter:
         rest = encoded.row >= 0
         rows, places = encoded.row[rest], np.flatnonzero(rest)
         first[rows] = places
-        # An event never moves past a rest, not even one that takes no time or lies behind a stretch
-        # of which nothing was written, or back behind one.
+        # An event never moves past a rest, not even one that takes no time or lies after a stretch
+        # of which nothing was written, or back after one.
         first[rows + 1] = np.maximum(first[rows + 1], places + 1)
         first = np.maximum.accumulate(first)
         until = np.full(len(first), len(encoded.row))
@@ -346,7 +346,7 @@ class StreamWriter:
         self._far_mm = extruder_mm if far else None
 
     def _set_again(self, line: bytes, ahead_mm: float) -> bytes:
-        """Line behind a G92 E: the extruder is `ahead_mm` further than the plan, and says so.
+        """Line after a G92 E: the extruder is `ahead_mm` further than the plan, and says so.
 
         The file counts from there whenever its E is absolute, which may be much later.
         """
@@ -425,8 +425,8 @@ class StreamWriter:
         limits = verbatim.limits_before
         if self._shaper_off and self._shaper_is_known:
             self._marked, limits = limits, self._stream_commands.in_stream(limits)
-        behind = b", line %d of the original" % verbatim.first_line
-        text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, behind)
+        line_note = b", line %d of the original" % verbatim.first_line
+        text = stop + self._stream_off(limits, verbatim.modal_before, extruder_mm, line_note)
         return text + shaper
 
     def _unmarked(self) -> bytes:
@@ -457,19 +457,19 @@ class StreamWriter:
         return text + self._unmarked() + shaper
 
     def _stream_off(
-        self, limits: Limits, state: ModalState, extruder_mm: float, behind: bytes
+        self, limits: Limits, state: ModalState, extruder_mm: float, line_note: bytes
     ) -> bytes:
         self._streaming = False
         text = self._stream_commands.limits(limits) + self._file_modes(state)
         text += self._file_extruder(extruder_mm + self._zero_mm)
         self._modal = None
-        mark = b"; stillpath: stream off" + behind + b"\n"
+        mark = b"; stillpath: stream off" + line_note + b"\n"
         return text + _feed_line(self._file_feed_mm_min) + mark
 
     def _shaper_before(self, verbatim: VerbatimPart) -> bytes:
         """Set the firmware's shaper again before lines that print on their own.
 
-        Firmwares stand still for it. Travel between two streams, as behind an object mark, is not
+        Firmwares stand still for it. Travel between two streams, as after an object mark, is not
         worth that: the next stream takes care of its vibration.
         """
         travel = verbatim.moves.end_mm - verbatim.moves.start_mm

@@ -310,8 +310,8 @@ class _Reader:
         flat = radius * angle
         along = [flat, flat, travel[2], 0.0]
         enter = [-turn * math.sin(first), turn * math.cos(first), 0.0]
-        behind = first + turn * angle
-        leave = [-turn * math.sin(behind), turn * math.cos(behind), 0.0]
+        at_end = first + turn * angle
+        leave = [-turn * math.sin(at_end), turn * math.cos(at_end), 0.0]
         yield self._row(along, enter, leave, path, radius, "P" if travel[3] else "T")
 
     def _to(self, point: list[float]) -> Iterator[list[float]]:

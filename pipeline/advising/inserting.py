@@ -209,7 +209,7 @@ class AdviceWriter:
         return b"".join(self._line(line, "the printer's own shaper") for line in lines)
 
     def _sets_all(self, lines: Sequence[bytes]) -> bool:
-        """Tell whether nothing of ours is left behind lines: no axis keeps its type."""
+        """Tell whether nothing of ours is left after these lines: no axis keeps its type."""
         left = Shaping(_OURS, _OURS)
         with contextlib.suppress(ValueError):
             for line in lines:
@@ -283,8 +283,8 @@ def _insert(file: BinaryIO, at: int, text: bytes) -> None:
     for stop in range(file.seek(0, io.SEEK_END), at, -_BLOCK_BYTES):
         start = max(stop - _BLOCK_BYTES, at)
         file.seek(start)
-        behind = file.read(stop - start)
+        tail = file.read(stop - start)
         file.seek(start + len(text))
-        file.write(behind)
+        file.write(tail)
     file.seek(at)
     file.write(text)

@@ -25,7 +25,7 @@ __all__ = [
 
 X, Y, Z, E, FED, F, UNIT, RELATIVE, RELATIVE_E, WAITS, SIZE = range(11)
 """Place of a state [mm]: x y z, what E reads, filament fed since the beginning; F [mm/min];
-mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 behind a move of X and Y
+mm of the file's unit; 1 where coordinates, or those of E, are relative; 1 after a move of X and Y
 so short that the firmware may carry it out with the next one."""
 WORD_COUNT = 7
 """X Y Z E F, and I J of arcs."""
@@ -183,7 +183,7 @@ def may_be_no_arc(state: Any, words: Any, mask: int) -> bool:
 
 @kernel(force_inline=True, allocates=False)
 def settle(state: Any, way_mm: float, shortest_mm: float, z_mm: float, fed_mm: float) -> None:
-    """Note behind a move whether it waits, from where Z and filament were before it.
+    """Note after a move whether it waits, from where Z and filament were before it.
 
     What waits is carried out with the next move that is long enough, of whatever axis.
     """
@@ -203,7 +203,7 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
     one, other : float array
         Of the original and of the written file. Filament counts anew where one does not know it.
     mask : int
-        Words of the move behind which they stand; 0: no move, and F does not count. With `WITHIN`
+        Words of the move after which they stand; 0: no move, and F does not count. With `WITHIN`
         a stream, where what E reads is set right before lines that depend on it only.
     place_mm : float array, shape (3,)
     filament_mm : float
@@ -228,13 +228,13 @@ def compare(one: Any, other: Any, mask: int, place_mm: Any, filament_mm: float) 
 
 
 @kernel(allocates=False)
-def compare_before(before: Any, behind: Any, state: Any, place_mm: Any, filament_mm: float) -> int:
+def compare_before(before: Any, after: Any, state: Any, place_mm: Any, filament_mm: float) -> int:
     """Compare the states before a line of a stream, of which the original knows both.
 
-    Where filament counts anew before it, it does so behind it too.
+    Where filament counts anew before it, it does so after it too.
     """
     if isnan(before[FED]) or isnan(state[FED]):
-        behind[FED] = nan
+        after[FED] = nan
     return compare(before, state, WITHIN, place_mm, filament_mm)
 
 
@@ -248,7 +248,7 @@ def ours(
     wanted: Any,
     rests: bool,
     before: Any,
-    behind: Any,
+    after: Any,
     place_mm: Any,
     filament_mm: float,
 ) -> tuple[int, int, bool, int]:
@@ -258,13 +258,13 @@ def ours(
     ----------
     text : uint8 array
     at, stop : int
-        Where to begin, and behind the last newline.
+        Where to begin, and after the last newline.
     state, words : float array
     wanted : uint8 array
         A line of the original, without its end; may be empty. It is carried out if it is plain.
     rests : bool
-        The states before it and behind it are compared with those of the original.
-    before, behind : float array
+        The states before it and after it are compared with those of the original.
+    before, after : float array
         States of the original.
     place_mm, filament_mm
         As of `compare`.
@@ -292,7 +292,7 @@ def ours(
         if next_at < 0:
             break
         if is_wanted and rests:
-            found = compare_before(before, behind, state, place_mm, filament_mm)
+            found = compare_before(before, after, state, place_mm, filament_mm)
             if found != SAME:
                 return at, lines, True, found
         move(state, words, mask)
@@ -301,7 +301,7 @@ def ours(
         if is_wanted:
             found = SAME
             if rests:
-                found = compare(behind, state, mask | WITHIN, place_mm, filament_mm)
+                found = compare(after, state, mask | WITHIN, place_mm, filament_mm)
             return at, lines, True, found
     return at, lines, False, SAME
 
@@ -351,8 +351,8 @@ def carry_out_moves(
             at += 1
             lines += 1
             continue
-        behind, mask = _words(text, at, words, arcs)
-        if behind < 0:
+        next_at, mask = _words(text, at, words, arcs)
+        if next_at < 0:
             break
         lines += 1
         if mask > 31:
@@ -364,14 +364,14 @@ def carry_out_moves(
                 state[E] = state[FED] = nan
             perhaps[found] = at
             found += 1
-            at = behind
+            at = next_at
             continue
         way_mm = way_xy_mm(state, words, mask)
         if way_mm == 0.0 and (state[WAITS] == 0.0 or not mask & WORDS):
             for k in range(SIZE):
                 before[k] = state[k]
             move(state, words, mask)
-            return behind, lines, mask, found
+            return next_at, lines, mask, found
         if way_mm > shortest_mm:
             state[WAITS] = 0.0
             move(state, words, mask)
@@ -381,7 +381,7 @@ def carry_out_moves(
             settle(state, way_mm, shortest_mm, z_mm, fed_mm)
             perhaps[found] = at
             found += 1
-        at = behind
+        at = next_at
     return at, lines, -1, found
 
 
@@ -399,7 +399,7 @@ def compare_moves(
     place_mm: Any,
     filament_mm: float,
 ) -> tuple[int, int, int, int, int, int, int, int]:
-    """Carry out plain moves that both texts share, and compare the states behind each.
+    """Carry out plain moves that both texts share, and compare the states after each.
 
     Parameters
     ----------
@@ -417,7 +417,7 @@ def compare_moves(
     (int, int, int, int, int, int, int, int)
         Where both texts go on, how many lines of each were passed, how many moves were carried
         out, how many of these without X and Y known, how many lines stand before the first with
-        them, and what differs behind the last.
+        them, and what differs after the last.
     """
     lines, written_lines, moves, unknown, before_known = 0, 0, 0, 0, -1
     while True:
@@ -427,9 +427,9 @@ def compare_moves(
         written_lines += written_passed
         if at >= stop or written_at >= written_stop:
             break
-        behind, mask = _words(before, at, words, False)
-        length = behind - at
-        if behind < 0 or written_at + length > written_stop:
+        next_at, mask = _words(before, at, words, False)
+        length = next_at - at
+        if next_at < 0 or written_at + length > written_stop:
             break
         k = 0
         while k < length and before[at + k] == after[written_at + k]:
@@ -438,7 +438,7 @@ def compare_moves(
             break
         move(one, words, mask)
         move(other, words, mask)
-        at = behind
+        at = next_at
         written_at += length
         lines += 1
         written_lines += 1

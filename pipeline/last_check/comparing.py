@@ -227,10 +227,10 @@ class LastCheck:
         self._note(moves, unknown, before, before + known)
         if written.is_read or (lines and original.is_read):
             return
-        line, behind = written.peek()
+        line, next_at = written.peek()
         code = code_of(line)
         if not code:
-            written.skip(behind)
+            written.skip(next_at)
             if line.startswith(_ON):
                 self._streaming, self._wanted = True, None
                 self._stream_line = original.line
@@ -248,7 +248,7 @@ class LastCheck:
             self._after.carry_out(code)
         else:
             raise self._strange(code, expected)
-        written.skip(behind)
+        written.skip(next_at)
 
     def _stream(self) -> None:
         """Follow a stream: moves of ours, and another line."""

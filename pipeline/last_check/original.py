@@ -64,9 +64,9 @@ class Text:
             line = line[len(_BOM) :]
         return line, end + 1
 
-    def skip(self, behind: int, lines: int = 1) -> None:
+    def skip(self, next_at: int, lines: int = 1) -> None:
         """Go on with a line further down."""
-        self.at = behind
+        self.at = next_at
         self.line += lines
 
 
@@ -166,10 +166,10 @@ class Original:
         """Return the next line that holds a command; nothing at the end."""
         text = self.text
         while not text.is_read or self.read_on():
-            line, behind = text.peek()
+            line, next_at = text.peek()
             if code := code_of(line):
                 return code
-            text.skip(behind)
+            text.skip(next_at)
         return b""
 
     def skip(self) -> None:
@@ -245,7 +245,7 @@ class Original:
         while text.line < before_line:
             if text.is_read and not self.read_on():
                 break
-            behind, lines, mask, found = at.carry_out_moves(
+            next_at, lines, mask, found = at.carry_out_moves(
                 text.array,
                 text.at,
                 text.stop,
@@ -258,18 +258,18 @@ class Original:
                 self._still,
                 self._places,
             )
-            text.skip(behind, lines)
+            text.skip(next_at, lines)
             if found:
                 data = text.data
                 for begin in self._places[:found].tolist():
                     perhaps.append(data[begin : data.index(b"\n", begin)].rstrip())
             if mask >= 0:
-                begin = text.data.rfind(b"\n", 0, behind - 1) + 1
-                return text.data[begin : behind - 1].rstrip(), mask
+                begin = text.data.rfind(b"\n", 0, next_at - 1) + 1
+                return text.data[begin : next_at - 1].rstrip(), mask
             if text.is_read or text.line >= before_line or found == _AT_A_TIME:
                 continue
-            line, behind = text.peek()
+            line, next_at = text.peek()
             if code := code_of(line):
                 return code, -1
-            text.skip(behind)
+            text.skip(next_at)
         return b"", -1

@@ -34,7 +34,7 @@ PEN_X, PEN_Y, PREVIOUS_X, PREVIOUS_Y, SPARE, BEND, HEIGHT = range(7)
 far leaves room for, how far the path has turned since the last point, the height extruded at."""
 COUNT, MOVE, SAMPLES, LAYER, LINE = range(5)
 """Where it keeps numbers: points of the tile, the move under way, samples since the last point,
-the tile's layer (behind a return: the one that comes), the line whose bytes were counted last."""
+the tile's layer (after a return: the one that comes), the line whose bytes were counted last."""
 
 UNKNOWN = 65535
 _MOST = 65534
@@ -87,7 +87,7 @@ def follow(
     begin : int
         First sample to look at.
     first, until : int
-        Number in the file of the first of the moves; moves before `until` end behind the samples.
+        Number in the file of the first of the moves; moves before `until` end after the samples.
     start, end, line, byte_start, byte_end, layer, feature
         Columns of the moves.
     point_bytes : float

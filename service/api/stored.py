@@ -70,8 +70,8 @@ async def stored(
     except FileNotFoundError:
         name = key.rsplit("/", 1)[-1]
         raise Problem(404, "The file is gone", f"{name} is no longer in the storage.") from None
-    first, behind = span or (0, found.size_bytes)
-    if not 0 <= first <= behind <= found.size_bytes:
+    first, past = span or (0, found.size_bytes)
+    if not 0 <= first <= past <= found.size_bytes:
         raise Problem(404, "The file is gone", "The file is shorter than its index says.")
     tag = f'"{etag or f"{found.size_bytes:x}-{int(found.modified_at * 1e6):x}"}"'
     headers = {"ETag": tag, "Accept-Ranges": "bytes"}
@@ -79,18 +79,18 @@ async def stored(
         headers["Content-Disposition"] = _disposition(filename)
     if matches(request.headers.get("if-none-match"), tag):
         return Response(status_code=304, headers=headers)
-    size = behind - first
+    size = past - first
     part = _range(request, tag, size)
     status = 200
     if part is not None:
         status = 206
         start, stop = part
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
-        first, behind = first + start, first + stop
-    headers["Content-Length"] = str(behind - first)
-    if request.method == "HEAD" or first == behind:
+        first, past = first + start, first + stop
+    headers["Content-Length"] = str(past - first)
+    if request.method == "HEAD" or first == past:
         return Response(status_code=status, headers=headers, media_type=media_type)
-    chunks = _closing(storage.read(key, first, behind))
+    chunks = _closing(storage.read(key, first, past))
     return StreamingResponse(chunks, status_code=status, headers=headers, media_type=media_type)
 
 

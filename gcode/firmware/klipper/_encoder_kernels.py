@@ -141,13 +141,13 @@ def assign_speeds(
             owed += least - available
             late += least - available
             available = least
-        behind = i > 0 and ours[i - 1]
+        chained = i > 0 and ours[i - 1]
         twice_accel = 2.0 * accel_mm_s2[i]
         # What the segment before was given for braking is no time of this one, and this one
         # brakes itself.
-        known = braking_s[i] - (braking_s[i - 1] if behind else 0.0)
+        known = braking_s[i] - (braking_s[i - 1] if chained else 0.0)
         brakes = 1.0 / (2.0 * before_accel * before) if before > 0.0 else 0.0
-        most_braking = MOST_LOST * planned_s[i - 1] if behind else np.inf
+        most_braking = MOST_LOST * planned_s[i - 1] if chained else np.inf
         v = length_mm[i] / available
         for _ in range(_ROUNDS):
             corner = min(v, before, junction_mm_s[i])
@@ -167,7 +167,7 @@ def assign_speeds(
         corner = min(v, before, junction_mm_s[i])
         loss = min((v - corner) ** 2 / (twice_accel * v), MOST_LOST * available)
         braking = min((before - corner) ** 2 * brakes, most_braking)
-        if behind:
+        if chained:
             predicted_s[i - 1] += braking - braking_s[i - 1]
             now += braking - braking_s[i - 1]
             braking_s[i - 1] = braking

@@ -57,7 +57,7 @@ def append(
     queue: Any,
     count: int,
 ) -> tuple[int, int, int]:
-    """Enter moves behind the `count` rows of the queue.
+    """Enter moves after the `count` rows of the queue.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def look_ahead(queue: Any, count: int, final: bool) -> int:
     next2 = 0.0
     next_smooth2 = 0.0
     peak2 = 0.0
-    coasting = 0  # moves behind the present one whose cruise speed comes from before them
+    coasting = 0  # moves after the present one whose cruise speed comes from before them
     settled = count if final else 0
     candidate = 0
     for m in range(count - 1, -1, -1):

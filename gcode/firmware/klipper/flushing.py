@@ -39,7 +39,7 @@ def pressure_advance(state: MachineState, command: Command) -> int:
 
 
 def shaper(state: MachineState, command: Command) -> int:
-    """SET_INPUT_SHAPER: stands still for the times ahead before and behind it."""
+    """SET_INPUT_SHAPER: stands still for the times ahead before and after it."""
     given = state.extended(command)
     before_s = _ahead_s(state)
     for axis in "XY":

@@ -95,7 +95,7 @@ def append(
     queue: Any,
     count: int,
 ) -> tuple[int, int, int]:
-    """Enter moves behind the `count` rows of the queue, one row for each move.
+    """Enter moves after the `count` rows of the queue, one row for each move.
 
     Returns
     -------

@@ -82,7 +82,7 @@ def thin(
 def bend_reversals(steps: Any, begin: Any, group: Any, wish: Any, least: int, corexy: bool) -> None:
     """Make no vertex an exact turn back: by junction deviation the releases would stop there.
 
-    They begin at 120 steps/s behind it, which takes 1/120 s for the first step. A step to the side
+    They begin at 120 steps/s after it, which takes 1/120 s for the first step. A step to the side
     at the next vertex, towards where it was meant to be, is angle enough; away from there, where
     the firmware would swallow a move of fewer than `least` steps otherwise.
 
@@ -246,10 +246,10 @@ def assign_rates(
             continue
         n, path = steps[i], path_mm[i]
         per_mm = n / path
-        # Where it cannot keep up it may run behind for a while, but must not fall to pieces.
+        # Where it cannot keep up it may run after for a while, but must not fall to pieces.
         wanted = end_s[i] + late - now - correction_s[i]
         if first:
-            # From rest the first step takes up to 1/120 s: the stretch begins behind it.
+            # From rest the first step takes up to 1/120 s: the stretch begins after it.
             wanted = planned_s[i]
         hurried = RUSH * path / planned_s[i] + RUSH_MM_S
         least = path / min(fastest_mm_s[i], hurried)

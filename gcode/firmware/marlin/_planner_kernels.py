@@ -1,6 +1,6 @@
 """Kernels of Marlin's planner: look-ahead of a finite queue, trapezoids, and their step timing.
 
-When a block starts, the firmware knows the `C_QUEUE` - 3 blocks behind it that its full queue
+When a block starts, the firmware knows the `C_QUEUE` - 3 blocks after it that its full queue
 holds; the last of them is planned to end at the lowest speed. With prefix sums of 2 a d that is the
 same as one backward pass over everything and a cap for each block.
 

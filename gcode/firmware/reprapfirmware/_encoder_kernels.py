@@ -144,7 +144,7 @@ def _speed(length: float, lasts_s: float, enter: float, accel: float) -> float:
     even = length / lasts_s
     if even <= enter:
         return even
-    # The ramp (v - enter)^2 / 2a and the cruise behind it make up the way in the time.
+    # The ramp (v - enter)^2 / 2a and the cruise after it make up the way in the time.
     half = enter + accel * lasts_s
     return half - float(np.sqrt(max(half * half - enter * enter - 2.0 * accel * length, 0.0)))
 
@@ -182,7 +182,7 @@ def keep_apart(
     least_s: float,
     keep: NDArray[np.bool_],
 ) -> None:
-    """Drop crowded ends that come sooner than `least_s` behind the one before.
+    """Drop crowded ends that come sooner than `least_s` after the one before.
 
     `begin_s[i]` is when the stretch of segment i begins; ends with `final` set stay.
     """

@@ -75,7 +75,7 @@ def append(
     queue: Any,
     count: int,
 ) -> tuple[int, int, int]:
-    """Enter moves behind the `count` rows of the queue; moves of no length are left out.
+    """Enter moves after the `count` rows of the queue; moves of no length are left out.
 
     Returns
     -------

@@ -60,7 +60,7 @@ class RepRapStreamCommands:
         return None
 
     def limits(self, limits: Limits) -> bytes:
-        """Lines that set the planner's limits for the moves behind them, M572 left out."""
+        """Lines that set the planner's limits for the moves after them, M572 left out."""
         own = cast(RepRapLimits, limits)
         lines = [
             _FENCE,
