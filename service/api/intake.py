@@ -28,9 +28,9 @@ from stillpath.service.deliveries.checking import Checker
 from stillpath.service.deliveries.printers import Printer, printer_for
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook
 from stillpath.service.jobs.state import Job
-from stillpath.service.jobs.store import (
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.submissions import (
     IdempotencyConflict,
-    JobStore,
     Quota,
     QuotaExceeded,
     SpaceExceeded,

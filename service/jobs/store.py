@@ -10,30 +10,27 @@ import base64
 import json
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import (
     Connection,
     CursorResult,
     Engine,
-    Row,
     Select,
-    Subquery,
-    and_,
     bindparam,
     case,
     delete,
     func,
     or_,
     select,
-    text,
     tuple_,
     update,
 )
 
 from stillpath.service.database import tables
 from stillpath.service.database.engine import insert, reading, write_together, writing
+from stillpath.service.jobs.queue_order import queue_order
 from stillpath.service.jobs.state import (
     WAITING_FOR_ROOM,
     Claimed,
@@ -44,121 +41,26 @@ from stillpath.service.jobs.state import (
     Stale,
     advance,
 )
+from stillpath.service.jobs.stored_rows import from_row, stored_job, to_row
+from stillpath.service.jobs.submissions import Quota, same_job, submission, submit, usage
 
-__all__ = [
-    "BadCursor",
-    "IdempotencyConflict",
-    "JobStore",
-    "Page",
-    "Quota",
-    "QuotaExceeded",
-    "SpaceExceeded",
-]
+__all__ = ["BadCursor", "JobStore", "Page"]
 
 _JOBS = tables.jobs.c
-_FIELDS = tuple(field.name for field in fields(Job))
-_NOT_OVER = tuple(state.value for state in JobState if not state.is_final)
 _OVER = tuple(state.value for state in JobState if state.is_final)
-_SHORT = tuple(kind.value for kind in JobKind if kind.is_short)
 _CLOCKS_APART = 12
 """A lease that lasts for longer than so many times what it may was taken before clocks were set."""
 
 
-def _in_order() -> Subquery:
-    """Return id and place, from 1, of every waiting job in the order of dispatch.
-
-    Short jobs stand in a line of their own.
-    """
-    is_short = case((_JOBS.kind.in_(_SHORT), 1), else_=0).label("is_short")
-    # Of one owner, what is asked about a job that is done comes before further files.
-    is_file = case((_JOBS.kind == "compensation", 1), else_=0).label("is_file")
-    present = (
-        select(
-            _JOBS.id,
-            _JOBS.owner,
-            _JOBS.state,
-            _JOBS.priority,
-            _JOBS.created_at,
-            is_short,
-            is_file,
-        )
-        .where(_JOBS.state.in_(_NOT_OVER))
-        .subquery("present")
-    )
-    job = present.c
-    running = (
-        select(job.owner, job.is_short, func.count().label("jobs"))
-        .where(job.state == "running")
-        .group_by(job.owner, job.is_short)
-        .subquery("running")
-    )
-    own_turn = func.row_number().over(
-        partition_by=(job.owner, job.is_short),
-        order_by=(job.priority.desc(), job.is_file, job.created_at, job.id),
-    )
-    turn = (own_turn + func.coalesce(running.c.jobs, 0)).label("turn")
-    waiting = (
-        select(job.id, job.created_at, job.priority, job.is_short, turn)
-        .outerjoin_from(
-            present,
-            running,
-            and_(running.c.owner == job.owner, running.c.is_short == job.is_short),
-        )
-        .where(job.state == "queued")
-        .subquery("waiting")
-    )
-    row = waiting.c
-    order = (row.priority.desc(), row.turn, row.created_at, row.id)
-    place = func.row_number().over(partition_by=row.is_short, order_by=order).label("place")
-    return select(row.id, row.is_short, place).subquery("queue")
-
-
 # Statements of every upload and every look of the reconciler are made once: to put one together
 # takes longer than to execute it.
-_QUEUE = _in_order()
+_QUEUE = queue_order()
 _PLACE = select(_QUEUE.c.place).where(_QUEUE.c.id == bindparam("job_id"))
-_GET = select(tables.jobs).where(_JOBS.id == bindparam("job_id"))
 _IN_STATE = (
     select(tables.jobs)
     .where(_JOBS.state == bindparam("wanted"))
     .order_by(_JOBS.created_at, _JOBS.id)
 )
-_SAME = (
-    select(tables.jobs)
-    .where(_JOBS.owner == bindparam("owner"), _JOBS.dedupe_key == bindparam("key"))
-    .where(_JOBS.state.in_(("done", *_NOT_OVER)))
-    .order_by(
-        case({"done": 0, "running": 1, "queued": 2}, value=_JOBS.state),
-        _JOBS.created_at.desc(),
-        _JOBS.id.desc(),
-    )
-    .limit(1)
-)
-_USAGE = select(
-    func.count().filter(_JOBS.state.in_(_NOT_OVER)),
-    func.sum(_JOBS.source_bytes + func.coalesce(_JOBS.output_bytes, 0)),
-).where(_JOBS.owner == bindparam("owner"))
-_ADD, _ADD_AUDIT = tables.jobs.insert(), tables.audit.insert()
-
-
-@dataclass(frozen=True, slots=True)
-class Quota:
-    """What one owner may have: jobs that are not over, and bytes of all jobs that are kept."""
-
-    max_jobs: int
-    max_bytes: int
-
-
-class QuotaExceeded(Exception):
-    """The owner has too many jobs already."""
-
-
-class SpaceExceeded(QuotaExceeded):
-    """The owner keeps too many bytes already."""
-
-
-class IdempotencyConflict(Exception):
-    """The idempotency key was used before, with another request."""
 
 
 class BadCursor(ValueError):
@@ -225,44 +127,27 @@ class JobStore:
         QuotaExceeded
         """
 
-        def add(connection: Connection) -> Job:
-            if idempotency is not None:
-                earlier = _earlier(connection, job, *idempotency)
-                if earlier is not None:
-                    return earlier
-            if shared or limits is not None:
-                _stand_in_line(connection, job.owner)
-            same = _same(connection, job.owner, job.dedupe_key) if shared else None
-            if same is not None:
-                if idempotency is not None:
-                    _lead_to(connection, job.owner, idempotency[0], {"job_id": same.id})
-                return same
-            if limits is not None:
-                _check_quota(connection, job, limits)
-            connection.execute(_ADD, _to_row(job))
-            if audit_row is not None:
-                connection.execute(_ADD_AUDIT, dict(audit_row))
-            return job
-
-        return write_together(self.engine, add)
+        return write_together(
+            self.engine, lambda c: submit(c, job, idempotency, limits, shared, audit_row)
+        )
 
     def submitted(self, owner: str, idempotency_key: str) -> tuple[str, Job | None] | None:
         """Return the fingerprint that came with a key, and its job unless that was deleted."""
         with reading(self.engine) as connection:
-            row = connection.execute(_submission(owner, idempotency_key)).one_or_none()
-            return row and (row.fingerprint, _get(connection, row.job_id))
+            row = connection.execute(submission(owner, idempotency_key)).one_or_none()
+            return row and (row.fingerprint, stored_job(connection, row.job_id))
 
     def find_same(self, owner: str, dedupe_key: str) -> Job | None:
         """Return the owner's newest job of a dedupe key: one that is done, else under way."""
         with reading(self.engine) as connection:
-            return _same(connection, owner, dedupe_key)
+            return same_job(connection, owner, dedupe_key)
 
     # Looking
 
     def get(self, job_id: str, owner: str | None = None) -> Job | None:
         """Return a job, of this owner if one is given, or None."""
         with reading(self.engine) as connection:
-            job = _get(connection, job_id)
+            job = stored_job(connection, job_id)
         return job if job is not None and owner in (None, job.owner) else None
 
     def many(self, ids: Iterable[str]) -> dict[str, Job]:
@@ -346,7 +231,7 @@ class JobStore:
     def usage(self, owner: str) -> tuple[int, int]:
         """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
         with reading(self.engine) as connection:
-            return _usage(connection, owner)
+            return usage(connection, owner)
 
     # The queue
 
@@ -392,14 +277,14 @@ class JobStore:
             The job afterwards; None if the job is gone, or it is too late for the event.
         """
         with writing(self.engine) as connection:
-            job = _get(connection, job_id, for_update=True)
+            job = stored_job(connection, job_id, for_update=True)
             if job is None:
                 return None
             try:
                 after = advance(job, event)
             except Stale:
                 return None
-            before, row = _to_row(job), _to_row(after)
+            before, row = to_row(job), to_row(after)
             changed = {name: value for name, value in row.items() if value != before[name]}
             connection.execute(update(tables.jobs).where(_JOBS.id == job_id).values(changed))
             if after.state.is_final:
@@ -485,91 +370,12 @@ class JobStore:
 
     def _jobs(self, query: Select[Any], values: Mapping[str, Any] | None = None) -> list[Job]:
         with reading(self.engine) as connection:
-            return [_from_row(row) for row in connection.execute(query, values or {})]
+            return [from_row(row) for row in connection.execute(query, values or {})]
 
     def _count(self, statement: Any) -> int:
         with writing(self.engine) as connection:
             result: CursorResult[Any] = connection.execute(statement)
             return result.rowcount
-
-
-def _get(connection: Connection, job_id: str, *, for_update: bool = False) -> Job | None:
-    # SQLite needs no lock of a row: its transaction has locked the database.
-    query = _GET.with_for_update() if for_update else _GET
-    row = connection.execute(query, {"job_id": job_id}).one_or_none()
-    return None if row is None else _from_row(row)
-
-
-def _submission(owner: str, key: str) -> Select[Any]:
-    row = tables.submissions.c
-    return select(tables.submissions).where(row.owner == owner, row.idempotency_key == key)
-
-
-def _earlier(connection: Connection, job: Job, key: str, fingerprint: str) -> Job | None:
-    """Return the job of the same request, or note down that `job` is the first one."""
-    row = {
-        "owner": job.owner,
-        "idempotency_key": key,
-        "fingerprint": fingerprint,
-        "job_id": job.id,
-        "created_at": job.created_at,
-        "kept_from_s": None,
-    }
-    # If somebody else is about to insert the same key, this waits for that transaction.
-    statement = insert(connection, tables.submissions).values(row).on_conflict_do_nothing()
-    is_first = (
-        connection.execute(statement.returning(tables.submissions.c.job_id)).first() is not None
-    )
-    if is_first:
-        return None
-    known = connection.execute(_submission(job.owner, key).with_for_update()).one()
-    if known.fingerprint != fingerprint:
-        raise IdempotencyConflict(
-            f"the idempotency key {key!r:.80} came before with another request; take a new key for "
-            "a new request"
-        )
-    earlier = _get(connection, known.job_id)
-    if earlier is None:  # deleted meanwhile: the request counts anew
-        _lead_to(connection, job.owner, key, row)
-    return earlier
-
-
-def _lead_to(connection: Connection, owner: str, key: str, values: dict[str, Any]) -> None:
-    """Let the request of an idempotency key lead to another job."""
-    row = tables.submissions.c
-    known = and_(row.owner == owner, row.idempotency_key == key)
-    connection.execute(update(tables.submissions).where(known).values(values))
-
-
-def _same(connection: Connection, owner: str, dedupe_key: str) -> Job | None:
-    row = connection.execute(_SAME, {"owner": owner, "key": dedupe_key}).one_or_none()
-    return None if row is None else _from_row(row)
-
-
-def _stand_in_line(connection: Connection, owner: str) -> None:
-    """Let submissions of one owner come one after the other, so that none overlooks another."""
-    if connection.dialect.name == "postgresql":  # SQLite has locked all
-        lock = text("SELECT pg_advisory_xact_lock(hashtextextended(:owner, 7))")
-        connection.execute(lock, {"owner": owner})
-
-
-def _usage(connection: Connection, owner: str) -> tuple[int, int]:
-    jobs, size = connection.execute(_USAGE, {"owner": owner}).one()
-    return int(jobs), int(size or 0)
-
-
-def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
-    jobs, size = _usage(connection, job.owner)
-    if jobs >= limits.max_jobs:
-        raise QuotaExceeded(
-            f"{job.owner!r} has {jobs} jobs that are not over, the limit is {limits.max_jobs}; "
-            "wait for some or cancel them"
-        )
-    if size + job.source_bytes > limits.max_bytes:
-        raise SpaceExceeded(
-            f"{job.owner!r} keeps {size} bytes and this upload has {job.source_bytes}, the limit "
-            f"is {limits.max_bytes}; delete old jobs"
-        )
 
 
 def _note_deliveries(connection: Connection, job: Job) -> None:
@@ -587,16 +393,6 @@ def _note_deliveries(connection: Connection, job: Job) -> None:
                     next_at=job.finished_at,
                 )
             )
-
-
-def _to_row(job: Job) -> dict[str, Any]:
-    return asdict(job) | {"state": job.state.value, "kind": job.kind.value}
-
-
-def _from_row(row: Row[Any]) -> Job:
-    values = row._mapping
-    named = {"state": JobState(values["state"]), "kind": JobKind(values["kind"])}
-    return Job(**{name: values[name] for name in _FIELDS} | named)
 
 
 def _to_cursor(job: Job) -> str:

@@ -28,7 +28,8 @@ from stillpath.service.database.engine import (
     writing,
 )
 from stillpath.service.jobs.state import Cancelled, Event, Failed, JobState, Lost
-from stillpath.service.jobs.store import JobStore, Quota, QuotaExceeded
+from stillpath.service.jobs.store import JobStore
+from stillpath.service.jobs.submissions import Quota, QuotaExceeded
 from stillpath.service.settings import Settings
 from tests.service.database.examples import finished, make_job, take_all
 

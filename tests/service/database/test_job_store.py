@@ -26,13 +26,8 @@ from stillpath.service.jobs.state import (
     Stale,
     advance,
 )
-from stillpath.service.jobs.store import (
-    BadCursor,
-    IdempotencyConflict,
-    JobStore,
-    Quota,
-    QuotaExceeded,
-)
+from stillpath.service.jobs.store import BadCursor, JobStore
+from stillpath.service.jobs.submissions import IdempotencyConflict, Quota, QuotaExceeded
 from tests.service.database.examples import finished, make_job
 from tests.service.database.happenings import events
 
