@@ -63,7 +63,7 @@ def here(
     from stillpath.cli.batch.items import Group, items_of
     from stillpath.cli.batch.output import OutputFolder
     from stillpath.cli.batch.worker_pool import LocalPool, worker_pool
-    from stillpath.cli.machines import open_machines
+    from stillpath.cli.own_machines import open_machines
     from stillpath.pipeline.options import Options
 
     options = Options()

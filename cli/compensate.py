@@ -22,8 +22,8 @@ from stillpath.cli.arguments import (
     check_output,
     chosen_options,
 )
-from stillpath.cli.machines import open_machines
 from stillpath.cli.option_groups import grouped
+from stillpath.cli.own_machines import open_machines
 from stillpath.cli.remote import compensate_on_server
 
 __all__ = ["register"]

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stillpath.cli.arguments import BasisOption, MachineOption, RobustOption, check_folder
-from stillpath.cli.machines import open_machines
+from stillpath.cli.own_machines import open_machines
 from stillpath.compensation.defaults import DEFAULT_BASIS
 
 __all__ = ["register"]

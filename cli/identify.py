@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 
 from stillpath.cli.arguments import check_folder, check_output
-from stillpath.cli.machines import RevisionNote, open_documents, open_machines, who
 from stillpath.cli.option_groups import grouped
+from stillpath.cli.own_machines import RevisionNote, open_documents, open_machines, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:

@@ -172,7 +172,7 @@ def _store(engine: Engine) -> Any:
 
 def _note(engine: Engine, action: str, key: Any) -> None:
     """Write into the audit log what was done here, by whoever may read the database."""
-    from stillpath.cli.machines import who
+    from stillpath.cli.own_machines import who
     from stillpath.service.security.audit import AuditLog
     from stillpath.service.security.callers import LOCAL, Caller
 

@@ -29,7 +29,7 @@ def export(
     """Write the machine's compensation for the extra of Klipper (docs/klipper-live.md)."""
     target = check_output(output)
 
-    from stillpath.cli.machines import open_machines
+    from stillpath.cli.own_machines import open_machines
 
     found = open_machines().for_job(machine, files=True)
 

@@ -5,29 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from stillpath.cli.option_groups import grouped
+from stillpath.cli.own_machines import By, Message, data_dir, open_machines, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from stillpath.applications.machines.documents import Documents
-    from stillpath.applications.machines.resolve import Resolver
     from stillpath.applications.machines.revision import Revision
-    from stillpath.applications.machines.settings import MachineSettings
     from stillpath.models.machine import Machine
-    from stillpath.service.settings import Settings
 
-__all__ = ["RevisionNote", "app", "data_dir", "open_documents", "open_machines", "who"]
+__all__ = ["app"]
 
 _LARGEST_LOG_BYTES = 10_000_000
-
-_Made = TypeVar("_Made")
 
 
 class _Group(TyperGroup):
@@ -51,16 +44,6 @@ Name = Annotated[str, typer.Argument(metavar="NAME")]
 Number = Annotated[
     int | None, typer.Option("--revision", min=1, help="A revision. [default: the newest]")
 ]
-By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you]")]
-Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
-
-
-@dataclass(frozen=True, slots=True)
-class RevisionNote:
-    """Who makes a revision, and why."""
-
-    by: By = None
-    message: Message = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,43 +55,6 @@ class NewMachine:
     fx: Annotated[float | None, typer.Option(min=1.0, help="Resonance of X, Hz.")] = None
     fy: Annotated[float | None, typer.Option(min=1.0, help="Resonance of Y, Hz.")] = None
     zeta: Annotated[float, typer.Option(min=0.001, max=1.0, help="Damping ratio.")] = 0.07
-
-
-def open_machines() -> Resolver:
-    """Return the machines of this user, by the environment's settings."""
-    from stillpath.applications.machines.resolve import Resolver
-    from stillpath.applications.machines.store import MachineStore
-
-    settings = _settings()
-    return Resolver(
-        MachineStore(open_documents("machines")),
-        require_approval=settings.require_approval,
-        max_age_days=settings.measurement_max_age_days,
-    )
-
-
-def open_documents(name: str) -> Documents:
-    """Return where this user's ``machines``, ``identifications`` or ``printers`` lie.
-
-    A folder, unless STILLPATH_DATABASE_URL names a PostgreSQL database.
-    """
-    from stillpath.applications.machines.documents import DocumentFolder
-
-    if _settings().database_url is not None:
-        from stillpath.service.database import documents, engine
-
-        settings = _service_settings()
-        if engine.database_url(settings).get_backend_name() != "sqlite":
-            # Without a pool nothing is left open after a command.
-            return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
-    return DocumentFolder(data_dir() / name)
-
-
-def data_dir() -> Path:
-    """Return the folder of this user's machines and identifications."""
-    from stillpath.applications.machines.settings import user_data_dir
-
-    return _settings().data_dir or user_data_dir()
 
 
 @app.callback(invoke_without_command=True)
@@ -497,18 +443,6 @@ def from_m503(
         typer.echo(line)
 
 
-def who(by: str | None) -> str:
-    """Return the author that was named, else the user of this computer."""
-    if by is not None:
-        return by
-    import getpass
-
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError, ImportError):  # a container's user may have no name
-        return "unknown"
-
-
 def _tell_of_others() -> None:
     """Say if the service keeps machines of its own in this folder, as earlier versions did."""
     from stillpath.applications.machines.settings import EARLIER_DATA_DIR
@@ -520,29 +454,6 @@ def _tell_of_others() -> None:
             f"STILLPATH_DATA_DIR={EARLIER_DATA_DIR.resolve()} shows those",
             err=True,
         )
-
-
-def _settings() -> MachineSettings:
-    from stillpath.applications.machines.settings import MachineSettings
-
-    return _checked(MachineSettings.from_environment)
-
-
-def _service_settings() -> Settings:
-    from stillpath.service.settings import Settings
-
-    return _checked(Settings)
-
-
-def _checked(make: Callable[[], _Made]) -> _Made:
-    from pydantic import ValidationError
-
-    from stillpath.service.wrong_options import wrong_setting
-
-    try:
-        return make()
-    except ValidationError as error:
-        raise ModelError(wrong_setting(error)) from None
 
 
 def _day(text: str) -> Any:

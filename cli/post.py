@@ -43,7 +43,7 @@ def compensate_in_place(
 
     from pydantic import ValidationError
 
-    from stillpath.cli.machines import open_machines
+    from stillpath.cli.own_machines import open_machines
     from stillpath.compensation.base import DesignError
     from stillpath.gcode.errors import GcodeError
     from stillpath.models.errors import ModelError

@@ -63,7 +63,7 @@ def _found(
 ) -> PrinterCheck:
     if server:
         return _asked(name, server, key, accept=accept)
-    from stillpath.cli.machines import open_documents, open_machines
+    from stillpath.cli.own_machines import open_documents, open_machines
     from stillpath.service.deliveries.checking import Checker, PrinterUnknown
     from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
     from stillpath.service.deliveries.targets import TargetRefused

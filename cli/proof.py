@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from stillpath.cli.arguments import MachineOption, check_folder, check_output
-from stillpath.cli.machines import By, Message, open_machines, who
 from stillpath.cli.option_groups import grouped
+from stillpath.cli.own_machines import By, Message, open_machines, who
 
 if TYPE_CHECKING:
     from stillpath.applications.machines.resolve import Resolver

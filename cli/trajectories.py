@@ -20,7 +20,7 @@ from stillpath.cli.arguments import (
     check_output,
     chosen_options,
 )
-from stillpath.cli.machines import open_machines
+from stillpath.cli.own_machines import open_machines
 from stillpath.compensation.defaults import DEFAULT_METHOD
 
 __all__ = ["register"]

@@ -32,7 +32,7 @@ def warm(
     check_input(source)
 
     from stillpath.cli.console import progress_shown
-    from stillpath.cli.machines import open_machines
+    from stillpath.cli.own_machines import open_machines
     from stillpath.pipeline.compensate import compensate_file
     from stillpath.pipeline.options import Options
     from stillpath.reports import write_report

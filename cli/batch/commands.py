@@ -151,7 +151,7 @@ def _at_work(
     """Yield a worker pool, its output folder, and a check to call now and then."""
     from stillpath.cli.batch.output import OutputFolder
     from stillpath.cli.batch.worker_pool import LocalPool, Workplace, worker_pool
-    from stillpath.cli.machines import open_machines
+    from stillpath.cli.own_machines import open_machines
     from stillpath.service.interruption import interruptible
 
     works: Workplace

@@ -16,8 +16,8 @@ from stillpath.applications.proof.recorders import RingSettings
 from stillpath.applications.proof.ring_figures import RingReport
 from stillpath.applications.proof.ring_motion import is_ring_test, read_ring_motion
 from stillpath.applications.proof.ring_test import RingTest, write_ring_test
-from stillpath.cli.machines import open_machines
 from stillpath.cli.main import run
+from stillpath.cli.own_machines import open_machines
 from stillpath.models.confirmation import Confirmation, confirmation_text
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine

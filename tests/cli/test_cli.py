@@ -264,7 +264,7 @@ def test_a_job_loads_only_what_it_needs():
     """Each of these costs every job a tenth of a second or more."""
     program = (
         "import sys, stillpath.cli.main, stillpath.pipeline.compensate\n"
-        "from stillpath.cli.machines import open_machines\n"
+        "from stillpath.cli.own_machines import open_machines\n"
         "open_machines().for_job('ender3', files=True)\n"
         "heavy = ('scipy.signal', 'scipy.stats', 'pydantic_settings', 'fastapi', 'sqlite3')\n"
         "print([name for name in heavy if name in sys.modules])\n"

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from stillpath.applications.machines.store import MachineStore
-from stillpath.cli.machines import data_dir
 from stillpath.cli.main import run
+from stillpath.cli.own_machines import data_dir
 from stillpath.service.database.documents import open_documents
 from stillpath.service.database.engine import open_database
 from stillpath.service.server import _tell_where

@@ -1,0 +1,106 @@
+"""Opens the machines of this user, and says who changes them. Heavy imports wait until needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from stillpath.models.errors import ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from stillpath.applications.machines.documents import Documents
+    from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.machines.settings import MachineSettings
+    from stillpath.service.settings import Settings
+
+__all__ = ["By", "Message", "RevisionNote", "data_dir", "open_documents", "open_machines", "who"]
+
+_Made = TypeVar("_Made")
+
+By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you]")]
+Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
+
+
+@dataclass(frozen=True, slots=True)
+class RevisionNote:
+    """Who makes a revision, and why."""
+
+    by: By = None
+    message: Message = ""
+
+
+def open_machines() -> Resolver:
+    """Return the machines of this user, by the environment's settings."""
+    from stillpath.applications.machines.resolve import Resolver
+    from stillpath.applications.machines.store import MachineStore
+
+    settings = _settings()
+    return Resolver(
+        MachineStore(open_documents("machines")),
+        require_approval=settings.require_approval,
+        max_age_days=settings.measurement_max_age_days,
+    )
+
+
+def open_documents(name: str) -> Documents:
+    """Return where this user's ``machines``, ``identifications`` or ``printers`` lie.
+
+    A folder, unless STILLPATH_DATABASE_URL names a PostgreSQL database.
+    """
+    from stillpath.applications.machines.documents import DocumentFolder
+
+    if _settings().database_url is not None:
+        from stillpath.service.database import documents, engine
+
+        settings = _service_settings()
+        if engine.database_url(settings).get_backend_name() != "sqlite":
+            # Without a pool nothing is left open after a command.
+            return documents.DocumentTable(engine.open_database(settings, pooled=False), name)
+    return DocumentFolder(data_dir() / name)
+
+
+def data_dir() -> Path:
+    """Return the folder of this user's machines and identifications."""
+    from stillpath.applications.machines.settings import user_data_dir
+
+    return _settings().data_dir or user_data_dir()
+
+
+def who(by: str | None) -> str:
+    """Return the author that was named, else the user of this computer."""
+    if by is not None:
+        return by
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # a container's user may have no name
+        return "unknown"
+
+
+def _settings() -> MachineSettings:
+    from stillpath.applications.machines.settings import MachineSettings
+
+    return _checked(MachineSettings.from_environment)
+
+
+def _service_settings() -> Settings:
+    from stillpath.service.settings import Settings
+
+    return _checked(Settings)
+
+
+def _checked(make: Callable[[], _Made]) -> _Made:
+    from pydantic import ValidationError
+
+    from stillpath.service.wrong_options import wrong_setting
+
+    try:
+        return make()
+    except ValidationError as error:
+        raise ModelError(wrong_setting(error)) from None
