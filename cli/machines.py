@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from stillpath.cli.option_groups import grouped
-from stillpath.cli.own_machines import By, Message, data_dir, open_machines, who
+from stillpath.cli.own_machines import By, Message, open_machines, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
@@ -84,7 +84,6 @@ def machines(context: typer.Context) -> None:
             str(max(approved)) if approved else "none",
         )
     _print(table)
-    _tell_of_others()
 
 
 @app.command()
@@ -441,19 +440,6 @@ def from_m503(
         typer.echo(f"assumed, for M503 does not say it: {', '.join(assumed)}; --set says otherwise")
     for line in _refused(machine):
         typer.echo(line)
-
-
-def _tell_of_others() -> None:
-    """Say if the service keeps machines of its own in this folder, as earlier versions did."""
-    from stillpath.applications.machines.settings import EARLIER_DATA_DIR
-
-    others, own = EARLIER_DATA_DIR / "machines", data_dir() / "machines"
-    if others.is_dir() and others.resolve() != own.resolve():
-        typer.echo(
-            f"note: a service that is started here keeps other machines, in {others}; "
-            f"STILLPATH_DATA_DIR={EARLIER_DATA_DIR.resolve()} shows those",
-            err=True,
-        )
 
 
 def _day(text: str) -> Any:

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import structlog
 import uvicorn
 
-from stillpath.applications.machines.settings import EARLIER_DATA_DIR
 from stillpath.service.api import create_app
 from stillpath.service.database.engine import DatabaseAway, database_url, open_database
 from stillpath.service.exclusive import exclusive
@@ -78,7 +77,8 @@ def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = 
         _database(settings),
         socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
     ):
-        _tell_where(settings)
+        log = structlog.get_logger("serve")
+        log.info("data directory", folder=str(settings.data_dir.resolve()))
         for address in _addresses(host, listener.getsockname()[1]):
             sys.stdout.write(f"stillpath: {address}\n")
         sys.stdout.flush()
@@ -92,18 +92,6 @@ def _addresses(host: str, port: int) -> list[str]:
         return [f"http://127.0.0.1:{port}/", f"http://{name}:{port}/ (from other computers)"]
     shown = f"[{host}]" if ":" in host else host
     return [f"http://{shown}:{port}/"]
-
-
-def _tell_where(settings: Settings) -> None:
-    """Say where the data are, and if that is not where the command line keeps its machines."""
-    log = structlog.get_logger("serve")
-    log.info("data directory", folder=str(settings.data_dir.resolve()))
-    if "data_dir" not in settings.model_fields_set and settings.data_dir == EARLIER_DATA_DIR:
-        log.warning(
-            "the data of an earlier version are here and go on being used; machines made on the "
-            "command line lie elsewhere: set STILLPATH_DATA_DIR for both to share them",
-            STILLPATH_DATA_DIR=str(settings.data_dir.resolve()),
-        )
 
 
 @contextlib.contextmanager

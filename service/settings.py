@@ -10,7 +10,6 @@ from pydantic import AfterValidator, Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from stillpath.applications.machines.settings import (
-    EARLIER_DATA_DIR,
     ENV_PREFIX,
     MachineSettings,
     user_data_dir,
@@ -32,14 +31,11 @@ Network = Annotated[str, AfterValidator(_network)]
 
 
 def _data_dir() -> Path:
-    """Return the folder that the command line uses too, so that both see the same machines.
-
-    Where an earlier version has left its data, they go on being used.
-    """
+    """Return the folder that the command line uses too, so that both see the same machines."""
     try:
-        return EARLIER_DATA_DIR if EARLIER_DATA_DIR.is_dir() else user_data_dir()
+        return user_data_dir()
     except RuntimeError:  # a user without a home, as services may be
-        return EARLIER_DATA_DIR
+        return Path("stillpath-data")
 
 
 class Settings(MachineSettings, BaseSettings):
@@ -52,7 +48,7 @@ class Settings(MachineSettings, BaseSettings):
     ----------
     data_dir : Path
         Uploads on their way, and, unless they are elsewhere, database, results and machines. By
-        default the user's folder for data, or `stillpath-data` here if there is one.
+        default the user's folder for data, or `stillpath-data` here for a user without a home.
     database_url : str, optional
         For instance ``postgresql+psycopg://user@host/stillpath``; by default SQLite in `data_dir`.
     storage_url : str, optional

@@ -10,11 +10,9 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["EARLIER_DATA_DIR", "ENV_PREFIX", "MachineSettings", "user_data_dir"]
+__all__ = ["ENV_PREFIX", "MachineSettings", "user_data_dir"]
 
 ENV_PREFIX = "STILLPATH_"
-EARLIER_DATA_DIR = Path("stillpath-data")
-"""Where the service kept its data before it had the user's folder in common with the commands."""
 
 
 class MachineSettings(BaseModel):

@@ -12,7 +12,6 @@ from stillpath.cli.main import run
 from stillpath.cli.own_machines import data_dir
 from stillpath.service.database.documents import open_documents
 from stillpath.service.database.engine import open_database
-from stillpath.service.server import _tell_where
 from stillpath.service.settings import Settings
 
 pytestmark = pytest.mark.skipif(sys.platform in ("win32", "darwin"), reason="the XDG convention")
@@ -41,34 +40,6 @@ def test_the_service_has_the_machines_of_the_command_line(home: Path):
     assert MachineStore(open_documents(settings, engine, "machines")).names() == ["mine"]
     engine.dispose()
     assert not Path("stillpath-data").exists()
-
-
-def test_data_of_an_earlier_version_go_on_being_used_and_both_sides_say_so(home: Path, capsys):
-    make_a_machine(home)
-    (Path("stillpath-data") / "machines").mkdir(parents=True)
-    settings = Settings()
-    assert settings.data_dir == Path("stillpath-data")
-    assert data_dir() == home  # what was made there is not lost either
-    capsys.readouterr()
-    _tell_where(settings)
-    assert "go on being used" in "".join(capsys.readouterr())
-    assert run(["machines"]) == 0
-    out, err = capsys.readouterr()
-    assert "mine" in out
-    assert f"STILLPATH_DATA_DIR={Path('stillpath-data').resolve()} shows those" in err
-
-
-def test_what_is_named_is_used_without_a_word(
-    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    (Path("stillpath-data") / "machines").mkdir(parents=True)
-    monkeypatch.setenv("STILLPATH_DATA_DIR", str(Path("stillpath-data").resolve()))
-    settings = Settings()
-    assert settings.data_dir == data_dir() == Path("stillpath-data").resolve()
-    _tell_where(settings)
-    assert "go on being used" not in "".join(capsys.readouterr())
-    assert run(["machines"]) == 0
-    assert not capsys.readouterr().err
 
 
 def test_a_user_without_a_home_keeps_data_where_the_service_is_started(monkeypatch):
