@@ -34,6 +34,7 @@ from stillpath.models.errors import ModelError
 from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.file_motion import STANDING_S
 from stillpath.pipeline.files import Discarding, default_cache_dir
 from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.measuring.layer_files import LayerWriter
@@ -60,7 +61,6 @@ from stillpath.pipeline.progress import ProgressReports
 from stillpath.pipeline.reading import dialect_for, doubts
 from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
-from stillpath.pipeline.simulate import STANDING_S
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s

@@ -11,6 +11,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.file_motion import STANDING_S, FileMotion
 from stillpath.pipeline.files import default_cache_dir, replacing
 from stillpath.pipeline.live_design import LiveDesign, cached_live_design, live_filter
 from stillpath.pipeline.live_motion import LiveMotion
@@ -22,7 +23,7 @@ from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.result import PrintWay, Result, StageTime
-from stillpath.pipeline.simulate import STANDING_S, FileMotion, measured, simulate_file
+from stillpath.pipeline.simulate import measured, simulate_file
 from stillpath.pipeline.ways import file_way, live_way
 
 __all__ = ["LivePrediction", "keep_file", "predict_live", "simulate_live"]

@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 import contextlib
-import io
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
 from stillpath.compensation.live_filter import LiveFilter
-from stillpath.gcode.containers.opening import open_text
-from stillpath.gcode.dialect import Dialect
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import check_moves_end, check_print_ends, intended
-from stillpath.gcode.firmware.registry import adapter
-from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.sampler import Sampler, Samples
-from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.gcode.types import EventKind, Moves, Phases, ProgramBlock, rows_of
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
-from stillpath.models.shaping import OFF, Shaping
+from stillpath.models.shaping import OFF
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.columns import npz_table
-from stillpath.pipeline.endless import LengthGuard
+from stillpath.pipeline.file_motion import STANDING_S, FileMotion
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.live_motion import LiveMotion
 from stillpath.pipeline.measuring.layer_files import written_layers
@@ -37,26 +26,14 @@ from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
-from stillpath.pipeline.progress import ProgressCallback, ProgressReports, progress_to
-from stillpath.pipeline.reading import DialectName, dialect_for, doubts, passed_over
+from stillpath.pipeline.progress import ProgressCallback
+from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.result import NOTHING_COMPENSATED, Result, StageTime
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
 
-__all__ = [
-    "STANDING_S",
-    "FileMotion",
-    "MotionPart",
-    "PlannedTime",
-    "TextMotion",
-    "measured",
-    "plan_file",
-    "simulate_file",
-]
+__all__ = ["PlannedTime", "measured", "plan_file", "simulate_file"]
 
-STANDING_S = 2.0
-"""How long a stand is measured: all vibration has died down after that."""
-_BLOCK_BYTES = 1 << 17
 _COLUMNS = ("t", "x", "y", "z", "e")
 
 
@@ -237,291 +214,3 @@ def measured(
         seen.add(samples)
     add(stream.flush())
     return seen
-
-
-@dataclass(frozen=True, slots=True)
-class MotionPart:
-    """Samples with the moves they belong to.
-
-    `path_mm`, shape (2, n), is where the file wants X and Y, if the firmware rounds to motor steps.
-    `jumped`: the position was lost before them. `shaping`: what the file has set the firmware's
-    shaper to.
-    """
-
-    samples: Samples
-    path_mm: np.ndarray | None
-    moves: Moves
-    first_move: int
-    jumped: bool
-    shaping: Shaping
-
-    def own_moves(self) -> Moves:
-        """Return the moves in which the samples lie."""
-        first, last = self.samples.move_index[[0, -1]] - self.first_move
-        return rows_of(self.moves, slice(first, last + 1))
-
-    def motion(self) -> MotionSamples:
-        """Return the samples with line, layer and feature."""
-        row = self.samples.move_index - self.first_move
-        moves = self.moves
-        travel = moves.end_mm - moves.start_mm
-        feeds = ((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)) & (travel[:, 3] > 0.0)
-        executed_mm = self.samples.xyz_mm[:2]
-        return MotionSamples(
-            path_mm=executed_mm if self.path_mm is None else self.path_mm,
-            executed_mm=executed_mm,
-            z_mm=self.samples.xyz_mm[2],
-            extruding=feeds[row] & self.samples.moving,
-            row=row,
-            moves=moves,
-            first_move=self.first_move,
-            sliced_mm=None if self.path_mm is None else executed_mm,
-        )
-
-
-class TextMotion:
-    """Iterate over the sampled motion of a text in bounded memory.
-
-    Parameters
-    ----------
-    file : binary file
-        Plain G-code, seekable; read from its beginning.
-    machine : Machine
-    dialect : Dialect
-    dt_s : float
-    longest_stand_s : float
-        What the machine stands longer is left out of the samples.
-    shaping : Shaping
-        The firmware's shaper before the first line.
-    progress : callable, optional
-        Is given the share of the file that is read and the time that it takes, now and then.
-    each : callable, optional
-        Is given every block of the program before its motion.
-
-    Attributes
-    ----------
-    time_s : float
-        Time of the motion that is planned.
-    reader : Interpreter
-    shapers : list of str
-        Labels of the shapers that the file sets, each once.
-    """
-
-    def __init__(
-        self,
-        file: BinaryIO,
-        machine: Machine,
-        dialect: Dialect,
-        dt_s: float,
-        *,
-        longest_stand_s: float = np.inf,
-        shaping: Shaping = OFF,
-        progress: Callable[[float, float], None] = lambda _share, _time_s: None,
-        each: Callable[[ProgramBlock], None] = lambda _block: None,
-    ) -> None:
-        self._file, self._machine, self._dialect = file, machine, dialect
-        self._longest_stand_s = longest_stand_s
-        self._progress, self._each = progress, each
-        self._left_out_s = self._end_s = 0.0
-        self._held: list[tuple[int, Moves]] = []
-        self._jumps: list[int] = []
-        """Moves in front of which the position was lost, by their index in the file."""
-        self._shaping = self._read_shaping = shaping
-        self._changes: list[tuple[int, Shaping]] = []
-        """Moves in front of which the shaper was set, and to what."""
-        self._step_mm = adapter(machine).step_mm
-        self._sampler, self._path_sampler = Sampler(dt_s), Sampler(dt_s)
-        self._adviser = adapter(machine).adviser(dialect)
-        self._unmodelled: set[str] = set()
-        self.shapers: list[str] = []
-        self.time_s = 0.0
-        self.reader = Interpreter(machine, dialect=dialect)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the firmware passes over, or what is not modelled."""
-        return [*passed_over(self.reader), *sorted(self._unmodelled)]
-
-    def __iter__(self) -> Iterator[MotionPart]:
-        file = self._file
-        planner = adapter(self._machine).planner()
-        moves = 0
-        guard = LengthGuard(file, self._machine, self._dialect)
-        size = max(file.seek(0, io.SEEK_END), 1)
-        file.seek(0)
-        while True:
-            data = file.read(_BLOCK_BYTES)
-            for block in self.reader.push(data) if data else self.reader.flush():
-                moves += len(block.moves)
-                self._each(block)
-                self._hold(block)
-                phases = planner.push(block)
-                self._check(phases, planner.time_s, guard.check)
-                for samples, path_mm in self._sampled(self._shortened(phases), final=False):
-                    yield from self._parts(samples, path_mm)
-            self.time_s = planner.time_s
-            self._progress(file.tell() / size, self.time_s)
-            if not data:
-                break
-        phases = planner.flush()
-        self._check(phases, planner.time_s, check_print_ends)
-        for samples, path_mm in self._sampled(self._shortened(phases), final=True):
-            yield from self._parts(samples, path_mm)
-        self.time_s = planner.time_s
-        if moves == 0:
-            raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
-
-    def _hold(self, block: ProgramBlock) -> None:
-        if len(block.moves):
-            self._held.append((block.first_move, block.moves))
-        events = block.events
-        lost = events.kind == EventKind.UNKNOWN
-        self._jumps += events.move_index[lost].tolist()
-        for row in np.flatnonzero(events.kind == EventKind.SHAPER).tolist():
-            self._set_shaper(block, row)
-
-    def _set_shaper(self, block: ProgramBlock, row: int) -> None:
-        events, offset = block.events, block.text_offset
-        line = block.text[int(events.byte_start[row]) - offset : int(events.byte_end[row]) - offset]
-        try:
-            found = self._adviser.read_shaper(line.decode("utf-8", "replace"), self._read_shaping)
-        except ValueError:
-            return
-        self._read_shaping = found
-        shaping = found.modelled
-        for kind in found.unknown_types:
-            self._unmodelled.add(
-                f"the shaper {kind} has no model: figures are those without it (line "
-                f"{int(events.line[row])})"
-            )
-        if shaping.label not in self.shapers:
-            self.shapers.append(shaping.label)
-        self._changes.append((int(events.move_index[row]), shaping))
-
-    def _check(
-        self, phases: Phases, time_s: float, check_length: Callable[[float, int], None]
-    ) -> None:
-        if self._held:
-            check_moves_end(phases, self._line)
-            check_length(time_s, int(self._held[-1][1].line[-1]))
-
-    def _line(self, move_index: int) -> int:
-        first, moves = [held for held in self._held if held[0] <= move_index][-1]
-        return int(moves.line[move_index - first])
-
-    def _shortened(self, phases: Phases) -> Phases:
-        """Leave out what the machine stands longer than it must."""
-        if len(phases) == 0 or np.isinf(self._longest_stand_s):
-            return phases
-        end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
-        stands_s = phases.t_s - np.append(self._end_s, end_s[:-1])
-        left_out_s = np.cumsum(np.maximum(stands_s - self._longest_stand_s, 0.0)) + self._left_out_s
-        self._left_out_s, self._end_s = float(left_out_s[-1]), float(end_s[-1])
-        return replace(phases, t_s=phases.t_s - left_out_s)
-
-    def _sampled(
-        self, phases: Phases, *, final: bool
-    ) -> Iterator[tuple[Samples, np.ndarray | None]]:
-        """Sample motion, and where the file wants it, if the firmware rounds to motor steps."""
-        if max(self._step_mm[:2]) == 0.0:
-            for samples in _all(self._sampler, phases, final=final):
-                yield samples, None
-            return
-        if len(phases):
-            moves, first = _joined([m for _, m in self._held]), self._held[0][0]
-            numbered = replace(phases, move_index=phases.move_index - first)
-            asked = intended(numbered, moves.start_mm, moves.end_mm, self._step_mm)
-        else:
-            asked = phases
-        executed = _all(self._sampler, phases, final=final)
-        for samples, path in zip(
-            executed, _all(self._path_sampler, asked, final=final), strict=True
-        ):
-            yield samples, path.xyz_mm[:2]
-
-    def _parts(self, samples: Samples, path_mm: np.ndarray | None) -> Iterator[MotionPart]:
-        """Cut samples where the position is lost or the shaper changes between two moves."""
-        begun, jumped, last = 0, False, int(samples.move_index[-1])
-        while True:
-            jump = self._jumps[0] if self._jumps else last + 1
-            change = self._changes[0][0] if self._changes else last + 1
-            if min(jump, change) > last:
-                break
-            at = int(np.searchsorted(samples.move_index, min(jump, change)))
-            if at > begun:
-                yield self._part(samples, path_mm, slice(begun, at), jumped)
-                begun, jumped = at, False
-            if jump <= change:
-                self._jumps.pop(0)
-                jumped = True
-            else:
-                self._shaping = self._changes.pop(0)[1]
-        yield self._part(samples, path_mm, slice(begun, len(samples)), jumped)
-
-    def _part(
-        self, samples: Samples, path_mm: np.ndarray | None, rows: slice, jumped: bool
-    ) -> MotionPart:
-        samples = samples.part(rows.start, rows.stop)
-        path_mm = None if path_mm is None else path_mm[:, rows]
-        first = int(samples.move_index[0])
-        while len(self._held) > 1 and self._held[1][0] <= first:
-            self._held.pop(0)
-        moves = _joined([m for _, m in self._held])
-        return MotionPart(samples, path_mm, moves, self._held[0][0], jumped, self._shaping)
-
-
-class FileMotion:
-    """Iterate over the sampled motion of a print file of any kind."""
-
-    def __init__(
-        self,
-        source: Path,
-        plate: int | None,
-        machine: Machine,
-        dialect: DialectName | None,
-        dt_s: float,
-        progress: ProgressCallback | None,
-        *,
-        longest_stand_s: float = np.inf,
-    ) -> None:
-        self._source, self._plate, self._machine = source, plate, machine
-        self._dialect = dialect_for(machine, dialect)
-        self._asked = dialect
-        self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
-        self._progress, self._reports = progress, ProgressReports(progress)
-        self.time_s = 0.0
-        self.feature_names: list[str] = []
-        self.facts = SlicerFacts()
-        self.warnings: list[str] = []
-        self.shapers: list[str] = []
-
-    def __iter__(self) -> Iterator[MotionPart]:
-        unpacking = progress_to(self._progress, "unpacking", 0.0)
-        with open_text(self._source, plate=self._plate, progress=unpacking) as container:
-            self.facts = container.facts()
-            doubtful = doubts(container.text, self._machine, self._asked)
-            motion = TextMotion(
-                container.text,
-                self._machine,
-                self._dialect,
-                self._dt_s,
-                longest_stand_s=self._longest_stand_s,
-                progress=partial(self._reports.say, "planning"),
-            )
-            self.feature_names = motion.reader.feature_names
-            yield from motion
-        self.time_s, self.shapers = motion.time_s, motion.shapers
-        self.warnings = [*doubtful, *motion.warnings]
-
-
-def _all(sampler: Sampler, phases: Phases, *, final: bool) -> Iterator[Samples]:
-    yield from sampler.push(phases)
-    if final:
-        yield from sampler.flush()
-
-
-def _joined(parts: list[Moves]) -> Moves:
-    if len(parts) == 1:
-        return parts[0]
-    names = Moves.__dataclass_fields__
-    return Moves(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})

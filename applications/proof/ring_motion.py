@@ -23,8 +23,8 @@ from stillpath.applications.proof.ring_test import (
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
+from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.reading import dialect_for
-from stillpath.pipeline.simulate import TextMotion
 from stillpath.simulation.response import PlantStream
 
 __all__ = ["RingMotion", "Stop", "is_ring_test", "predicted", "read_ring_motion"]

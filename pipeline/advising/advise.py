@@ -34,6 +34,7 @@ from stillpath.pipeline.advising.messages import (
 )
 from stillpath.pipeline.advising.reading import FirstReading
 from stillpath.pipeline.clock import StageClock
+from stillpath.pipeline.file_motion import STANDING_S, TextMotion
 from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.measuring.layer_files import LayerWriter
@@ -58,7 +59,6 @@ from stillpath.pipeline.result import (
     StageTime,
 )
 from stillpath.pipeline.shaping import ShapedMotion
-from stillpath.pipeline.simulate import STANDING_S, TextMotion
 from stillpath.version import __version__
 
 __all__ = ["advise_file"]

@@ -11,8 +11,8 @@ import numpy as np
 from stillpath.models.machine import Machine
 from stillpath.models.plants import ParametricMembers, PlantSetSpec, PlantSpec, TfSpec
 from stillpath.models.store import load_machine
+from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.reading import dialect_for
-from stillpath.pipeline.simulate import TextMotion
 from stillpath.simulation.printers.bodies import STEP_S, Bodies, Element, Friction
 from stillpath.simulation.printers.resonance_test import Accelerometer, Record
 
