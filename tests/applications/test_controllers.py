@@ -142,7 +142,8 @@ def test_page_holds_everything_itself(tmp_path: Path) -> None:
         links = Links()
         links.feed(page)
         assert links.found == ["data:,"]
-        assert "nan" not in page.lower().replace("nan-", "")
+        body = page[page.index("<body") :]  # a digest in the head may hold any letters
+        assert "nan" not in body.lower().replace("nan-", "")
         json.loads((tmp_path / "controller.json").read_text())
         assert (tmp_path / "controller.h").read_text().startswith("/*")
 
