@@ -15,7 +15,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.models.machine import Machine
 from stillpath.pipeline.file_rewriting import FileRewriting, file_rewriting
 from stillpath.pipeline.job import Job
-from stillpath.pipeline.last_check.comparing import LastCheckError
+from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
 from stillpath.pipeline.options import Options

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from stillpath.models.machine import Machine
-from stillpath.pipeline.last_check.comparing import LastCheckError
+from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.progress import ProgressCallback
 

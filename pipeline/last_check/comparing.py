@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.machine import Machine
 from stillpath.pipeline.last_check import _reader_kernels as at
+from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
 from stillpath.pipeline.last_check.reader import NAN, Kind, Reader, code_of, tells_times
 from stillpath.pipeline.last_check.rules import rules_of
@@ -25,7 +26,7 @@ from stillpath.pipeline.result import LastCheckFigures
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-__all__ = ["LastCheck", "LastCheckError"]
+__all__ = ["LastCheck"]
 
 _PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
 _MOST_IDLE = 1 << 10
@@ -47,40 +48,6 @@ _IN_STREAM = re.compile(
     _ANYWHERE.pattern + rb"|G1 (?:[XYZEF]-?[\d.]+ ?)+$|G9[01]$|M8[23]$|G92 E-?[\d.]+$",
     re.IGNORECASE,
 )
-
-
-class LastCheckError(Exception):
-    """The written file is not what it should be; it must not be delivered.
-
-    Attributes
-    ----------
-    line, written_line : int
-        Lines of the original and of the written file, from 1.
-    reason : str
-        What was found there.
-    stream_line : int
-        Line of the original at which the last stream before begins; 0 where there is none.
-    """
-
-    exit_code = 1
-
-    def __init__(self, message: str, line: int, written_line: int) -> None:
-        self.line, self.written_line, self.reason = line, written_line, message
-        self.stream_line = 0
-        super().__init__(
-            f"the last check refuses the written file at its line {written_line} (line {line} of "
-            f"the original): {message}. This is an error of Stillpath, nothing was written: "
-            "please report it with the file, and print the original"
-        )
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return _rebuilt, (self.args[0], self.line, self.written_line, self.reason)
-
-
-def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckError:
-    error = LastCheckError(reason, line, written_line)
-    error.args = (text,)
-    return error
 
 
 class LastCheck:

@@ -56,7 +56,7 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
     from stillpath.compensation.base import DesignError
     from stillpath.gcode.errors import GcodeError
     from stillpath.models.errors import ModelError
-    from stillpath.pipeline.last_check.comparing import LastCheckError
+    from stillpath.pipeline.last_check.errors import LastCheckError
 
     match error:
         case GcodeError() | ModelError() | DesignError() if kind in _REFUSED:

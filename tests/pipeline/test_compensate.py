@@ -23,7 +23,7 @@ from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file, plan_file
-from stillpath.pipeline.last_check.comparing import LastCheckError
+from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.measuring.reference_shaper import BestShaper

@@ -17,7 +17,8 @@ from stillpath.gcode.pieces import VerbatimPart
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.last_check.comparing import LastCheck, LastCheckError
+from stillpath.pipeline.last_check.comparing import LastCheck
+from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import LastCheckFigures, Result
 from stillpath.service.jobs.problems import problem_of

@@ -1,0 +1,39 @@
+"""What the last check raises where a written file differs from its original."""
+
+from __future__ import annotations
+
+__all__ = ["LastCheckError"]
+
+
+class LastCheckError(Exception):
+    """The written file is not what it should be; it must not be delivered.
+
+    Attributes
+    ----------
+    line, written_line : int
+        Lines of the original and of the written file, from 1.
+    reason : str
+        What was found there.
+    stream_line : int
+        Line of the original at which the last stream before begins; 0 where there is none.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, line: int, written_line: int) -> None:
+        self.line, self.written_line, self.reason = line, written_line, message
+        self.stream_line = 0
+        super().__init__(
+            f"the last check refuses the written file at its line {written_line} (line {line} of "
+            f"the original): {message}. This is an error of Stillpath, nothing was written: "
+            "please report it with the file, and print the original"
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuilt, (self.args[0], self.line, self.written_line, self.reason)
+
+
+def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckError:
+    error = LastCheckError(reason, line, written_line)
+    error.args = (text,)
+    return error
