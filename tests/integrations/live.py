@@ -141,12 +141,12 @@ FILES: dict[str, Callable[[], str]] = {
 
 @dataclass(frozen=True)
 class Pair:
-    """A print as Klipper makes it, and with the extra; its plan, and what the host said."""
+    """A print as Klipper makes it, and with the extra; what the host said, and its plan."""
 
     plain: Steps
     live: Steps
-    plan: HostMoves
     log: str
+    plan: HostMoves | None = None
 
     def planned(self) -> tuple[Array, Array]:
         """The plan from shortly before the print on: times, and places of X and Y, (2, n).
@@ -155,6 +155,7 @@ class Pair:
         """
         first = (round(print_begins(self.plain.time_s) * 1e3) - 500) * FINE
         ends_s = max(float(t[-1]) for t in self.plain.time_s)
+        assert self.plan is not None
         at_s = np.arange(first, round(ends_s * 1e3 * FINE) + 50 * FINE) * 1e-3 / FINE
         return at_s, self.plan.head_at(at_s)
 
@@ -186,7 +187,7 @@ def both(
     plan = recorded(place)
     text = text + "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"  # the first of them makes all steps
     second = print_with(text, machine, export, place, klipper, more)
-    return Pair(first, second, plan, (place / "klippy.log").read_text())
+    return Pair(first, second, (place / "klippy.log").read_text(), plan)
 
 
 def stands(steps: Steps, least_s: float = 0.6) -> list[tuple[float, ...]]:

@@ -47,6 +47,7 @@ RULES = {
     "GET /v1/machines/{name}/response": READ,
     "GET /v1/machines/{name}/design": READ,
     "GET /v1/machines/{name}/design.html": READ,
+    "GET /v1/machines/{name}/stillpath.json": READ,
     # For a trial; to keep what was found is for admins.
     "POST /v1/machines/{name}/measurements": SUBMIT,
     "GET /v1/machines/{name}/identification": READ,
