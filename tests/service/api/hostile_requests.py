@@ -120,5 +120,6 @@ def hostile_requests(
         lambda: client.post(CONTROLLERS, **loop(60_000)),
         lambda: client.get("/v1/machines/ender3/design?axis=x&robust=minimax&basis=bspline"),
         lambda: client.get("/v1/machines/ender3/design?axis=y&robust=ensemble"),
+        lambda: client.get("/v1/machines/voron-v0/stillpath.json"),
         lambda: client.get(trajectories),
     ]
