@@ -108,9 +108,10 @@ def test_limits_bring_the_plan_back(
     given["digest"] = export_digest(given)
     prints = both(two_objects(), machine, given, tmp_path, klipper_live)
     assert "limited 0.000 s" not in prints.log
-    off = off_steps(prints, given, corexy=False)
-    assert np.sqrt(np.mean(off**2)) < 0.4
-    assert np.abs(off).max() < 4.0
+    # At the samples of the filter: between them the prediction would decide anew what is too much.
+    off = off_steps(prints, given, corexy=False)[:, ::FINE]
+    assert np.sqrt(np.mean(off**2)) < 0.31
+    assert np.abs(off).max() < 1.1
 
 
 def test_a_compensated_file_is_not_compensated_twice(
