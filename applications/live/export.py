@@ -18,7 +18,6 @@ __all__ = [
     "export_digest",
     "export_document",
     "export_text",
-    "made_export",
     "write_export",
 ]
 
@@ -34,21 +33,11 @@ def write_export(machine: Machine, target: Path, cache_dir: Path | None = None) 
     DesignError
         If there is no print-time compensation for the machine.
     """
-    document = made_export(machine, cache_dir)
+    design = cached_live_design(machine, cache_dir or default_cache_dir())
+    document = export_document(machine, design)
     with replacing(target) as temporary:
         temporary.write_text(export_text(document), encoding="utf-8")
     return document
-
-
-def made_export(machine: Machine, cache_dir: Path | None = None) -> dict[str, Any]:
-    """Return the export of a machine; its design is kept in the cache.
-
-    Raises
-    ------
-    DesignError
-        As `write_export` does.
-    """
-    return export_document(machine, cached_live_design(machine, cache_dir or default_cache_dir()))
 
 
 def export_text(document: dict[str, Any]) -> str:

@@ -148,7 +148,7 @@ class JobQuery(BaseModel):
     compare_live: bool = Field(
         default=False,
         description="Whether the report of a compensated file says too what the compensation "
-        "inside Klipper would make of the sliced file (a quarter more computing time).",
+        "inside Klipper would make of the sliced file. The print is planned once more for it.",
     )
     plate: Annotated[int, Field(ge=1, le=10_000)] | None = Field(
         default=None, description="Which plate of a 3MF package with several."

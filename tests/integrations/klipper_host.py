@@ -27,6 +27,7 @@ from stillpath.models.machine import Machine
 __all__ = [
     "CHECKOUT",
     "EXTRA",
+    "MICROSTEPS",
     "NO_KLIPPER",
     "PYTHON",
     "STEP_MM",
@@ -43,8 +44,8 @@ EXTRA = Path(__file__).resolve().parents[2] / "integrations/klipper/extra"
 
 _CLOCK_HZ = 20_000_000
 """So slow that no stand of a motor is longer than the clock's 32 bits."""
-_MICROSTEPS, _ROTATION_MM = 256, 40.0
-STEP_MM = _ROTATION_MM / (200 * _MICROSTEPS)
+MICROSTEPS, _ROTATION_MM = 256, 40.0
+STEP_MM = _ROTATION_MM / (200 * MICROSTEPS)
 """Of the motors of X and Y: .8 um, so that no step hides anything."""
 _QUEUE_STEP = "queue_step oid=%c interval=%u count=%hu add=%hi"
 _DIRECTION = "set_next_step_dir oid=%c dir=%c"
@@ -234,7 +235,7 @@ def printer_cfg(machine: Machine, *more: str, shaper: bool = False) -> str:
         lines += [
             f"[stepper_{axis}]\nstep_pin: P{3 * k}\ndir_pin: P{3 * k + 1}",
             f"endstop_pin: P{3 * k + 2}",
-            f"microsteps: {16 if axis == 'z' else _MICROSTEPS}\nrotation_distance: {_ROTATION_MM}",
+            f"microsteps: {16 if axis == 'z' else MICROSTEPS}\nrotation_distance: {_ROTATION_MM}",
             f"position_endstop: 0\nposition_min: {travel.min_mm}\nposition_max: {travel.max_mm}",
             "homing_speed: 100",
         ]
@@ -309,7 +310,7 @@ def steps_of(gcode: str, config: str, place: Path, klipper: Path | None = None) 
         env=environment,
         capture_output=True,
         check=False,
-        timeout=600,
+        timeout=3600,
     )
     log = (place / "klippy.log").read_text(encoding="utf-8", errors="replace")
     assert not done.returncode, log[-4000:]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stillpath.compensation.live_filter import LiveFilter
 from stillpath.models.machine import Machine
 from tests.integrations.interrupted import two_objects
-from tests.integrations.klipper_host import STEP_MM, Steps, printer_cfg, steps_of
+from tests.integrations.klipper_host import MICROSTEPS, STEP_MM, Steps, printer_cfg, steps_of
 from tests.integrations.klipper_moves import HostMoves, recorded
 
 __all__ = [
@@ -167,10 +167,14 @@ def print_with(
     place: Path,
     klipper: Path,
     more: str = "",
+    microsteps: int | None = None,
 ) -> Steps:
-    """Print with the extra."""
+    """Print with the extra; `microsteps` of X and Y, if not as fine as `STEP_MM`."""
     (place / "stillpath.json").write_text(json.dumps(export), encoding="utf-8")
-    return steps_of(text, printer_cfg(machine, SECTION, more), place, klipper)
+    config = printer_cfg(machine, SECTION, more)
+    if microsteps is not None:
+        config = config.replace(f"microsteps: {MICROSTEPS}\n", f"microsteps: {microsteps}\n")
+    return steps_of(text, config, place, klipper)
 
 
 def both(
