@@ -112,13 +112,13 @@ async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersi
 
 _UPLOAD: dict[str, Any] = {
     "status_code": 201,
-    "responses": responses(401, 403, 408, 413, 422, 429, 507),
     "openapi_extra": upload_body(required_form=True),
     "summary": "Hand in a file as to OctoPrint",
 }
+_REFUSALS = 401, 403, 408, 413, 422, 429, 507
 
 
-@router.post("/api/files/local", **_UPLOAD)
+@router.post("/api/files/local", responses=responses(*_REFUSALS), **_UPLOAD)
 async def upload(request: Request, response: Response, caller: Uploader) -> Stored:
     """Make a job of the file, for the only printer there is."""
     printers = request.app.state.printers
@@ -132,7 +132,9 @@ async def upload(request: Request, response: Response, caller: Uploader) -> Stor
     return await _taken(request, response, next(iter(printers)), caller)
 
 
-@router.post("/printers/{name}/api/files/local", **_UPLOAD)
+@router.post(
+    "/printers/{name}/api/files/local", responses=responses(404, *_REFUSALS), **_UPLOAD
+)
 async def upload_for(
     request: Request, response: Response, name: PrinterName, caller: Uploader
 ) -> Stored:

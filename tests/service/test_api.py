@@ -254,6 +254,16 @@ def test_health_and_openapi(client: TestClient):
     assert "application/problem+json" in post["responses"]["413"]["content"]
 
 
+def test_every_route_with_a_name_in_it_may_not_find_it(client: TestClient):
+    silent = [
+        f"{method.upper()} {path}"
+        for path, operations in client.get("/openapi.json").json()["paths"].items()
+        for method, operation in operations.items()
+        if "{" in path and "404" not in operation["responses"]
+    ]
+    assert silent == ["PUT /v1/machines/{name}", "POST /v1/machines/{name}/settings"]  # create it
+
+
 def test_foreign_pages_are_kept_out(client: TestClient):
     rebound = {"host": "evil.example"}
     assert_problem(client.get("/v1/machines", headers=rebound), 403, "evil.example")
