@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.minimax import guarded_weights
 from stillpath.compensation.preview_axis import (
     GENTLE_RUNG,
@@ -105,7 +106,7 @@ class PreviewFbf:
         machine: Machine,
         dt_s: float,
         *,
-        basis: str = "ce-opt",
+        basis: str = DEFAULT_BASIS,
         robust: str = "off",
         along: float | None = None,
         window_s: float = 0.3,

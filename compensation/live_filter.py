@@ -132,7 +132,7 @@ def design_taps(
     Least squares in frequency: sum_m w_m |1 - B G_m H|^2 S + (f / corner)^4 |H|^2 S, S the
     spectrum of acceleration-limited motion and B that of the quadratic B-spline which the motors
     follow. The members enter by P = sum_m w_m |B G_m|^2 and C = sum_m w_m conj(B G_m) / P (the
-    ensemble of METHOD's section 4 in frequency; dissertation (4.22)). Gain and first moment are
+    ensemble of `docs/method.md` in frequency; dissertation (4.22)). Gain and first moment are
     taken out of the unknowns.
     """
     dt_s = members[0].dt_s

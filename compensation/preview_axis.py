@@ -46,7 +46,10 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Rung:
-    """One step of the ladder: number of functions (per 300 samples) and price of acceleration."""
+    """One step of the ladder: number of functions (per 300 samples) and price of acceleration.
+
+    Both count samples of 1 ms: at another sampling the same ladder is another design.
+    """
 
     n: int
     price: float

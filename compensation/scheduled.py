@@ -19,11 +19,11 @@ from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.schedule import EMPTY, OperatingPoint
 
-__all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "ScheduledCompensator"]
+__all__ = ["BLEND_STEP", "DESIGN_STEP", "REMEMBERED_S", "ScheduledCompensator"]
 
 Array = NDArray[np.float64]
 
-STEP = 0.02
+DESIGN_STEP = 0.02
 """Ratio, minus 1, of a resonance from one design to the next in mass and height."""
 BLEND_STEP = 0.02
 """The same in x and y. The blend of two neighbours is off by the square of their difference."""
@@ -59,7 +59,7 @@ class ScheduledCompensator:
         self, machine: Machine, make: Callable[[Machine], Compensator], dt_s: float
     ) -> None:
         self._machine, self._make, self._dt_s = machine, make, dt_s
-        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s)
         self._made: dict[OperatingPoint, Compensator] = {}
         self._share = 1.0

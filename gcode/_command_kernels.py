@@ -34,12 +34,23 @@ from stillpath.gcode._slots import (
     MAX_VALUE,
     MIN_VALUE,
     OK,
+    Action,
 )
 from stillpath.gcode._table_kernels import note_modal, put_event, settle
 from stillpath.models.jit import kernel
 
 _HARMLESS, _MODE, _STOP, _UNKNOWN, _STATE = 0, 1, 3, 4, 8
 _X, _E, _P, _S = 23, 4, 15, 18
+# Compiled code takes plain numbers.
+_MOVE, _ARC_CW, _ARC_CCW, _CURVE = (
+    int(a) for a in (Action.MOVE, Action.ARC_CW, Action.ARC_CCW, Action.CURVE)
+)
+_DWELL, _SET_POSITION = int(Action.DWELL), int(Action.SET_POSITION)
+_PLANE_XY, _PLANE_YZ = int(Action.PLANE_XY), int(Action.PLANE_YZ)
+_INCHES, _MILLIMETRES = int(Action.INCHES), int(Action.MILLIMETRES)
+_ABSOLUTE, _RELATIVE = int(Action.ABSOLUTE), int(Action.RELATIVE)
+_ABSOLUTE_E, _RELATIVE_E = int(Action.ABSOLUTE_E), int(Action.RELATIVE_E)
+_SPEED_FACTOR, _EXTRUDE_FACTOR = int(Action.SPEED_FACTOR), int(Action.EXTRUDE_FACTOR)
 _MARLIN_E = 1
 _P_ONLY, _OR_NOTHING = 0, 2
 _BARE_IS_ZERO, _OFFSET, _POSITION = 0, 1, 2
@@ -56,44 +67,44 @@ def execute(action: int, w: Any, mask: int, f: Any, i: Any, rows: Any, tables: A
     w, mask : ndarray of 26 floats, int
         Values of the words A to Z and which of them are present.
     """
-    if action < 20:
+    if action < _MOVE:  # an `EventKind`
         if action == _UNKNOWN:
             settle(f, i, rows)
             i[I_KNOWN] = 0
         put_event(i, rows, action)
         return OK
-    if action == 20:
+    if action == _MOVE:
         return move(w, mask, f, i, rows)
-    if action == 21 or action == 22:
-        return arc(action == 21, w, mask, f, i, rows)
-    if action == 36:
+    if action in (_ARC_CW, _ARC_CCW):
+        return arc(action == _ARC_CW, w, mask, f, i, rows)
+    if action == _CURVE:
         return curve(w, mask, f, i, rows)
-    if action == 23:
+    if action == _DWELL:
         return _dwell(w, mask, f, i, rows)
     settle(f, i, rows)
     kind = _MODE
-    if 24 <= action <= 26:
-        i[I_PLANE] = action - 24
-    elif action == 27 or action == 33:
-        unit_mm = 25.4 if action == 27 else 1.0
+    if _PLANE_XY <= action <= _PLANE_YZ:
+        i[I_PLANE] = action - _PLANE_XY
+    elif action in (_INCHES, _MILLIMETRES):
+        unit_mm = 25.4 if action == _INCHES else 1.0
         if f[F_UNIT_MM] != unit_mm or f[F_UNIT_E_MM] != unit_mm:
             kind = _STATE
         f[F_UNIT_MM] = f[F_UNIT_E_MM] = unit_mm
-    elif action == 28 or action == 29:
-        i[I_ABS_XYZ] = 1 if action == 28 else 0
+    elif action in (_ABSOLUTE, _RELATIVE):
+        i[I_ABS_XYZ] = 1 if action == _ABSOLUTE else 0
         if i[I_E_RULE] == _MARLIN_E:
             i[I_ABS_E] = i[I_ABS_XYZ]
-    elif action == 31 or action == 32:
-        i[I_ABS_E] = 1 if action == 31 else 0
-    elif action == 30:
+    elif action in (_ABSOLUTE_E, _RELATIVE_E):
+        i[I_ABS_E] = 1 if action == _ABSOLUTE_E else 0
+    elif action == _SET_POSITION:
         return _set_position(w, mask, f, i, rows, tables)
-    elif action == 34 or action == 35:
+    elif action in (_SPEED_FACTOR, _EXTRUDE_FACTOR):
         if mask & (1 << _S) or i[I_FACTOR_DEFAULT]:
             percent = w[_S] if mask & (1 << _S) else 100.0
             f[F_ERROR] = percent
             if not MIN_VALUE <= percent <= MAX_VALUE:
                 return ERROR_POSITIVE
-            if action == 34:
+            if action == _SPEED_FACTOR:
                 factor = percent / (60.0 * 100.0)
                 f[F_SPEED] = f[F_SPEED] / f[F_SPEED_FACTOR] * factor
                 f[F_SPEED_FACTOR] = factor

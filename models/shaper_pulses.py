@@ -89,8 +89,8 @@ def _zv(zeta: float) -> Pulses:
 
 
 def _mzv(zeta: float) -> Pulses:
-    # Undamped: three pulses 3/8 of a period apart, zero vibration and the shortest such with
-    # non-negative weights: 1 - 1/sqrt 2, sqrt 2 - 1, 1 - 1/sqrt 2.
+    # Undamped: three pulses 3/8 of a period apart, Klipper's spacing. That the vibration cancels
+    # gives the weights 1 - 1/sqrt 2, sqrt 2 - 1, 1 - 1/sqrt 2.
     outer = 1 - math.sqrt(0.5)
     return _damped(
         zeta, np.array([outer, math.sqrt(2.0) - 1.0, outer]), np.array([0.0, 0.375, 0.75])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.cautious import Caution
+from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
@@ -164,7 +165,7 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 
 
 def choose_caution(
-    machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = "ce-opt"
+    machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = DEFAULT_BASIS
 ) -> tuple[Caution, Choice]:
     """Choose how much of the compensation a machine bears; found once per machine revision.
 
@@ -309,7 +310,11 @@ def _unseen(axis: PlantSetSpec) -> bool:
 
 
 def pair_weights(machine: Machine, count: int) -> Array:
-    """Return how likely each pair of members is."""
+    """Return the weight of each pair: the geometric mean of its members' weights, normalised.
+
+    Members are paired by their place in the sets, so this is no joint probability: the root keeps
+    one unlikely member from hiding the other.
+    """
     x, y = (
         np.array([m.weight for m in machine.axes[axis].weighted_members()]) for axis in ("x", "y")
     )

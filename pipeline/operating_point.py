@@ -10,7 +10,7 @@ from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at, mass_schedules
 from stillpath.models.schedule import EMPTY, OperatingPoint, resonances_hz
-from stillpath.simulation.scheduled import BLEND_STEP, STEP
+from stillpath.simulation.scheduled import BLEND_STEP, SIMULATION_STEP
 
 __all__ = ["Operation"]
 
@@ -47,7 +47,7 @@ class Operation:
         self.printed_kg = 0.0
         self._furthest_mm: float | None = None
         self._point = EMPTY
-        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._grid = OperatingGrid(machine, step=SIMULATION_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
         self._used: dict[str, tuple[float, float]] = {}
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.scheduled import BLEND_STEP, STEP
+from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
@@ -144,7 +144,7 @@ class PieceCompensator:
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
         # An axis that bears more is looked at as if it went less far.
         self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
-        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
 
     def compensate(self, piece: Piece, point: OperatingPoint = EMPTY) -> CompensatedPiece:

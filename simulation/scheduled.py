@@ -13,11 +13,11 @@ from stillpath.models.ripple import MachineRipple
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.response import PlantStream
 
-__all__ = ["BLEND_STEP", "REMEMBERED_S", "STEP", "MachineStream"]
+__all__ = ["BLEND_STEP", "REMEMBERED_S", "SIMULATION_STEP", "MachineStream"]
 
 Array = NDArray[np.float64]
 
-STEP = 0.001
+SIMULATION_STEP = 0.001
 """Ratio, minus 1, by which a resonance moves in mass or height before the plants are taken anew."""
 BLEND_STEP = 0.02
 """The same from node to node in x and y."""
@@ -55,7 +55,7 @@ class MachineStream:
         self._member = member
         self._ripple = MachineRipple(machine.kinematics, machine.ripple)
         self._friction = DryFriction(machine.friction_mm)
-        self._grid = OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP)
+        self._grid = OperatingGrid(machine, step=SIMULATION_STEP, blend_step=BLEND_STEP)
         self._remembered = round(REMEMBERED_S / dt_s) if machine.schedules else 0
         self._past = np.zeros((2, 0))
         self._level: OperatingPoint | None = None

@@ -115,7 +115,8 @@ def design_report(
     _check_names(axis, settings)
     dt_s, row = settings.dt_s, AXES.index(axis)
     spec = machine.axes["x" if axis == "x" else "y"]
-    plants = plant_set(spec, dt_s)
+    # What designs see: no command leads for a delay of slow motion (`PreviewFbf`).
+    plants = plant_set(spec.without_delay(), dt_s)
     designers, missing = _designers(machine, settings)
     robust = _robust_mode(machine, settings, designers)
     # Without a set all robust modes are one.
@@ -125,7 +126,11 @@ def design_report(
         lifted = designers[mode].lifted[row]
     else:
         update = round(settings.update_s / dt_s)
-        lifted = lifted_window(plants.members, plants.weights, window, update)
+        # Refused as a whole: its figures say why.
+        members, weights = plants.members, plants.weights
+        if mode == "off":
+            members, weights = (plants.nominal,), np.ones(1)
+        lifted = lifted_window(members, weights, window, update)
     # What the product refuses as a whole, no rung of it can be used for.
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
     most = functions_within(spec.band_hz, dt_s)

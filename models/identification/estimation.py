@@ -136,8 +136,8 @@ def response_at(aligned: AlignedLog, f_hz: Array) -> LocalResponse:
 def plateau_gain(response: FrequencyResponse) -> float | None:
     """Return the gain that the response has towards 0 Hz, from 8 to 15 Hz; None if unknown.
 
-    A resonance above lifts the band by 1/(1 - f^2/f_r^2), so the real part of 1/H is a line in
-    f^2; the gain is where it meets 0 Hz.
+    A resonance above lifts the band by 1/(1 - f^2/f_r^2), so 1/|H| is a line in f^2;
+    the gain is where it meets 0 Hz.
     """
     low, high = _PLATEAU_HZ
     used = (response.f_hz >= low) & (response.f_hz <= high) & (response.coherence >= 0.8)

@@ -1,8 +1,9 @@
 """The frame on its feet, which a sensor feels and a nozzle over its bed does not.
 
 An accelerometer measures against the ground. A frame that shakes by reaction (mass ratio mu,
-frequency w) multiplies what the nozzle does over the bed by 1 - mu s^2/(s^2 + 2 z w s + w^2): a
-mode of share mu, or a pair of poles beside a pair of zeros, far below the mode that rings most.
+frequency w) multiplies what the nozzle does over the bed by 1 - mu s^2/(s^2 + 2 z w s + w^2), to
+first order in mu (exactly: `nozzle`): a mode of share mu, or a pair of poles beside a pair of
+zeros, far below the mode that rings most.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ def explain_response(
     fit : Fit
         To their mean.
     frame_firm : bool
-        Whether the frame is known to stand firm; else half of the plants are without what may be
-        its mode.
+        Whether the frame is known to stand firm; else four fifths of the plants are without what
+        may be its mode.
     progress : callable, optional
         Told the share done, 0 to 1.
 

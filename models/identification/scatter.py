@@ -64,4 +64,4 @@ SCATTERS = (
     Scatter(white_db=0.5, smooth_db=0.9, octaves=0.35, floor=0.01),
 )
 """Repeats within a session differ by .3 to .5 dB bin by bin, tables of one axis weeks apart by .5
-to 1 dB over an octave (`benchmarks/printers.py` prints the spread of real tables)."""
+to 1 dB over an octave (45 real tables, `docs/tried.md`)."""

@@ -88,10 +88,11 @@ def response_set(
 ) -> AxisIdentification:
     """Identify an axis from one or more responses: repeats, amplitudes, positions, heights.
 
-    Nominal is the fit to their mean (weighted by 1/sd^2, delays aligned). Members are fits of the
-    same structure, one for each label that differs from the others: responses with the same label
-    are repeats, which show the scatter inside which others are dropped. Where nothing differs
-    beyond it, members are what else explains the responses (`response_bootstrap`).
+    Responses with the same label are repeats, which show the scatter. Labels that differ beyond it
+    become members, fits of one structure; nominal is the fit to the mean of all (weighted by
+    1/sd^2, delays aligned). Where nothing differs, members are what else explains the responses
+    (`response_bootstrap`), and nominal is the first of them: that fit, without the mode of the
+    frame unless the frame is firm.
 
     Parameters
     ----------

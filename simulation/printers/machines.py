@@ -86,7 +86,7 @@ class CoreXY:
     Attributes
     ----------
     a, b : Axis
-        Motors and belts; `belt.mass_kg` is that of carriage and beam.
+        Motors and belts; `belt.mass_kg` is the mass with which `belt.f_hz` is stated: the carriage.
     carriage_kg, beam_kg : float
         What moves in X; what moves with it in Y.
     """

@@ -1,9 +1,10 @@
 """Stillpath: print compensation for G-code.
 
-``compensate``, ``simulate``, ``plan``, ``identify``, ``design``, ``load_machine``, ``Machine`` and
-``Client`` are the public interface (`stillpath.library`); everything else may change from one
-version to the next. The rooms of the package lie in the checkout's root. Here are links to them, so
-that all of it has one import name.
+``compensate``, ``simulate``, ``plan``, ``identify``, ``design``, ``load_machine``, ``Machine``,
+``Client`` and the errors ``GcodeError``, ``ModelError`` and ``DesignError`` are the public
+interface (`stillpath.library`); everything else may change from one version to the next. The rooms
+of the package lie in the checkout's root. Here are links to them, so that all of it has one import
+name.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from stillpath.version import __version__
 if TYPE_CHECKING:
     from stillpath.library import (
         Client,
+        DesignError,
+        GcodeError,
         Machine,
+        ModelError,
         compensate,
         design,
         identify,
@@ -26,7 +30,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Client",
+    "DesignError",
+    "GcodeError",
     "Machine",
+    "ModelError",
     "__version__",
     "compensate",
     "design",

@@ -9,7 +9,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stillpath.compensation.base import DesignError
 from stillpath.compensation.defaults import DEFAULT_BASIS
+from stillpath.gcode.errors import GcodeError
+from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.service.client import Client
@@ -21,7 +24,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Client",
+    "DesignError",
+    "GcodeError",
     "Machine",
+    "ModelError",
     "compensate",
     "design",
     "identify",

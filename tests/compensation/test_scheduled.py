@@ -10,7 +10,7 @@ from stillpath.compensation.base import Compensator, DesignError
 from stillpath.compensation.fbf import LADDER, PreviewFbf
 from stillpath.compensation.preview_axis import BAND_MARGIN, functions_within
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.scheduled import BLEND_STEP, STEP, ScheduledCompensator
+from stillpath.compensation.scheduled import BLEND_STEP, DESIGN_STEP, ScheduledCompensator
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import Mode, ModesSpec, plant_set
@@ -205,7 +205,11 @@ def test_nodes_that_a_print_does_not_touch_are_not_designed() -> None:
     one = ScheduledCompensator(machine, make, DT_S)
     assert len(asked) == 1
     run(one, pieces(2), [OperatingPoint()] * 2)
-    assert 2 <= len(asked) < 0.7 * OperatingGrid(machine, step=STEP, blend_step=BLEND_STEP).nodes
+    assert (
+        2
+        <= len(asked)
+        < 0.7 * OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP).nodes
+    )
 
 
 def test_designs_fail_where_they_are_made() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stillpath.gcode.firmware.klipper._encoder_kernels import MOST_LOST, expected_braking
-from stillpath.gcode.firmware.klipper._motion_kernels import move_limits
+from stillpath.gcode.firmware.klipper._limit_kernels import move_limits
 
 FACTS = (20.0, 200.0, 100.0, 5000.0, 1.0)
 

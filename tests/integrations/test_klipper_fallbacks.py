@@ -116,6 +116,8 @@ def test_it_passes_the_plan_through_where_it_falls_behind(
     prints = troubled_pair(text, machine, export(name), tmp_path, troubled, more)
     assert f"stillpath: passing through: {said}" in prints.log
     assert f"stillpath: passing for {name}: {said}" in prints.log
+    # Switched on again, it says nothing of what is over.
+    assert f"stillpath: on for {name}; limited" in prints.log.rpartition("passing for")[2]
     check(prints, machine)
 
 
@@ -125,7 +127,7 @@ def troubled_pair(
     """Print without the extra, and with it and something that troubles it."""
     plain = "\n".join(line for line in text.split("\n") if not line.startswith("STILLPATH"))
     first = steps_of(plain, printer_cfg(machine, MORE), place, host)
-    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\n"
+    text += "SET_KINEMATIC_POSITION\nSTILLPATH_STATUS\nSTILLPATH ENABLE=1\n"
     second = print_with(text, machine, given, place, host, MORE + more)
     return Pair(first, second, (place / "klippy.log").read_text())
 

@@ -25,7 +25,7 @@ from stillpath.gcode.firmware.encoding import (
     limits_in_force,
 )
 from stillpath.gcode.firmware.klipper._encoder_kernels import assign_speeds, expected_braking
-from stillpath.gcode.firmware.klipper._motion_kernels import move_limits
+from stillpath.gcode.firmware.klipper._limit_kernels import move_limits
 from stillpath.gcode.firmware.klipper.limits import KlipperLimits
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.klipper.stream_commands import IN_STREAM_MARK_MM_S

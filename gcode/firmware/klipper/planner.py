@@ -2,7 +2,8 @@
 
 `Planner` gives for any cutting of the stream what a look-ahead over the whole stretch between
 two stops gives; Klipper's own queue of a quarter second agrees with it on the golden files.
-Rules: klippy/toolhead.py, klippy/kinematics/extruder.py, 2026-08.
+The rules stand in `_planner_kernels`; sources: klippy/toolhead.py, klippy/kinematics/extruder.py,
+2026-08.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Marlin's planner: from moves to blocks of whole steps and their trapezoids.
 
 `Planner` gives the same for any cutting of the stream. It takes the file to be read faster than
-it is executed, so the firmware's queue is full but for the first blocks after a stop. Rules and
-sources: docs/marlin.md.
+it is executed, so the firmware's queue is full but for the first blocks after a stop. The rules
+stand in `_block_kernels` (speeds, accelerations and junctions of a block) and `_planner_kernels`
+(look-ahead, trapezoids, step timing); sources: docs/marlin.md.
 """
 
 from __future__ import annotations

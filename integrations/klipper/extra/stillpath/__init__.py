@@ -24,7 +24,7 @@ from .motors import Motor, queue_of
 KINEMATICS = {"cartesian": "CartKinematics", "corexy": "CoreXYKinematics"}
 ASIDE = ("TEST_RESONANCES", "SHAPER_CALIBRATE", "SET_INPUT_SHAPER", "FORCE_MOVE", "STEPPER_BUZZ")
 """Commands during which the motors follow Klipper's plan itself."""
-# Klipper of those days does not obey (v0.13.0-631 to -641).
+# Klipper v0.13.0-631 to -641 ignores SHAPER_FREQ=0.
 SHAPER = (
     "input_shaper is active: SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0"
     " (update a Klipper of 2026-04-27 to 2026-05-04, or take the frequencies out of printer.cfg)"
@@ -43,10 +43,10 @@ class Stillpath:
         self.export = self.toolhead = self.queue = self.filter = None
         self.motors = []
         self.engaged, self.aside = False, 0
-        self.reason = "not started"
+        self.reason, self.passing_reason = "not started", ""
         self.late = 0
         self.busy_s = self.moved_s = self.advanced_s = 0.0
-        self.load, self.window = 0.0, [0.0, 0.0]
+        self.window = [0.0, 0.0]
         self.gcode = self.printer.lookup_object("gcode")
         self.gcode.register_command("STILLPATH", self.cmd_STILLPATH, desc=self.cmd_STILLPATH_help)
         self.gcode.register_command(
@@ -245,19 +245,21 @@ class Stillpath:
         self.window[0] += busy_s
         self.window[1] += moved_s
         if self.window[1] >= LOAD_S:
-            self.load = self.window[0] / self.window[1]
+            recent_load = self.window[0] / self.window[1]
             self.window = [0.0, 0.0]
-            if self.load > MOST_LOAD and not self.filter.passing:
-                self.filter.passing = True
-                self.reason = "this computer is too slow (%d %% of a core)" % (100 * self.load,)
-                logging.warning("stillpath: passing through: %s", self.reason)
+            if recent_load > MOST_LOAD:
+                self._pass("this computer is too slow (%d %% of a core)" % (100 * recent_load,))
 
     def _was_late(self):
         self.late += 1
+        self._pass("a move came later than Klipper promises")
+
+    def _pass(self, reason):
+        """Let the plan pass unfiltered until STILLPATH ENABLE=1."""
         if not self.filter.passing:
             self.filter.passing = True
-            self.reason = "a move came later than Klipper promises"
-            logging.warning("stillpath: passing through: %s", self.reason)
+            self.passing_reason = reason
+            logging.warning("stillpath: passing through: %s", reason)
 
     # -- what it says
 
@@ -305,7 +307,7 @@ class Stillpath:
         return {
             "enabled": self.wanted,
             "state": self._state(),
-            "reason": self.reason,
+            "reason": self.passing_reason if self._state() == "passing" else self.reason,
             "machine": export.machine if export else "",
             "digest": export.digest if export else "",
             "limited_s": self.filter.limited * export.sample_s if export else 0.0,
