@@ -102,7 +102,7 @@ class ReaderOptions:
         bool,
         typer.Option(
             "--frame-firm",
-            help="The frame stands firm (bolted down, heavy): what the sensor feels is what "
+            help="The frame does not move (bolted down, heavy): what the sensor feels is what "
             "prints.",
         ),
     ] = False
@@ -152,7 +152,7 @@ class RippleOptions:
         float, typer.Option(help="Share by which passes move ripple that is known already.")
     ] = 0.5
     remaining: Annotated[
-        bool, typer.Option("--remaining", help="The passes ran with the known ripple undone.")
+        bool, typer.Option("--remaining", help="The passes were recorded with the known ripple compensated.")
     ] = False
     homing_repeatability: Annotated[
         float, typer.Option(metavar="MM", help="How exactly homing repeats.")
@@ -175,7 +175,7 @@ def run(
     ripple: RippleOptions,
     note: RevisionNote,
 ) -> None:
-    """Make a machine of measurements. Resonance tests, recorded drives, responses, models.
+    """Build a machine model from measurements: resonance tests, recorded drives, responses, models.
 
     Without --machine and --output nothing is stored: the figures are printed.
     """

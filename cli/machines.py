@@ -275,7 +275,7 @@ def motors(
         Path, typer.Argument(metavar="CONSOLE", exists=True, help="Its console, or klippy.log.")
     ],
     margin: Annotated[
-        float, typer.Option(min=0.1, max=1.0, help="Of what was borne, what is stored.")
+        float, typer.Option(min=0.1, max=1.0, help="Fraction of the measured limit to store.")
     ] = 0.75,
     full_step: Annotated[
         int, typer.Option(min=1, max=256, help="Microsteps of a full step, of X and Y.")
@@ -283,7 +283,7 @@ def motors(
     by: By = None,
     message: Message = "",
 ) -> None:
-    """Store what the motors bore in a search for lost steps, with a margin (`command`)."""
+    """Store the limits that a search for lost steps measured, with a margin (`command`)."""
     from stillpath.applications.proof.motor_test import borne, envelope, levels_of
 
     levels = levels_of(written.read_text(encoding="utf-8", errors="replace"))

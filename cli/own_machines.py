@@ -22,8 +22,8 @@ __all__ = ["By", "Message", "RevisionNote", "data_dir", "open_documents", "open_
 
 _Made = TypeVar("_Made")
 
-By = Annotated[str | None, typer.Option("--by", help="Who does it. [default: you]")]
-Message = Annotated[str, typer.Option("--message", "-M", help="Why.")]
+By = Annotated[str | None, typer.Option("--by", help="Author, recorded with the revision. [default: you]")]
+Message = Annotated[str, typer.Option("--message", "-M", help="Why; recorded with the revision.")]
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,10 +33,10 @@ def test_what_is_public_is_there_and_told() -> None:
 
 def test_rooms_are_imported_below_stillpath_only() -> None:
     package = ROOT / "src" / "stillpath"
-    rooms = [path.name for path in package.iterdir() if path.is_dir() and path.name[0] != "_"]
-    files = [path for room in rooms for path in (package / room).rglob("*.py")]
+    layers = [path.name for path in package.iterdir() if path.is_dir() and path.name[0] != "_"]
+    files = [path for layer in layers for path in (package / layer).rglob("*.py")]
     assert len(files) > 300
-    other = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(rooms)})\b", re.MULTILINE)
+    other = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(layers)})\b", re.MULTILINE)
     assert [path for path in files if other.search(path.read_text(encoding="utf-8"))] == []
 
 

@@ -19,7 +19,7 @@ from pydantic_core import from_json
 from stillpath.applications.machines.checks import differences
 from stillpath.applications.machines.documents import Documents
 from stillpath.compensation.defaults import DEFAULT_METHOD
-from stillpath.gcode.firmware.klipper.versions import keeps_shaper
+from stillpath.gcode.firmware.klipper.versions import ignores_shaper_frequencies
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
@@ -383,7 +383,7 @@ def _wrappers(asked: Asked) -> Iterator[Finding]:
 def _kept_shaper(asked: Asked, *, streams: bool) -> Iterator[Finding]:
     """Find a Klipper that does not switch its shaper off, nor set its frequency."""
     shaper = asked.settings.get("input_shaper")
-    if shaper is None or not keeps_shaper(asked.software):
+    if shaper is None or not ignores_shaper_frequencies(asked.software):
         return
     if streams and not any(shaper.get(f"shaper_freq_{axis}") for axis in "xy"):
         return

@@ -2,7 +2,7 @@
 
 ``compensate``, ``simulate``, ``plan``, ``identify``, ``design``, ``load_machine``, ``Machine``,
 ``Client`` and the errors ``GcodeError``, ``ModelError`` and ``DesignError`` are the public
-interface (`stillpath.library`); everything else may change from one version to the next. The rooms
+interface (`stillpath.library`); everything else may change from one version to the next. The layers
 of the package lie in the checkout's root. Here are links to them, so that all of it has one import
 name.
 """

@@ -102,5 +102,5 @@ class KlipperAdapter:
         length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
         flat = np.hypot(travel_mm[:, 0], travel_mm[:, 1])
         climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * flat
-        least = self._firmware.planner.max_z_accel_mm_s2 * (1.0 + 1e-9)
-        return np.asarray(climb * self._stream.accel_mm_s2 > length * least)
+        most_z_accel = self._firmware.planner.max_z_accel_mm_s2 * (1.0 + 1e-9)
+        return np.asarray(climb * self._stream.accel_mm_s2 > length * most_z_accel)

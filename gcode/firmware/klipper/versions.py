@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["keeps_shaper"]
+__all__ = ["ignores_shaper_frequencies"]
 
 _VERSION = re.compile(r"v0\.13\.0-(\d+)-g[0-9a-f]+")
-_KEEPS = range(631, 642)
+_IGNORING = range(631, 642)
 
 
-def keeps_shaper(version: str) -> bool:
+def ignores_shaper_frequencies(version: str) -> bool:
     """Return whether SET_INPUT_SHAPER leaves printer.cfg's frequencies in force.
 
     Between commits db10e92e9 (2026-04-27, v0.13.0-631) and 77d5d942e (2026-05-04, v0.13.0-642) of
@@ -24,4 +24,4 @@ def keeps_shaper(version: str) -> bool:
         Copies of Klipper that count otherwise are taken for sound.
     """
     found = _VERSION.match(version)
-    return found is not None and int(found[1]) in _KEEPS
+    return found is not None and int(found[1]) in _IGNORING
