@@ -51,7 +51,7 @@ def configuration(key: str) -> str:
             f'[[operations]]\ninclude-name = "{name}"\n'
             f"checks.positive_data_acceptance.expected-statuses = {expected}"
         )
-    # A document has thousands of ways to be wrong; which numbers are refused, the models' tests say.
+    # A document has thousands of ways to be wrong: the tests of models try them.
     lines.append(
         '[[operations]]\ninclude-name = "PUT /v1/machines/{name}"\ngeneration.mode = "positive"'
     )
