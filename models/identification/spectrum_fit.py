@@ -125,14 +125,7 @@ def explain_spectra(
     name = _column(single, column)
     search = _Search(single, name, excitation, spectra, max_order)
     found = search.candidates(progress)
-    accepted: list[_Candidate] = []
-    drawn: list[_Candidate] = []
-    for k, scatter in enumerate(SCATTERS):
-        some = search.accepted(found, scatter)
-        accepted += some
-        drawn += search.drawn(some, scatter)
-        if progress:
-            progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
+    accepted, drawn = _explanations(search, found, progress)
     least_db = min(c.residual_db for c in accepted)
     good = [c for c in accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
     centres = [c.structure.spec(c.theta) for c in good]
@@ -162,6 +155,21 @@ def explain_spectra(
         notes=notes,
     )
     return Explained(fit, population)
+
+
+def _explanations(
+    search: _Search, found: Sequence[_Candidate], progress: Callable[[float], None] | None
+) -> tuple[list[_Candidate], list[_Candidate]]:
+    """Return the candidates that explain the spectra, and draws around them."""
+    accepted: list[_Candidate] = []
+    drawn: list[_Candidate] = []
+    for k, scatter in enumerate(SCATTERS):
+        some = search.accepted(found, scatter)
+        accepted += some
+        drawn += search.drawn(some, scatter)
+        if progress:
+            progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
+    return accepted, drawn
 
 
 def fit_spectrum(
