@@ -279,21 +279,7 @@ def robust_response(
             f"all plants are silent at frequency {int(np.argmax(silent))} of the grid"
         )
     shares = checked_weights(np.full(len(g), 1.0 / len(g)) if weights is None else weights, len(g))
-    if distribution == "sampled":
-        first, second = shares @ g, shares @ np.abs(g) ** 2
-    else:
-        region = Region.of(g)
-        if distribution == "uniform":
-            r = _uniform_mean(region.r_span, _moments_of_r)
-            turn = _uniform_mean(region.theta_span, _turn)[0]
-        elif distribution == "kernel":
-            r = _kernel_mean(region.r, shares, region.r_span, r_bandwidth, _moments_of_r)
-            turn = _kernel_mean(region.theta, shares, region.theta_span, theta_bandwidth, _turn)[0]
-        else:
-            raise DesignError(
-                f"no distribution is called {distribution!r}; there are sampled, uniform, kernel"
-            )
-        first, second = r[1] / r[0] * turn, (r[2] / r[0]).real
+    first, second = _moments(g, shares, distribution, r_bandwidth, theta_bandwidth)
     tracked = np.abs(first) ** 2 / second
     if tracked.min() < _LEAST_TRACKED:
         raise DesignError(
@@ -303,6 +289,30 @@ def robust_response(
             "band in which it is known"
         )
     return np.asarray(second / first.conj(), np.complex128), np.asarray(tracked, np.float64)
+
+
+def _moments(
+    g: Responses,
+    shares: Array,
+    distribution: Distribution,
+    r_bandwidth: ArrayLike | None,
+    theta_bandwidth: ArrayLike | None,
+) -> tuple[Responses, Array]:
+    """Return the means of G and of |G|^2 over a distribution, each of shape (f,)."""
+    if distribution == "sampled":
+        return shares @ g, shares @ np.abs(g) ** 2
+    region = Region.of(g)
+    if distribution == "uniform":
+        r = _uniform_mean(region.r_span, _moments_of_r)
+        turn = _uniform_mean(region.theta_span, _turn)[0]
+    elif distribution == "kernel":
+        r = _kernel_mean(region.r, shares, region.r_span, r_bandwidth, _moments_of_r)
+        turn = _kernel_mean(region.theta, shares, region.theta_span, theta_bandwidth, _turn)[0]
+    else:
+        raise DesignError(
+            f"no distribution is called {distribution!r}; there are sampled, uniform, kernel"
+        )
+    return r[1] / r[0] * turn, (r[2] / r[0]).real
 
 
 def robust_nominal(

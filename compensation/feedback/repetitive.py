@@ -36,6 +36,7 @@ from scipy.special import diric
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Extreme,
     Prediction,
     Refusal,
@@ -433,13 +434,12 @@ def _designed(
     angle = 2 * np.pi * f * nominal.dt_s
     match = nominal.servo(f) * inverse.response(angle)
     factor = plug_in_factor(model.response(angle), match)
-    return judged(
+    design = Design(
         method,
-        loops,
         blocks,
         Prediction(f, nominal.s0(f), factor),
         repetitive_coefficients(model, inverse),
-        uncertainty=uncertainty,
         settings=asked | {"period": model.period},
         notes=(*inverse.notes, *notes),
     )
+    return judged(design, loops, uncertainty)
