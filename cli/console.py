@@ -43,30 +43,7 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
 def print_result(result: Result, console: Console | None = None) -> None:
     """Print what was measured: one column per channel, then time, size and warnings."""
     console = console or Console(highlight=False)
-    table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
-    table.add_column("error, µm")
-    for channel in result.channels:
-        table.add_column(channel.label.split(" (")[0], justify="right")
-    for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
-        for kind in ("contour", "tracking"):
-            for measure in ("rms", "max"):
-                cells = [
-                    f"{getattr(getattr(channel, scope), f'{kind}_{measure}_um'):.2f}"
-                    for channel in result.channels
-                ]
-                table.add_row(f"{kind} {measure}, {part}", *cells)
-    if any(c.selected_rms_um is not None for c in result.channels):
-        table.add_row(
-            "contour rms, compensated features",
-            *[f"{c.selected_rms_um or 0.0:.2f}" for c in result.channels],
-        )
-    if any(c.contour_range_um for c in result.channels):
-        table.add_row(
-            "contour rms, all plants",
-            *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
-        )
-    table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
-    console.print(table)
+    console.print(_error_table(result))
     console.print(f"best shaper for this machine: {result.best_shaper}")
     if result.confirmation:
         console.print(f"the machine's model: {result.confirmation}")
@@ -101,6 +78,33 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def _error_table(result: Result) -> Table:
+    table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
+    table.add_column("error, µm")
+    for channel in result.channels:
+        table.add_column(channel.label.split(" (")[0], justify="right")
+    for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
+        for kind in ("contour", "tracking"):
+            for measure in ("rms", "max"):
+                cells = [
+                    f"{getattr(getattr(channel, scope), f'{kind}_{measure}_um'):.2f}"
+                    for channel in result.channels
+                ]
+                table.add_row(f"{kind} {measure}, {part}", *cells)
+    if any(c.selected_rms_um is not None for c in result.channels):
+        table.add_row(
+            "contour rms, compensated features",
+            *[f"{c.selected_rms_um or 0.0:.2f}" for c in result.channels],
+        )
+    if any(c.contour_range_um for c in result.channels):
+        table.add_row(
+            "contour rms, all plants",
+            *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
+        )
+    table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
+    return table
 
 
 def _way_line(way: PrintWay) -> str:

@@ -5,23 +5,33 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
-from stillpath.models.identification.types import Fit, FrequencyResponse
+from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
 
 __all__ = [
+    "apart_warning",
     "body_notes",
     "by_file",
+    "cross_axis_warning",
     "fit_warnings",
     "level_warnings",
     "mounting_notes",
     "parted",
     "scale_warnings",
+    "spectrum_level_warning",
 ]
 
+Array = NDArray[np.float64]
+
 _MOSTLY = 0.8
+_CROSS = 0.2
+_APART_DB = 2.0
+"""Repeats within a session differ by .3 to 1 dB, tables of one axis weeks apart by up to 1.5 dB."""
+_DB = 10 / np.log(10)
 _LEVEL_TOLERANCE = 0.15
 _LEVELS = (0.3, 3.0)
 _POOR, _POOR_DB = 0.15, 1.1
@@ -151,4 +161,50 @@ def _slope_text(response: FrequencyResponse) -> str:
         f"towards low frequencies the response goes like f^{power:d} instead of being level: "
         "command and measurement must be the same quantity (both position, or both acceleration); "
         f"multiply the response by (2 pi j f)^{-power:d}"
+    )
+
+
+def spectrum_level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
+    """Warn of a level that another accel_per_hz would explain better."""
+    stated = excitation.accel_per_hz_mm_s
+    if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
+        return ()
+    return (
+        (
+            f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
+            f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
+            "its sensor reads right (the shape of the model hardly depends on it)"
+        ),
+    )
+
+
+def apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
+    """Warn of the two tables that differ most in shape, if they are not of one machine."""
+    pairs = [
+        (float(_DB * np.std(logs[i] - logs[j])), spectra[i].source, spectra[j].source)
+        for i in range(len(logs))
+        for j in range(i)
+    ]
+    apart_db, one, other = max(pairs, default=(0.0, "", ""))
+    if apart_db <= _APART_DB:
+        return ()
+    return (
+        (
+            f"{other} and {one} differ by {apart_db:.1f} dB in shape (repeats: below "
+            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, "
+            "mounting); give only tables of the machine as it prints today"
+        ),
+    )
+
+
+def cross_axis_warning(share: float, other: str, column: str) -> tuple[str, ...]:
+    """Warn of another axis that moved too."""
+    if share <= _CROSS:
+        return ()
+    return (
+        (
+            f"sensor axis {other!r} has {share:.0%} of the power of {column!r}: the axes are "
+            "coupled (CoreXY belts of unequal tension?), the frame rocks, or the sensor is turned; "
+            f"the model describes {column!r} alone"
+        ),
     )
