@@ -24,14 +24,14 @@ _PLAIN_EVERY_S = 5.0
 
 
 @contextmanager
-def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
+def progress_shown() -> Iterator[Callable[[Progress], None]]:
     """Yield a progress callback: a bar on a terminal, now and then a plain line elsewhere.
 
     It raises `Interrupted` when the process was asked to stop.
     """
     from stillpath.service.compiling import compiling_reported
 
-    with interruptible() as check, shown(title) as show, compiling_reported(show) as told:
+    with interruptible() as check, shown("stillpath") as show, compiling_reported(show) as told:
 
         def tell(progress: Progress) -> None:
             check()
@@ -40,9 +40,9 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
         yield tell
 
 
-def print_result(result: Result, console: Console | None = None) -> None:
+def print_result(result: Result) -> None:
     """Print what was measured: one column per channel, then time, size and warnings."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     console.print(_error_table(result))
     console.print(f"best shaper for this machine: {result.best_shaper}")
     if result.confirmation:
@@ -162,12 +162,12 @@ def _advice_line(advice: AdviceFigures) -> str:
     )
 
 
-def print_planned(planned: PlannedTime, console: Console | None = None) -> None:
+def print_planned(planned: PlannedTime) -> None:
     """Print how long a file takes, and what its slicer says."""
     said = ""
     if planned.slicer_time_s is not None:
         said = f"; {planned.slicer or 'the slicer'} says {planned.slicer_time_s:.0f} s"
-    (console or Console(highlight=False)).print(f"print time {planned.time_s:.1f} s{said}")
+    Console(highlight=False).print(f"print time {planned.time_s:.1f} s{said}")
     for warning in planned.warnings:
         sys.stderr.write(f"warning: {warning}\n")
 

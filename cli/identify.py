@@ -233,7 +233,7 @@ def _identify_plants(
     from stillpath.cli.console import progress_shown
     from stillpath.cli.identification_tables import print_identification
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         found = identify_files(
             read_inputs(files),
             start,

@@ -42,6 +42,8 @@ E_TOLERANCE_MM = 3e-4
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
 END_EXCESS_MM = 1.5e-3
+SHORTEST_S = 0.5e-3
+"""Samples nearer than this to the start of a stretch are not ends of segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,6 @@ def fit_segments(
     *,
     step_mm_s: float = np.inf,
     grid_mm: float = 1e-3,
-    minimum_s: float = 0.5e-3,
 ) -> Segments:
     """Fit the stretches of a piece.
 
@@ -134,8 +135,6 @@ def fit_segments(
         Segments are cut short where the speed of an axis would step by more.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
-    minimum_s : float
-        Samples nearer than this to the start of a stretch are not ends of segments.
     """
     # A vertex on a coarse grid (a motor's whole steps) lies up to half of it beside its place.
     slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
@@ -157,7 +156,7 @@ def fit_segments(
         last = round(timeline.end_s[i] / timeline.dt_s)
         if i == len(timeline.groups) - 1:
             last = samples - 1
-        first = min(int(np.ceil((start_s + minimum_s) / timeline.dt_s)), last)
+        first = min(int(np.ceil((start_s + SHORTEST_S) / timeline.dt_s)), last)
         fit.stretch(i, start_s, first, last, tolerance_mm + END_EXCESS_MM)
     return fit.segments()
 

@@ -269,18 +269,15 @@ def exact_frequency(f_hz: float) -> Fraction:
     return Fraction(round(f_hz * 1000), 1000)
 
 
-def invert_servo(
-    num: Sequence[float], den: Sequence[float], radius: float = _RADIUS
-) -> ServoInverse:
+def invert_servo(num: Sequence[float], den: Sequence[float]) -> ServoInverse:
     """Return a causal, stable inverse of V = num/den up to a preview.
 
     Parameters
     ----------
     num, den : sequence of float
         Powers of z^-1.
-    radius : float
-        Largest pole of the inverse.
     """
+    radius = _RADIUS
     top = np.trim_zeros(np.asarray(num, float), "b")
     delay = int(np.flatnonzero(top)[0])
     top = top[delay:]

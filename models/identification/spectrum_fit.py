@@ -42,7 +42,7 @@ from stillpath.models.identification.types import (
 )
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["Explained", "explain_spectra", "fit_spectrum", "refit_spectrum"]
+__all__ = ["Explained", "explain_spectra", "refit_spectrum"]
 
 Array = NDArray[np.float64]
 
@@ -179,20 +179,6 @@ def _population(
         crowd = search.shaken(crowd)
         centres += [without_frame(plant) for plant in centres]
     return representatives(centres, crowd)
-
-
-def fit_spectrum(
-    spectrum: Spectrum,
-    excitation: Excitation,
-    *,
-    column: str | None = None,
-    max_order: int = 4,
-    progress: Callable[[float], None] | None = None,
-) -> Fit:
-    """Return the plant in the middle of those that explain a spectrum; see `explain_spectra`."""
-    return explain_spectra(
-        [spectrum], excitation, column=column, max_order=max_order, progress=progress
-    ).fit
 
 
 def refit_spectrum(

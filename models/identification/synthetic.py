@@ -147,12 +147,11 @@ def simulate_spectrum(
     *,
     sensor: Sensor = ADXL345,
     rng: np.random.Generator,
-    f_max_hz: float = 200.0,
 ) -> Spectrum:
-    """Return Klipper's power spectral densities of a simulated test, up to `f_max_hz`."""
+    """Return Klipper's power spectral densities of a simulated test, up to 200 Hz."""
     log = simulate_log(plants, excitation, sensor=sensor, lead_s=0.0, tail_s=0.0, rng=rng)
     f, psd = klipper_psd(log.time_s, log.accel_mm_s2)
-    kept = f <= f_max_hz
+    kept = f <= 200.0
     columns = {name: psd[kept, i] for i, name in enumerate("xyz")}
     columns["xyz"] = psd[kept].sum(axis=1)
     return Spectrum(f[kept], columns, log.axis, log.source)
