@@ -317,13 +317,10 @@ def _moments(
 
 def robust_nominal(
     plants: Sequence[DiscretePlant] | ArrayLike,
-    weights: ArrayLike | None = None,
-    distribution: Distribution = "kernel",
     *,
+    distribution: Distribution = "kernel",
     points: int = 4096,
     dt_s: float | None = None,
-    r_bandwidth: ArrayLike | None = None,
-    theta_bandwidth: ArrayLike | None = None,
 ) -> FrequencyNominal:
     """Make the robust nominal model of a set of plants or of measured responses.
 
@@ -331,7 +328,7 @@ def robust_nominal(
     ----------
     plants : sequence of DiscretePlant, or array_like, shape (l, points / 2 + 1)
         Responses from 0 Hz to the Nyquist frequency; see `extended_response` for measured ones.
-    weights, distribution, r_bandwidth, theta_bandwidth
+    distribution : str
         See `robust_response`.
     points : int
         Length of the two-sided impulse response, even; longer than the plants ring.
@@ -357,13 +354,7 @@ def robust_nominal(
                 f"(plants, {points // 2 + 1}) and the sampling time"
             )
         f_hz = _grid(points, dt_s)
-    response, tracked = robust_response(
-        responses,
-        weights,
-        distribution,
-        r_bandwidth=r_bandwidth,
-        theta_bandwidth=theta_bandwidth,
-    )
+    response, tracked = robust_response(responses, distribution=distribution)
     # A real filter answers 0 Hz and the Nyquist frequency with real numbers.
     response[[0, -1]] = response[[0, -1]].real
     h = np.fft.irfft(response, points)
