@@ -132,9 +132,7 @@ async def upload(request: Request, response: Response, caller: Uploader) -> Stor
     return await _taken(request, response, next(iter(printers)), caller)
 
 
-@router.post(
-    "/printers/{name}/api/files/local", responses=responses(404, *_REFUSALS), **_UPLOAD
-)
+@router.post("/printers/{name}/api/files/local", responses=responses(404, *_REFUSALS), **_UPLOAD)
 async def upload_for(
     request: Request, response: Response, name: PrinterName, caller: Uploader
 ) -> Stored:
