@@ -137,9 +137,9 @@ def read(path: Path) -> Result:
     return Result(**data, name=path.stem)
 
 
-def read_all(folder: Path = RESULTS) -> list[Result]:
+def read_all() -> list[Result]:
     """Return all results in the order of the page."""
-    found = [read(path) for path in sorted(folder.glob("*.json"))]
+    found = [read(path) for path in sorted(RESULTS.glob("*.json"))]
     return sorted(found, key=lambda r: (SECTIONS.index(r.section), r.order, r.name))
 
 

@@ -214,9 +214,7 @@ def full_ce_opt(
     return np.asarray((_toeplitz(a, samples) @ w).T)
 
 
-def full_bsplines(
-    plant: DiscretePlant, path: Array, spacing: float, price: float, degree: int = 3
-) -> Array:
+def full_bsplines(plant: DiscretePlant, path: Array, spacing: float, price: float) -> Array:
     """Return the command of a whole path whose increments are B-splines.
 
     min |y_d - N w|^2 + price |Psi c|^2 with D w = Psi c, by Lagrange multipliers.
@@ -228,8 +226,8 @@ def full_bsplines(
     spacing : float
         Samples from knot to knot.
     price : float
-    degree : int
     """
+    degree = 3
     b, a = _fraction(plant)
     samples = path.shape[1]
     numerator = _toeplitz(b, samples)

@@ -26,7 +26,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -183,24 +183,22 @@ def judged(task: Task) -> list[Row]:
     rows = []
     with tempfile.TemporaryDirectory(prefix="stillpath-quality-") as folder:
         for tolerance_um in task.tolerances_um:
-            row = _case(task, machine, tolerance_um, own, best, none, shaped, Path(folder), began)
-            rows.append(row)
+            row = _case(task, tolerance_um, own, best, none, shaped, Path(folder))
+            rows.append(replace(row, cpu_s=time.process_time() - began))
             began = time.process_time()
     return rows
 
 
 def _case(
     task: Task,
-    machine: Machine,
     tolerance_um: float,
     own: Motion,
     best: BestShaper,
     none: Judge,
     shaped: Judge,
     folder: Path,
-    began: float,
 ) -> Row:
-    target = folder / "out.gcode"
+    machine, target = load_machine(task.machine), folder / "out.gcode"
     options = task.options.model_copy(update={"tolerance_um": tolerance_um})
     result = compensate_file(task.file, target, machine, options, cache_dir=task.cache)
     written = read_motion(target, machine)
@@ -244,7 +242,7 @@ def _case(
         ],
         emission_rms=result.emission_rms_um,
         emission_max=result.emission_max_um,
-        cpu_s=time.process_time() - began,
+        cpu_s=0.0,
         missed=[],
     )
     row.missed.extend(missed(row))

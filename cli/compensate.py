@@ -73,7 +73,7 @@ def compensate(
     from stillpath.cli.console import print_result, progress_shown
     from stillpath.pipeline.compensate import compensate_file
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         result = compensate_file(
             source, target, found.machine, options, progress=progress, layers=report
         )
@@ -112,7 +112,7 @@ def simulate(
         from stillpath.pipeline.live_printing import simulate_live as simulated
     else:
         from stillpath.pipeline.compensate import simulate_file as simulated
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         result = simulated(
             source,
             found.machine,

@@ -24,14 +24,14 @@ _PLAIN_EVERY_S = 5.0
 
 
 @contextmanager
-def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
+def progress_shown() -> Iterator[Callable[[Progress], None]]:
     """Yield a progress callback: a bar on a terminal, now and then a plain line elsewhere.
 
     It raises `Interrupted` when the process was asked to stop.
     """
     from stillpath.service.compiling import compiling_reported
 
-    with interruptible() as check, shown(title) as show, compiling_reported(show) as told:
+    with interruptible() as check, shown("stillpath") as show, compiling_reported(show) as told:
 
         def tell(progress: Progress) -> None:
             check()
@@ -40,33 +40,10 @@ def progress_shown(title: str) -> Iterator[Callable[[Progress], None]]:
         yield tell
 
 
-def print_result(result: Result, console: Console | None = None) -> None:
+def print_result(result: Result) -> None:
     """Print what was measured: one column per channel, then time, size and warnings."""
-    console = console or Console(highlight=False)
-    table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
-    table.add_column("error, µm")
-    for channel in result.channels:
-        table.add_column(channel.label.split(" (")[0], justify="right")
-    for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
-        for kind in ("contour", "tracking"):
-            for measure in ("rms", "max"):
-                cells = [
-                    f"{getattr(getattr(channel, scope), f'{kind}_{measure}_um'):.2f}"
-                    for channel in result.channels
-                ]
-                table.add_row(f"{kind} {measure}, {part}", *cells)
-    if any(c.selected_rms_um is not None for c in result.channels):
-        table.add_row(
-            "contour rms, compensated features",
-            *[f"{c.selected_rms_um or 0.0:.2f}" for c in result.channels],
-        )
-    if any(c.contour_range_um for c in result.channels):
-        table.add_row(
-            "contour rms, all plants",
-            *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
-        )
-    table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
-    console.print(table)
+    console = Console(highlight=False)
+    console.print(_error_table(result))
     console.print(f"best shaper for this machine: {result.best_shaper}")
     if result.confirmation:
         console.print(f"the machine's model: {result.confirmation}")
@@ -101,6 +78,33 @@ def print_result(result: Result, console: Console | None = None) -> None:
         )
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False)
+
+
+def _error_table(result: Result) -> Table:
+    table = Table(title=f"{result.source_name} on {result.machine_title}", title_justify="left")
+    table.add_column("error, µm")
+    for channel in result.channels:
+        table.add_column(channel.label.split(" (")[0], justify="right")
+    for part, scope in (("extruding", "extruding"), ("all motion", "all_motion")):
+        for kind in ("contour", "tracking"):
+            for measure in ("rms", "max"):
+                cells = [
+                    f"{getattr(getattr(channel, scope), f'{kind}_{measure}_um'):.2f}"
+                    for channel in result.channels
+                ]
+                table.add_row(f"{kind} {measure}, {part}", *cells)
+    if any(c.selected_rms_um is not None for c in result.channels):
+        table.add_row(
+            "contour rms, compensated features",
+            *[f"{c.selected_rms_um or 0.0:.2f}" for c in result.channels],
+        )
+    if any(c.contour_range_um for c in result.channels):
+        table.add_row(
+            "contour rms, all plants",
+            *["{:.2f} - {:.2f}".format(*(c.contour_range_um or ())) for c in result.channels],
+        )
+    table.add_row("residual rms", *[f"{c.residual_rms_um:.2f}" for c in result.channels])
+    return table
 
 
 def _way_line(way: PrintWay) -> str:
@@ -158,12 +162,12 @@ def _advice_line(advice: AdviceFigures) -> str:
     )
 
 
-def print_planned(planned: PlannedTime, console: Console | None = None) -> None:
+def print_planned(planned: PlannedTime) -> None:
     """Print how long a file takes, and what its slicer says."""
     said = ""
     if planned.slicer_time_s is not None:
         said = f"; {planned.slicer or 'the slicer'} says {planned.slicer_time_s:.0f} s"
-    (console or Console(highlight=False)).print(f"print time {planned.time_s:.1f} s{said}")
+    Console(highlight=False).print(f"print time {planned.time_s:.1f} s{said}")
     for warning in planned.warnings:
         sys.stderr.write(f"warning: {warning}\n")
 

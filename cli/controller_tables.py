@@ -11,9 +11,9 @@ from stillpath.applications.controllers.figures import ControllerReport, LoopFig
 __all__ = ["print_controller", "print_loops"]
 
 
-def print_controller(d: ControllerReport, console: Console | None = None) -> None:
+def print_controller(d: ControllerReport) -> None:
     """Print the figures of a design, a line each, and its notes."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(f"{d.method} for {d.title}", markup=False)
     least, most = d.min_inverse_t, d.max_add_on
     before, after = d.time.before, d.time.after
@@ -36,9 +36,9 @@ def print_controller(d: ControllerReport, console: Console | None = None) -> Non
         console.print(f"note: {note}", markup=False)
 
 
-def print_loops(loops: Sequence[LoopFigures], console: Console | None = None) -> None:
+def print_loops(loops: Sequence[LoopFigures]) -> None:
     """Print the built-in closed-loop machines and the methods that fit each."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for loop in loops:
         sensor = "" if loop.sensor_hz == loop.rate_hz else f", sensor {loop.sensor_hz:.5g} Hz"
         console.print(f"{loop.name} ({loop.rate_hz:g} Hz{sensor}): {loop.title}", markup=False)

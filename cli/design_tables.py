@@ -11,9 +11,9 @@ from stillpath.applications.design.summary import Summary, modes_text, zero_text
 __all__ = ["print_design"]
 
 
-def print_design(report: DesignReport, console: Console | None = None) -> None:
+def print_design(report: DesignReport) -> None:
     """Print the axis, its set, the ladder and what errors of frequency cost."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     summary = Summary(report)
     _axis(report, console)
     if len(report.plant.members) > 1:

@@ -11,9 +11,9 @@ from stillpath.applications.identification.page import change_text, fit_text, in
 __all__ = ["print_identification"]
 
 
-def print_identification(report: IdentificationReport, console: Console | None = None) -> None:
+def print_identification(report: IdentificationReport) -> None:
     """Print modes, fit and warnings of every axis."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     for axis in report.axes:
         console.print(_modes(axis))
         console.print(f"the model misses {fit_text(axis)}{_order(axis)}")

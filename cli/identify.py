@@ -210,11 +210,10 @@ def _learn_ripple(
         gain=chosen.gain,
         remaining=chosen.remaining,
         homing_repeatability_mm=chosen.homing_repeatability,
-        name=target.machine,
-        title=target.title,
     )
-    made = store(learnt.machine, learnt.sources)
-    _write(target.output, learnt.machine)
+    machine = learnt.named(target.machine, target.title)
+    made = store(machine, learnt.sources)
+    _write(target.output, machine)
     typer.echo(learnt.summary)
     _print_revision(made)
 
@@ -234,7 +233,7 @@ def _identify_plants(
     from stillpath.cli.console import progress_shown
     from stillpath.cli.identification_tables import print_identification
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         found = identify_files(
             read_inputs(files),
             start,

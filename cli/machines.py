@@ -15,6 +15,7 @@ from stillpath.cli.own_machines import By, Message, open_machines, who
 from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
+    from stillpath.applications.machines.checks import StatedMachine
     from stillpath.applications.machines.revision import Revision
     from stillpath.models.machine import Machine
 
@@ -356,6 +357,12 @@ def check(
     typer.echo(f"{name}: nothing speaks against it")
 
 
+def _stated(made: NewMachine) -> StatedMachine:
+    from stillpath.applications.machines.checks import StatedMachine
+
+    return StatedMachine(made.name, made.title, (made.fx, made.fy), made.zeta)
+
+
 @app.command("from-config")
 @grouped
 def from_config(
@@ -369,9 +376,7 @@ def from_config(
     from stillpath.applications.machines.revision import source_file
 
     config = read_printer_config(file)
-    machine = machine_from_config(
-        config, made.name, title=made.title, f_hz=(made.fx, made.fy), zeta=made.zeta
-    )
+    machine = machine_from_config(config, _stated(made))
     revision = open_machines().store.add_revision(
         made.name,
         machine,
@@ -413,12 +418,9 @@ def from_m503(
     machine = marlin_settings.machine_from_m503(
         content.decode(errors="replace"),
         file.name,
-        made.name,
+        _stated(made),
         travel_mm=marlin_settings.read_travel(travel),
         kinematics=kinematics,
-        title=made.title,
-        f_hz=(made.fx, made.fy),
-        zeta=made.zeta,
         fields=fields or (),
     )
     revision = open_machines().store.add_revision(

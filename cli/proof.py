@@ -85,7 +85,7 @@ def coupon(
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_proof
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         made = write_coupon(found.machine, check_output(output), settings, progress=progress)
     print_proof(made, found.warnings)
 
@@ -106,7 +106,7 @@ def tower(
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_proof, print_tower
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         made = write_tower(
             found.machine, axis, check_output(output), settings, count=bands, progress=progress
         )
@@ -135,7 +135,7 @@ def ring_test(
     from stillpath.cli.proof_tables import print_proof
 
     settings = RingSettings(chip, chip_y, _text(start_gcode))
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         made = write_ring_test(found.machine, check_output(output), settings, progress=progress)
     print_proof(made, found.warnings)
 
@@ -234,7 +234,7 @@ def _verify_print(printed: Path, log: Path, machine: Machine, report: Path | Non
     from stillpath.cli.console import progress_shown
     from stillpath.cli.proof_tables import print_readback
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         made = verify_log(printed, log, machine, progress=progress)
     if report is not None:
         write_readback(made, report)

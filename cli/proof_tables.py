@@ -18,21 +18,20 @@ __all__ = ["print_proof", "print_readback", "print_ring", "print_tower"]
 def print_proof(
     made: ProofPrint,
     warnings: Sequence[str] = (),
-    console: Console | None = None,
     *,
     lines: int | None = None,
 ) -> None:
     """Print the legend (its first lines) and all warnings about a print and its machine."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for line in made.legend[:lines]:
         console.print(line, markup=False)
     for warning in (*warnings, *made.warnings):
         console.print(f"warning: {warning}", markup=False)
 
 
-def print_tower(tower: Tower, console: Console | None = None) -> None:
+def print_tower(tower: Tower) -> None:
     """Print the bands of a tower, from the top down as they stand on the bed."""
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     table = Table(
         "band",
         "height, mm",
@@ -56,9 +55,9 @@ def print_tower(tower: Tower, console: Console | None = None) -> None:
     console.print(tower.written.legend[-1], markup=False)
 
 
-def print_readback(report: ReadbackReport, console: Console | None = None) -> None:
+def print_readback(report: ReadbackReport) -> None:
     """Print verdicts and figures of a log that was read back."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for verdict in report.verdicts:
         console.print(verdict, markup=False)
     if report.axes:
@@ -96,9 +95,9 @@ def print_readback(report: ReadbackReport, console: Console | None = None) -> No
         console.print(f"note: {note}", markup=False)
 
 
-def print_ring(report: RingReport, console: Console | None = None) -> None:
+def print_ring(report: RingReport) -> None:
     """Print verdicts and figures of a ring test."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     for axis in report.axes:
         console.print(axis.text, markup=False)
     table = Table(

@@ -13,9 +13,9 @@ __all__ = ["print_scan"]
 _SHOWN = 5
 
 
-def print_scan(d: ScanReport, console: Console | None = None) -> None:
+def print_scan(d: ScanReport) -> None:
     """Print the totals of every variant, the worst tracks, and notes."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True)
     console.print(
         f"{d.source} on {d.title}: {len(d.tracks)} tracks, {d.drawn_mm:.4g} mm, "
         f"{d.duration_s:.3g} s at {d.rate_hz:g} samples/s",

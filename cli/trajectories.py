@@ -68,7 +68,7 @@ def trajectories(
     from stillpath.cli.console import progress_shown
     from stillpath.pipeline.trajectories import write_trajectories
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         rows = write_trajectories(
             source,
             target,
@@ -100,7 +100,7 @@ def plan(
     from stillpath.cli.console import print_planned, progress_shown
     from stillpath.pipeline.compensate import plan_file
 
-    with progress_shown("stillpath") as progress:
+    with progress_shown() as progress:
         planned = plan_file(
             source,
             target,

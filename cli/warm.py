@@ -40,7 +40,7 @@ def warm(
     found = open_machines().for_job(machine, files=True)
     with (
         tempfile.TemporaryDirectory(prefix="stillpath-warm-") as folder,
-        progress_shown("stillpath") as progress,
+        progress_shown() as progress,
     ):
         report = Path(folder) / "report"
         result = compensate_file(

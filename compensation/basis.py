@@ -128,9 +128,7 @@ def ce_opt_basis_of(plant: LiftedOperator, n: int) -> Array:
     return _signed(np.asarray(vt[np.argsort(-sigma)].T, np.float64))
 
 
-def robust_basis(
-    gram: Array, mean: Array, n: int, r: int | None = None, tolerance: float = TOLERANCE
-) -> Array:
+def robust_basis(gram: Array, mean: Array, n: int, r: int | None = None) -> Array:
     """Best basis of ensemble least squares over a plant set.
 
     With C = Psi Y and the best Y, sum_j l_j |I - G_j C|^2 = rows - trace((Psi'A Psi)^-1 Psi'B'B
@@ -145,7 +143,7 @@ def robust_basis(
         Number of functions, at most m - r.
     r : int, optional
         How many of the directions that the set answers least to leave out, as in (4.10). By
-        default those whose singular value is below `tolerance` times the largest.
+        default those whose singular value is below `TOLERANCE` times the largest.
 
     Returns
     -------
@@ -158,11 +156,11 @@ def robust_basis(
         If n functions do not fit into what the set answers.
     """
     _check(n, len(gram))
-    functions, mu = robust_functions(gram, mean, r, tolerance)
+    functions, mu = robust_functions(gram, mean, r)
     if n > len(mu):
         raise DesignError(
             f"n = {n} robust functions, but the plant set answers {len(mu)} of {len(gram)} "
-            f"directions (tolerance {tolerance:g}): take at most {len(mu)}"
+            f"directions (tolerance {TOLERANCE:g}): take at most {len(mu)}"
         )
     return orthonormal(functions[:, :n])
 

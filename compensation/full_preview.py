@@ -34,6 +34,8 @@ RANK_TOLERANCE = 1e-12
 """Filtered functions count as dependent below this singular value, relative to the largest."""
 _DEPENDENT = 1e-13
 """The same for the functions themselves."""
+_SILENT = 1e-9
+"""Inputs whose output is smaller, relative to the largest, count as silent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,11 +219,11 @@ class FullPreview:
         np.cumsum(shares, axis=1, out=shares)
         return shares[:, np.asarray(counts) - 1]
 
-    def initial_state(self, y_d: ArrayLike, free: ArrayLike = 0.0) -> Array:
+    def initial_state(self, y_d: ArrayLike) -> Array:
         """Return X gamma, the state in which the plant must start when filters had states."""
         if self._states is None:
             raise DesignError("this design was made without filter initial states")
-        return np.asarray(self._states @ self.coefficients(y_d, free), np.float64)
+        return np.asarray(self._states @ self.coefficients(y_d), np.float64)
 
     def controller(self) -> Array:
         """Return C of (2.11) and (E.7) as a matrix, shape (cols, rows)."""
@@ -281,9 +283,7 @@ class FullPreview:
         return rank
 
 
-def independence(
-    plant: DiscretePlant, basis: Array, states: Array | None = None, tolerance: float = 1e-9
-) -> Independence:
+def independence(plant: DiscretePlant, basis: Array, states: Array | None = None) -> Independence:
     """Test by (2.17) whether the filtered functions will be independent, before filtering them.
 
     Parameters
@@ -292,8 +292,6 @@ def independence(
     basis : ndarray, shape (m, n)
     states : ndarray, shape (order, n), optional
         Initial states X of the filters; zero by default.
-    tolerance : float
-        Rank tolerance, relative: inputs whose output is smaller than that count as silent.
 
     Notes
     -----
@@ -310,9 +308,9 @@ def independence(
     _, _, vt = np.linalg.svd(answers)
     silent = vt[m:].T
     q, sigma, _ = np.linalg.svd(np.concatenate([phi, x]), full_matrices=False)
-    rank = int(np.sum(sigma > tolerance * sigma[0]))
+    rank = int(np.sum(sigma > _SILENT * sigma[0]))
     both = svdvals(np.concatenate([q[:, :rank], silent], axis=1))
-    return Independence(rank, int(np.sum(both > tolerance)), plant.order)
+    return Independence(rank, int(np.sum(both > _SILENT)), plant.order)
 
 
 def _check_basis(basis: Array, cols: int) -> None:

@@ -49,17 +49,12 @@ class TwoStep:
     r: int
 
 
-def lifted_optimum(members: LiftedSet, tolerance: float = PSEUDO_INVERSE_TOLERANCE) -> Array:
+def lifted_optimum(members: LiftedSet) -> Array:
     """Return the nominal model (4.28): the pseudo-inverse of B' times A, shape (rows, cols).
 
-    It minimises |Delta G_nom^-1|_F (4.26). It is neither Toeplitz nor causal.
-
-    Parameters
-    ----------
-    members : LiftedSet
-    tolerance : float
-        See `PSEUDO_INVERSE_TOLERANCE`: plants with relative degree or non-minimum-phase zeros have
-        directions that cannot be inverted.
+    It minimises |Delta G_nom^-1|_F (4.26). It is neither Toeplitz nor causal. Plants with relative
+    degree or non-minimum-phase zeros have directions that cannot be inverted
+    (`PSEUDO_INVERSE_TOLERANCE`).
 
     Raises
     ------
@@ -67,12 +62,12 @@ def lifted_optimum(members: LiftedSet, tolerance: float = PSEUDO_INVERSE_TOLERAN
         If the plants cancel each other: B is zero.
     """
     u, sigma, vt = np.linalg.svd(members.mean, full_matrices=False)
-    if sigma[0] <= tolerance * np.sqrt(np.trace(members.gram)):
+    if sigma[0] <= PSEUDO_INVERSE_TOLERANCE * np.sqrt(np.trace(members.gram)):
         raise DesignError(
             "the plants of the set cancel each other (their mean is zero), so no nominal model is "
             "better than none: check their signs"
         )
-    kept = sigma > tolerance * sigma[0]
+    kept = sigma > PSEUDO_INVERSE_TOLERANCE * sigma[0]
     return np.asarray(
         u[:, kept] @ ((vt[kept] @ members.gram) / sigma[kept, None]), dtype=np.float64
     )

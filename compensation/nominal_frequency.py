@@ -279,21 +279,7 @@ def robust_response(
             f"all plants are silent at frequency {int(np.argmax(silent))} of the grid"
         )
     shares = checked_weights(np.full(len(g), 1.0 / len(g)) if weights is None else weights, len(g))
-    if distribution == "sampled":
-        first, second = shares @ g, shares @ np.abs(g) ** 2
-    else:
-        region = Region.of(g)
-        if distribution == "uniform":
-            r = _uniform_mean(region.r_span, _moments_of_r)
-            turn = _uniform_mean(region.theta_span, _turn)[0]
-        elif distribution == "kernel":
-            r = _kernel_mean(region.r, shares, region.r_span, r_bandwidth, _moments_of_r)
-            turn = _kernel_mean(region.theta, shares, region.theta_span, theta_bandwidth, _turn)[0]
-        else:
-            raise DesignError(
-                f"no distribution is called {distribution!r}; there are sampled, uniform, kernel"
-            )
-        first, second = r[1] / r[0] * turn, (r[2] / r[0]).real
+    first, second = _moments(g, shares, distribution, r_bandwidth, theta_bandwidth)
     tracked = np.abs(first) ** 2 / second
     if tracked.min() < _LEAST_TRACKED:
         raise DesignError(
@@ -305,15 +291,36 @@ def robust_response(
     return np.asarray(second / first.conj(), np.complex128), np.asarray(tracked, np.float64)
 
 
+def _moments(
+    g: Responses,
+    shares: Array,
+    distribution: Distribution,
+    r_bandwidth: ArrayLike | None,
+    theta_bandwidth: ArrayLike | None,
+) -> tuple[Responses, Array]:
+    """Return the means of G and of |G|^2 over a distribution, each of shape (f,)."""
+    if distribution == "sampled":
+        return shares @ g, shares @ np.abs(g) ** 2
+    region = Region.of(g)
+    if distribution == "uniform":
+        r = _uniform_mean(region.r_span, _moments_of_r)
+        turn = _uniform_mean(region.theta_span, _turn)[0]
+    elif distribution == "kernel":
+        r = _kernel_mean(region.r, shares, region.r_span, r_bandwidth, _moments_of_r)
+        turn = _kernel_mean(region.theta, shares, region.theta_span, theta_bandwidth, _turn)[0]
+    else:
+        raise DesignError(
+            f"no distribution is called {distribution!r}; there are sampled, uniform, kernel"
+        )
+    return r[1] / r[0] * turn, (r[2] / r[0]).real
+
+
 def robust_nominal(
     plants: Sequence[DiscretePlant] | ArrayLike,
-    weights: ArrayLike | None = None,
-    distribution: Distribution = "kernel",
     *,
+    distribution: Distribution = "kernel",
     points: int = 4096,
     dt_s: float | None = None,
-    r_bandwidth: ArrayLike | None = None,
-    theta_bandwidth: ArrayLike | None = None,
 ) -> FrequencyNominal:
     """Make the robust nominal model of a set of plants or of measured responses.
 
@@ -321,7 +328,7 @@ def robust_nominal(
     ----------
     plants : sequence of DiscretePlant, or array_like, shape (l, points / 2 + 1)
         Responses from 0 Hz to the Nyquist frequency; see `extended_response` for measured ones.
-    weights, distribution, r_bandwidth, theta_bandwidth
+    distribution : str
         See `robust_response`.
     points : int
         Length of the two-sided impulse response, even; longer than the plants ring.
@@ -347,13 +354,7 @@ def robust_nominal(
                 f"(plants, {points // 2 + 1}) and the sampling time"
             )
         f_hz = _grid(points, dt_s)
-    response, tracked = robust_response(
-        responses,
-        weights,
-        distribution,
-        r_bandwidth=r_bandwidth,
-        theta_bandwidth=theta_bandwidth,
-    )
+    response, tracked = robust_response(responses, distribution=distribution)
     # A real filter answers 0 Hz and the Nyquist frequency with real numbers.
     response[[0, -1]] = response[[0, -1]].real
     h = np.fft.irfft(response, points)

@@ -335,13 +335,26 @@ class PreviewAxis:
         targets_mm : ndarray, shape (members, n), optional
             What each member shall do; by default the path.
         """
-        design, drive = self._designs.design(rung), self._drive(rung, task, targets_mm)
-        n, window, update = len(task.path_mm), self.window, self.update
-        windows = len(drive.command)
+        drive = self._drive(rung, task, targets_mm)
         self._move_origin(float(task.path_mm[0]))
-        origin = self._origin
-        bounds = task.bounds.seen_from(origin)
-        alone = np.zeros(windows, bool)
+        u, last_states = self._solved(rung, task, careful, drive)
+        # The windows run on past the end of the path, where the command stands.
+        n, origin, end_mm = len(task.path_mm), self._origin, float(task.path_mm[-1])
+        u[n - 1] = end_mm - origin
+        states = self._advanced(last_states, u[len(u) - self.update : n - 1])
+        # Off the rounding by which a bounded solution may miss the end of the travel.
+        u += origin
+        position = _snapped(u[:n], task.bounds)
+        position[-1] = end_mm
+        return AxisCommand(position, states - self._resting(end_mm - origin))
+
+    def _solved(
+        self, rung: int, task: AxisTask, careful: Set[int], drive: _Drive
+    ) -> tuple[Array, Array]:
+        """Return the command of all windows, and the states where the last one begins."""
+        design, window, update = self._designs.design(rung), self.window, self.update
+        bounds = task.bounds.seen_from(self._origin)
+        alone = np.zeros(len(drive.command), bool)
         alone[list(careful)] = True
         lifted = self._designs.lifted
         functions = functions_of(design, at_rests=False)
@@ -355,6 +368,7 @@ class PreviewAxis:
             drive.state,
         )
 
+        windows = len(drive.command)
         u = np.empty(windows * update)
         z, w = np.append(self._states, [0.0, 0.0]), 0
         for until in (windows - 1, windows):
@@ -390,15 +404,7 @@ class PreviewAxis:
                 drive.memory.committed[w] = committed
                 advance_window(lifted.advance, design.state_drive, z, committed)
                 w += 1
-        # The windows run on past the end of the path, where the command stands.
-        end_mm = float(task.path_mm[-1])
-        u[n - 1] = end_mm - origin
-        states = self._advanced(last_states, u[(windows - 1) * update : n - 1])
-        # Off the rounding by which a bounded solution may miss the end of the travel.
-        u += origin
-        position = _snapped(u[:n], task.bounds)
-        position[-1] = end_mm
-        return AxisCommand(position, states - self._resting(end_mm - origin))
+        return u, last_states
 
     def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
         """Return what a rung makes of a piece; the last one again for the same piece and rung.

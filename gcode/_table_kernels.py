@@ -168,7 +168,6 @@ class Tables(NamedTuple):
 
 
 _KEPT = 8
-_FNV_OFFSET = 1469598103934665603
 _FNV_PRIME = 1099511628211
 _HASH_PRIME, _ONE, _29 = np.uint64(0x9E3779B97F4A7C15), np.uint64(1), np.uint64(29)
 

@@ -31,6 +31,7 @@ _IGNORED = frozenset(
 )
 _MOTION = frozenset({"G0", "G1", "G2", "G3", "G92"})
 _MOST_MOVES = 1_000_000
+_MOST_SAMPLES = 5_000_000
 _COMMENT = re.compile(r"\([^)]*(?:\)|$)")
 _CODES = re.compile(r"(?<![A-Z_])([GM]) *0*(\d+)")
 
@@ -130,15 +131,13 @@ def read_hatches(text: str) -> Hatches:
     return reader.hatches()
 
 
-def sample_hatches(
-    hatches: Hatches, dt_s: float, timing: Timing, most_samples: int = 5_000_000
-) -> ScanSamples:
+def sample_hatches(hatches: Hatches, dt_s: float, timing: Timing) -> ScanSamples:
     """Return the path at constant speed along every move, sampled every `dt_s`.
 
     Raises
     ------
     GcodeError
-        If there would be more than `most_samples`.
+        If there would be more than five million.
     """
     lengths = np.hypot(*(hatches.end_mm - hatches.start_mm).T)
     jumps = ~hatches.beam
@@ -151,10 +150,10 @@ def sample_hatches(
     standing = hatches.dwell_s + np.where(jumps & (lengths > 0), timing.settle_s, 0.0)
     ends = timing.lead_s + np.cumsum(moving + standing)
     count = int((ends[-1] + timing.lead_s) / dt_s) + 1
-    if count > most_samples:
+    if count > _MOST_SAMPLES:
         raise GcodeError(
             f"the scan takes {ends[-1]:.4g} s, {count} samples at {1 / dt_s:g} Hz; up to "
-            f"{most_samples} are computed at once: give one layer, or a part of it"
+            f"{_MOST_SAMPLES} are computed at once: give one layer, or a part of it"
         )
     t: Array = np.arange(count, dtype=np.float64) * dt_s
     starts = ends - standing - moving

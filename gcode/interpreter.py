@@ -9,7 +9,6 @@ and after them the event that stops the machine.
 from __future__ import annotations
 
 import copy
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,13 @@ from numpy.typing import NDArray
 from stillpath.gcode import _slots as at
 from stillpath.gcode._command_kernels import execute
 from stillpath.gcode._lex_kernels import PADDING, run
+from stillpath.gcode.comments import note_comment
 from stillpath.gcode.dialect import Action, Dialect
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.dialects import dialect_of
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.lexer import Command, split_line
 from stillpath.gcode.meta import META_WORDS, held_back, meta_command
-from stillpath.gcode.slicers.marks import MarkKind, read_mark
 from stillpath.gcode.state import MachineState, nobody
 from stillpath.gcode.types import KEPT, EventKind, Events, Limits, ModalState, Moves, ProgramBlock
 from stillpath.models.machine import Machine
@@ -80,7 +79,6 @@ class Interpreter:
         self._carried = 0
         self._offset = 0
         self._first_move = 0
-        self._layer_style: str | None = None
         self._text = b""
 
     @property
@@ -267,7 +265,7 @@ class Interpreter:
         text = raw.decode("utf-8", "replace")
         if text.startswith(";"):
             state.span = int(i[at.I_POS]), int(i[at.I_END]) - text.endswith("\n")
-            return self._comment(Command("", {}, text))
+            return note_comment(state, Command("", {}, text))
         if len(text) > _LONGEST_COMMAND and len(text.split(";", 1)[0]) > _LONGEST_COMMAND:
             raise GcodeError(
                 f"the command has more than {_LONGEST_COMMAND} characters; is this G-code?",
@@ -282,7 +280,7 @@ class Interpreter:
             return self._several(commands)
         (command,) = commands
         if not command.name and not (command.words and self.dialect.modal_words):
-            return self._comment(command)
+            return note_comment(state, command)
         return self._command(command)
 
     def _split(self, text: str) -> list[Command]:
@@ -396,58 +394,6 @@ class Interpreter:
             i[at.I_KNOWN] = known
         return at.OK
 
-    def _comment(self, command: Command) -> int:
-        """Take note of a slicer's mark, and remember it for the kernel."""
-        state, i, text = self.state, self.state.i, command.text
-        found = text.find(";")
-        mark = read_mark(text[found:]) if found >= 0 else None
-        kind = None if mark is None else mark.kind
-        if mark is None or kind is None:
-            state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
-        elif kind == MarkKind.STAMP:
-            # What is read back has thousands of lines of ours.
-            state.remember(command, at.MEMO_EVENT, int(EventKind.STAMP))
-            return state.event(EventKind.STAMP)
-        elif kind in (MarkKind.OFF, MarkKind.ON):
-            state.settle()
-            i[at.I_KEPT] = KEPT if kind == MarkKind.OFF else 0
-        elif kind == MarkKind.LAYER:
-            style = text[found : found + 7]
-            self._layer_style = self._layer_style or style
-            if style == self._layer_style and not self._same_height(mark.text):
-                state.settle()
-                i[at.I_LAYER] += 1
-                self._note_height(mark.text)
-                if not mark.text:
-                    state.remember(command, at.MEMO_LAYER, 0)
-            elif not mark.text:
-                state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
-        elif kind == MarkKind.Z:
-            self._note_height(mark.text)
-        elif kind == MarkKind.FEATURE:
-            number = state.features.number(mark.text)
-            state.settle()
-            i[at.I_FEATURE] = number
-            state.remember(command, at.MEMO_FEATURE, number + 1)
-        elif kind == MarkKind.OBJECT:
-            number = state.objects.number(mark.text)
-            state.settle()
-            i[at.I_OBJECT] = number
-            state.remember(command, at.MEMO_OBJECT, number + 1)
-        else:
-            state.remember(command, at.MEMO_EVENT, int(EventKind.HARMLESS))
-        return state.event(EventKind.HARMLESS)
-
-    def _same_height(self, text: str) -> bool:
-        """Tell whether a layer mark that names its height is the next object's of that layer."""
-        layer = int(self.state.i[at.I_LAYER])
-        return bool(text and layer >= 0 and self.state.tables.layer_z[layer] == _height(text))
-
-    def _note_height(self, text: str) -> None:
-        layer = int(self.state.i[at.I_LAYER])
-        if layer >= 0 and text:
-            self.state.tables.layer_z[layer] = _height(text)
-
     def _failed(self, status: int) -> int:
         """Raise what is wrong with the line in hand, unless the firmware passes it over."""
         state, i, f = self.state, self.state.i, self.state.f
@@ -513,10 +459,3 @@ def _skipped(raw: bytes) -> int:
 
 
 _BLANK_OR_DIGIT = frozenset(bytes([c]) for c in b" 0123456789")
-
-
-def _height(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan

@@ -31,8 +31,6 @@ def plan_moves(
     GcodeError
         For a move that the firmware refuses, or that takes more than 20 minutes.
     """
-    planner = adapter(machine).planner(rests_apart=rests_apart)
-    planner.queue_moves(moves, limits)
-    phases = planner.flush()
+    phases = adapter(machine).planner(rests_apart=rests_apart).plan_whole(moves, limits)
     check_moves_end(phases, lambda index: int(moves.line[index]))
     return phases

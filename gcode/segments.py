@@ -42,6 +42,8 @@ E_TOLERANCE_MM = 3e-4
 END_SPEED_MM_S = 8.0
 """A stretch does not crawl into a Z move slower than this: the Z move would start as slowly."""
 END_EXCESS_MM = 1.5e-3
+SHORTEST_S = 0.5e-3
+"""Samples nearer than this to the start of a stretch are not ends of segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,6 @@ def fit_segments(
     *,
     step_mm_s: float = np.inf,
     grid_mm: float = 1e-3,
-    minimum_s: float = 0.5e-3,
 ) -> Segments:
     """Fit the stretches of a piece.
 
@@ -134,17 +135,9 @@ def fit_segments(
         Segments are cut short where the speed of an axis would step by more.
     grid_mm : float
         X and Y of all vertices but the last of a stretch are multiples of this.
-    minimum_s : float
-        Samples nearer than this to the start of a stretch are not ends of segments.
     """
-    dt = timeline.dt_s
     # A vertex on a coarse grid (a motor's whole steps) lies up to half of it beside its place.
     slack_mm = max(0.5 * (grid_mm - tolerance_mm), 0.0)
-    capacity = command_mm.shape[1] + len(timeline.groups)
-    end_s, end_mm = np.empty(capacity), np.empty((4, capacity))
-    groups = np.empty(capacity, dtype=np.int64)
-    direction = np.empty((2, command_mm.shape[1]))
-    path_directions(timeline.position_mm[:2], direction)
     bounds = Bounds(
         along_mm=ALONG_SHARE * error_filter.share * tolerance_mm + slack_mm,
         across_mm=error_filter.share * across_tolerance_mm(tolerance_mm) + slack_mm,
@@ -153,47 +146,87 @@ def fit_segments(
         e_mm=E_TOLERANCE_MM,
         step_mm_s=step_mm_s,
     )
-    states, errors = np.zeros_like(error_filter.answers.pole), np.empty(LONGEST)
-    count = 0
+    fit = _Fit(timeline, command_mm, error_filter, bounds, grid_mm)
+    samples = command_mm.shape[1]
     for i, group in enumerate(timeline.groups):
-        start = timeline.end_s[i - 1] if i else 0.0
         if group.rest:
-            resting = timeline.end_s[i] - timeline.start_s[i]
-            rest_errors(error_filter.answers.pole, states, round(resting / dt))
+            fit.rest(timeline.end_s[i] - timeline.start_s[i])
             continue
-        last = round(timeline.end_s[i] / dt)
+        start_s = timeline.end_s[i - 1] if i else 0.0
+        last = round(timeline.end_s[i] / timeline.dt_s)
         if i == len(timeline.groups) - 1:
-            last = command_mm.shape[1] - 1
-        first = min(int(np.ceil((start + minimum_s) / dt)), last)
-        before = int(np.floor(start / dt + 1e-6))
+            last = samples - 1
+        first = min(int(np.ceil((start_s + SHORTEST_S) / timeline.dt_s)), last)
+        fit.stretch(i, start_s, first, last, tolerance_mm + END_EXCESS_MM)
+    return fit.segments()
+
+
+class _Fit:
+    """The segments of a piece so far, and the machine's errors at their end."""
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        command_mm: NDArray[np.float64],
+        error_filter: ErrorFilter,
+        bounds: Bounds,
+        grid_mm: float,
+    ) -> None:
+        self._timeline, self._command_mm, self._bounds = timeline, command_mm, bounds
+        self._filter, self._grid_mm = error_filter, grid_mm
+        capacity = command_mm.shape[1] + len(timeline.groups)
+        self._end_s, self._end_mm = np.empty(capacity), np.empty((4, capacity))
+        self._groups = np.empty(capacity, dtype=np.int64)
+        self._direction = np.empty((2, command_mm.shape[1]))
+        path_directions(timeline.position_mm[:2], self._direction)
+        self._states = np.zeros_like(error_filter.answers.pole)
+        self._errors = np.empty(LONGEST)
+        self._count = 0
+
+    def rest(self, duration_s: float) -> None:
+        """Let errors die down."""
+        samples = round(duration_s / self._timeline.dt_s)
+        rest_errors(self._filter.answers.pole, self._states, samples)
+
+    def stretch(self, i: int, start_s: float, first: int, last: int, crawl_mm: float) -> None:
+        """Fit group i, which begins at `start_s`, with ends at samples `first` to `last`.
+
+        Before a Z move the last segment may miss the command by `crawl_mm`.
+        """
+        timeline, command_mm, count = self._timeline, self._command_mm, self._count
+        before = int(np.floor(start_s / timeline.dt_s + 1e-6))
         # Z and E moved in the rest before; X and Y stand where the command left them.
         begin = np.concatenate([command_mm[:2, before], timeline.group_start_mm[i, 2:]])
         n = fit_stretch(
             command_mm,
-            direction,
-            bounds,
-            grid_mm,
-            dt,
-            start,
+            self._direction,
+            self._bounds,
+            self._grid_mm,
+            timeline.dt_s,
+            start_s,
             first,
             last,
             begin,
             bool(np.all(command_mm[2, first : last + 1] == begin[2])),
-            error_filter.answers,
-            states,
-            errors,
+            self._filter.answers,
+            self._states,
+            self._errors,
             count,
-            end_s,
-            end_mm,
+            self._end_s,
+            self._end_mm,
         )
-        if group.before_z:
-            allowed = tolerance_mm + END_EXCESS_MM
-            n = _merge_crawl(end_s[count:], end_mm[:, count:], n, command_mm, dt, allowed)
-        groups[count : count + n] = i
-        count += n
-    return Segments(
-        end_s[:count].copy(), end_mm[:, :count].copy(), groups[:count].copy(), error_filter
-    )
+        if timeline.groups[i].before_z:
+            end_s, end_mm = self._end_s[count:], self._end_mm[:, count:]
+            n = _merge_crawl(end_s, end_mm, n, command_mm, timeline.dt_s, crawl_mm)
+        self._groups[count : count + n] = i
+        self._count += n
+
+    def segments(self) -> Segments:
+        """Return what was fitted."""
+        end_s, end_mm, groups = (
+            a[..., : self._count] for a in (self._end_s, self._end_mm, self._groups)
+        )
+        return Segments(end_s.copy(), end_mm.copy(), groups.copy(), self._filter)
 
 
 def _merge_crawl(

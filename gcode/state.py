@@ -107,6 +107,7 @@ class MachineState:
         self.tool_known = dialect.tool_at_start
         self.conditional_indent = -1
         self.warnings: dict[str, int] = {}
+        self.layer_style: str | None = None
         self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
@@ -120,29 +121,12 @@ class MachineState:
         if len(row) > at.MAX_LIMITS:
             raise ValueError(f"{len(row)} limits, more than {at.MAX_LIMITS}")
         self.rows = Rows.empty(0)
-        self.tables = Tables(
-            *_new_table(len(row), _FIRST_ROWS),
-            *_new_table(at.MODAL_SIZE, _FIRST_ROWS),
-            np.zeros(_MEMOS, np.int64),
-            np.zeros(_MEMOS, np.int64),
-            np.full((_MEMOS // 2, len(row)), np.nan),
-            np.full((_MEMOS // 2, 2), -1, np.int32),
-            dialect.table("G"),
-            dialect.table("M"),
-            np.full(_LAYERS, np.nan),
-        )
+        self.tables = _new_tables(len(row), dialect)
         f[at.F_SPEED] = dialect.start_speed_mm_s
         f[at.F_SPEED_FACTOR] = 1.0 / 60.0
         f[at.F_EXTRUDE_FACTOR] = f[at.F_UNIT_MM] = f[at.F_UNIT_E_MM] = 1.0
         f[at.F_LIMITS : at.F_LIMITS + len(row)] = row
-        f[at.F_ARC_MM] = self.firmware.arc_resolution_mm
-        if isinstance(self.firmware, Marlin):
-            f[at.F_ARC_LEAST_MM] = self.firmware.min_arc_segment_mm
-            f[at.F_ARC_PER_CIRCLE] = self.firmware.min_circle_segments
-        elif isinstance(self.firmware, RepRapFirmware):
-            f[at.F_ARC_LEAST_MM] = self.firmware.arc_least_mm
-            f[at.F_ARC_PER_S] = self.firmware.arc_segments_per_s
-            f[at.F_ARC_DEVIATION_MM] = self.firmware.arc_deviation_mm
+        _set_arcs(f, self.firmware)
         for k, axis in enumerate("xyz"):
             f[at.F_LOW + k] = machine.travel[axis].min_mm  # type: ignore[index]
             f[at.F_HIGH + k] = machine.travel[axis].max_mm  # type: ignore[index]
@@ -398,6 +382,32 @@ class Names:
 def nobody(command: Command) -> int:
     """Carry out commands while nothing is read: there are none."""
     raise RuntimeError(f"nobody carries out {command.name}")
+
+
+def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:
+    """Set how finely the firmware cuts arcs."""
+    f[at.F_ARC_MM] = firmware.arc_resolution_mm
+    if isinstance(firmware, Marlin):
+        f[at.F_ARC_LEAST_MM] = firmware.min_arc_segment_mm
+        f[at.F_ARC_PER_CIRCLE] = firmware.min_circle_segments
+    elif isinstance(firmware, RepRapFirmware):
+        f[at.F_ARC_LEAST_MM] = firmware.arc_least_mm
+        f[at.F_ARC_PER_S] = firmware.arc_segments_per_s
+        f[at.F_ARC_DEVIATION_MM] = firmware.arc_deviation_mm
+
+
+def _new_tables(limits: int, dialect: Dialect) -> Tables:
+    return Tables(
+        *_new_table(limits, _FIRST_ROWS),
+        *_new_table(at.MODAL_SIZE, _FIRST_ROWS),
+        np.zeros(_MEMOS, np.int64),
+        np.zeros(_MEMOS, np.int64),
+        np.full((_MEMOS // 2, limits), np.nan),
+        np.full((_MEMOS // 2, 2), -1, np.int32),
+        dialect.table("G"),
+        dialect.table("M"),
+        np.full(_LAYERS, np.nan),
+    )
 
 
 def _new_table(columns: int, rows: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:

@@ -120,7 +120,36 @@ def build_timeline(
         Standing time after the last group, at most which the command may take to settle.
     """
     duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    row_start = np.empty(len(phases))
+    start, end, row_start, rests = _laid(groups, duration, rest_s, dt_s, lead_s, tail_s)
+    samples = int(np.ceil(end[-1] / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
+    moved = replace(phases, t_s=row_start)
+    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+    until = np.where(xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
+    position, row, moving = sample_until(moved, (0.0, dt_s, samples), until)
+    return Timeline(
+        dt_s=dt_s,
+        position_mm=position,
+        row=row,
+        moving=moving,
+        rests=np.array(rests, dtype=np.int64).reshape(-1, 2),
+        groups=groups,
+        start_s=start,
+        end_s=end,
+        group_start_mm=phases.start_mm[[group.first for group in groups]],
+        row_start_s=row_start,
+    )
+
+
+def _laid(
+    groups: list[Group],
+    duration: NDArray[np.float64],
+    rest_s: NDArray[np.float64],
+    dt_s: float,
+    lead_s: float,
+    tail_s: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], list[tuple[int, int]]]:
+    """Return start and end of the groups, the start of the rows, and the samples of the rests."""
+    row_start = np.empty(len(duration))
     start, end = np.empty(len(groups)), np.empty(len(groups))
     rests: list[tuple[int, int]] = []
     now = 0.0
@@ -144,20 +173,4 @@ def build_timeline(
             # However short: a stretch has a sample of its own after the rest.
             now = max(now, dt_s * (rests[-1][1] if rests else 1))
             end[i] = now
-    samples = int(np.ceil(now / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
-    moved = replace(phases, t_s=row_start)
-    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
-    until = np.where(xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
-    position, row, moving = sample_until(moved, (0.0, dt_s, samples), until)
-    return Timeline(
-        dt_s=dt_s,
-        position_mm=position,
-        row=row,
-        moving=moving,
-        rests=np.array(rests, dtype=np.int64).reshape(-1, 2),
-        groups=groups,
-        start_s=start,
-        end_s=end,
-        group_start_mm=phases.start_mm[[group.first for group in groups]],
-        row_start_s=row_start,
-    )
+    return start, end, row_start, rests

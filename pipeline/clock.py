@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterator
 from typing import TypeVar
 
+from stillpath.pipeline.result import StageTime
+
 __all__ = ["StageClock"]
 
 T = TypeVar("T")
@@ -32,6 +34,10 @@ class StageClock:
             yield
         finally:
             self.cpu_s[name] = self.cpu_s.get(name, 0.0) + time.process_time() - start
+
+    def stages(self) -> list[StageTime]:
+        """Return the stages for a result."""
+        return [StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self.cpu_s.items()]
 
     def each(self, name: str, items: Iterator[T]) -> Iterator[T]:
         """Yield items, and count what it takes to come by each of them."""

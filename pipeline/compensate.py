@@ -40,15 +40,14 @@ def compensate_file(
     layers: Path | None = None,
     trace: Callable[[Trace], None] | None = None,
 ) -> Result:
-    """Compensate a print file.
+    """Compensate a print file; the figures are measured on the written file.
 
     Parameters
     ----------
     source, target : Path
         Plain or binary G-code or a 3MF package; the target is of the same kind, or plain if its
-        name says so and the source's does not; with method `live` it is a copy. It is written next
-        to itself, under another name, and renamed when it is complete; the source is only read.
-        They may be the same file.
+        name says so and the source's does not; with method `live` it is a copy. It is renamed when
+        it is complete; the source is only read. They may be the same file.
     machine : Machine
     options : Options
     cache_dir : Path, optional
@@ -60,11 +59,6 @@ def compensate_file(
     trace : callable, optional
         Is given the motion as it is measured; once more from its first sample where the last check
         has a piece reverted.
-
-    Returns
-    -------
-    Result
-        Figures measured on the written file.
 
     Raises
     ------
@@ -91,15 +85,27 @@ def compensate_file(
         return advise_file(source, target, machine, options, **how, layers=layers)
     # First, as the target may be the source.
     live = predict_live(source, machine, options, **how) if options.compare_live else None
-    opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
+    order = Order(machine, options, cache_dir, progress)
+    result = _rewrite(source, target, order, layers, trace)
+    return result if live is None else live.beside(result)
+
+
+def _rewrite(
+    source: Path,
+    target: Path,
+    order: Order,
+    layers: Path | None,
+    trace: Callable[[Trace], None] | None,
+) -> Result:
+    """Put a compensated file in its place."""
+    plate, progress = order.options.plate, order.progress
+    opened = file_rewriting(source, target, plate=plate, layers=layers, progress=progress)
     with opened as file:
-        order = Order(machine, options, cache_dir, progress)
         job, result = _final_job(file, order, source.name, trace)
         job.deliver(file.text)
-        if options.times == "new":
+        if order.options.times == "new":
             file.container.delay(job.delay_s)
-    result = result.model_copy(update=file.sizes)
-    return result if live is None else live.beside(result)
+    return result.model_copy(update=file.sizes)
 
 
 def _final_job(

@@ -279,7 +279,7 @@ class FileMotion:
         *,
         longest_stand_s: float = np.inf,
     ) -> None:
-        self._source, self._plate, self._machine = source, plate, machine
+        self.source, self.machine, self._plate = source, machine, plate
         self._dialect = dialect_for(machine, dialect)
         self._asked = dialect
         self._dt_s, self._longest_stand_s = dt_s, longest_stand_s
@@ -292,12 +292,12 @@ class FileMotion:
 
     def __iter__(self) -> Iterator[MotionPart]:
         unpacking = progress_to(self._progress, "unpacking", 0.0)
-        with open_text(self._source, plate=self._plate, progress=unpacking) as container:
+        with open_text(self.source, plate=self._plate, progress=unpacking) as container:
             self.facts = container.facts()
-            doubtful = doubts(container.text, self._machine, self._asked)
+            doubtful = doubts(container.text, self.machine, self._asked)
             motion = TextMotion(
                 container.text,
-                self._machine,
+                self.machine,
                 self._dialect,
                 self._dt_s,
                 longest_stand_s=self._longest_stand_s,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import io
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -19,13 +19,12 @@ import numpy as np
 
 from stillpath.compensation.base import DesignError
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.planning import intended, join_phases
+from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
-from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
+from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
-from stillpath.gcode.sampler import sample_phases, sample_until
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.gcode.slicers.retiming import Retiming
 from stillpath.gcode.splitter import Splitter
@@ -34,14 +33,14 @@ from stillpath.models.errors import ModelError
 from stillpath.pipeline.caution import caution_for
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.endless import LengthGuard
-from stillpath.pipeline.file_motion import STANDING_S
 from stillpath.pipeline.files import Discarding, default_cache_dir
 from stillpath.pipeline.last_check.comparing import LastCheck
 from stillpath.pipeline.measuring.layer_files import LayerWriter
-from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.measure import Measurement, channel_names
 from stillpath.pipeline.measuring.points import MotionSamples, part_of
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.measuring.tracing import Trace
+from stillpath.pipeline.motion_record import MotionRecord
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options, stamp
 from stillpath.pipeline.order import Order
@@ -54,7 +53,6 @@ from stillpath.pipeline.piece_compensator import (
     CompensatedPiece,
     PieceCompensator,
     Unfit,
-    as_executed,
     deviation,
 )
 from stillpath.pipeline.progress import ProgressReports
@@ -70,8 +68,6 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 __all__ = ["Attempt", "Job"]
-
-_CHUNK = 1 << 17
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
 """What says of itself why a piece cannot be compensated."""
@@ -114,7 +110,6 @@ class Job:
         self._clock = StageClock()
         self._changes = options.method != "none"
         self._adapter = adapter(machine)
-        self._rounds = max(self._adapter.step_mm[:2]) > 0.0
         if self._changes and self._adapter.refusal is not None:
             raise ModelError(f"{machine.name} cannot execute this file: {self._adapter.refusal}")
         self._design(order.cache_dir or default_cache_dir())
@@ -128,12 +123,15 @@ class Job:
         self._budget = budget
         self._pairs: BudgetMeasurement | None = None
         self._measurement = self._measuring(trace)
+        self._sum = Totals()
+        changing = None
         if self._changes:
             self._verifier = Verifier(machine, options.tolerance_um)
             self._writer = StreamWriter(self._adapter, stamp(machine, options))
+            changing = self._work.compensator, self._verifier
+        self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, changing)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
-        self._sum = Totals()
         self._sum.warnings += doubts(source, machine, options.dialect)
         if options.budget_um is not None and not self._changes:
             self._sum.warnings.append("The method none changes nothing: the budget was not used.")
@@ -165,14 +163,9 @@ class Job:
                 self._machine, DT_S, self._shaper, take_layer=take_layer, trace=trace, size=size
             )
             return self._pairs
+        names = channel_names(compensated=True)
         return Measurement(
-            self._machine,
-            DT_S,
-            self._shaper,
-            compensated=True,
-            take_layer=take_layer,
-            trace=trace,
-            size=size,
+            self._machine, DT_S, self._shaper, names, take_layer=take_layer, trace=trace, size=size
         )
 
     @staticmethod
@@ -221,7 +214,7 @@ class Job:
             raise GcodeError("the file contains no moves; is it G-code with LF line ends?")
         if self._changes:
             text = self._writer.end(self._sum.newline, self._checker.extruder_mm)
-            self._wait(switching_s(self._checker.push(text)))
+            self._motion.wait(switching_s(self._checker.push(text)))
             self._emit(text)
         self._measurement.finish()
         if self._layers is not None:
@@ -289,10 +282,7 @@ class Job:
                 next(self._budget.paced(piece))  # which counts it
             self._put_back(piece, original_s, refusal)
             return
-        if self._sum.jumped:
-            # Homed, say: the machine did not come here along the path.
-            self._work.compensator.reset(self._asked(piece, piece.phases).start_mm[0, :2])
-            self._sum.jumped = False
+        self._motion.begin(piece)
         switched_s = self._switched_off_s()
         for paced in (
             self._clock.each("plan", self._budget.paced(piece)) if self._budget else (piece,)
@@ -314,7 +304,13 @@ class Job:
         self._sum.add_piece(attempt.made, attempt.executed, attempt.gap_mm)
         with self._clock.stage("measure"):
             # The last sample of an item is the first one of the next.
-            self._measure_piece(piece, part_of(attempt.motion, 0, len(attempt.motion) - 1))
+            written = part_of(attempt.motion, 0, len(attempt.motion) - 1)
+            if self._budget is None or self._pairs is None:
+                self._measurement.add(written)
+            else:
+                classes = self._budget.classes(piece.moves)
+                self._pairs.add_pair(written, self._motion.as_sliced(piece), classes)
+                self._budget.correct(self._pairs.sums())
         late_s = attempt.made.encoded.row_start_s - (piece.phases.t_s - piece.phases.t_s[0])
         self._emit(attempt.text, piece, np.append(delay_s + late_s, self.delay_s))
 
@@ -326,7 +322,7 @@ class Job:
         lines = self._writer.switching_off
         seconds = switching_s(self._checker.snapshot().push(lines)) if lines else 0.0
         if seconds > 0.0:
-            self._wait(seconds)
+            self._motion.wait(seconds)
         return seconds
 
     def _attempt(self, piece: Piece, paced: Piece) -> Attempt:
@@ -349,7 +345,7 @@ class Job:
                 gap_mm = deviation(made, executed)
                 self._verifier.check_motion(piece, made, gap_mm, executed)
             with self._clock.stage("measure"):
-                motion = self._motion(piece, paced, made, executed)
+                motion = self._motion.as_written(piece, paced, made, executed)
                 if self._budget is None:
                     self._verifier.check_gain(motion, self._point)
         except _FAULTS as error:
@@ -363,30 +359,6 @@ class Job:
                 f"{error}); please report it with the file"
             ) from error
         return Attempt(made, executed, gap_mm, text, motion)
-
-    def _motion(
-        self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
-    ) -> MotionSamples:
-        """Planned and executed motion of a piece on one grid of real time."""
-        asked = self._asked(paced, paced.phases)
-        planned, position, row, extruding = as_executed(made, asked, executed)
-        came = planned
-        if self._rounds:
-            moved = replace(paced.phases, t_s=made.encoded.row_start_s)
-            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
-        return self._samples(piece, row, planned, position, extruding, came)
-
-    def _measure_piece(self, piece: Piece, written: MotionSamples) -> None:
-        if self._budget is None or self._pairs is None:
-            self._measurement.add(written)
-            return
-        phases = piece.phases
-        grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
-        path, row = sample_phases(self._asked(piece, phases), grid)
-        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
-        sliced = self._samples(piece, row, path, came, feeding(phases)[row], came)
-        self._pairs.add_pair(written, sliced, self._budget.classes(piece.moves))
-        self._budget.correct(self._pairs.sums())
 
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece stay as sliced."""
@@ -415,7 +387,7 @@ class Job:
             with self._clock.stage("read back"):
                 blocks = self._checker.push(text)
             # Lines of ours make it stand too, or its own longer than they did.
-            self._wait(switching_s(blocks) - switching_s([verbatim]))
+            self._motion.wait(switching_s(blocks) - switching_s([verbatim]))
         self._emit(text, verbatim, self.delay_s)
         self._sum.moves += len(verbatim.moves)
         self._sum.newline = verbatim.text.endswith(b"\n") if verbatim.text else self._sum.newline
@@ -427,100 +399,12 @@ class Job:
             self._budget.passed(seconds)
         with self._clock.stage("measure"):
             for part in parts:
-                if part is None:
-                    self._measurement.jump()
-                    self._observe(None)
-                elif isinstance(part, Phases):
-                    self._measure_verbatim(verbatim, part)
-                else:
-                    self._stand(part)
+                self._motion.pass_by(verbatim, part)
 
     def _check_end(self, item: VerbatimPart, seconds: float) -> None:
         lines: Moves | Events = item.moves if len(item.moves) else item.events
         if len(lines):
             self._length.check(self._sum.original_s + seconds, int(lines.line[-1]))
-
-    def _measure_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
-        duration = phases.accel_s + phases.cruise_s + phases.decel_s
-        motion_s = phases.duration_s
-        self._sum.original_s += motion_s
-        self._sum.time_s += motion_s
-        feeds = feeding(phases)
-        extruding_s = float(np.sum(duration[feeds]))
-        self._sum.extruding_s += extruding_s
-        if isinstance(verbatim, LeftOut):
-            self._sum.left_out_s += motion_s
-            self._sum.left_out_extruding_s += extruding_s
-        else:
-            self._sum.passed_motion_s += motion_s
-        if np.any(feeds) and not isinstance(verbatim, LeftOut):
-            self._sum.passed_s += extruding_s
-            first = phases.move_index[int(np.argmax(feeds))]
-            self._sum.passed_line = self._sum.passed_line or int(verbatim.moves.line[first])
-        until = np.where(feeds, phases.t_s + duration, -np.inf)
-        asked = self._asked(verbatim, phases)
-        samples = max(round(motion_s / DT_S), 1)
-        for start in range(0, samples, _CHUNK):
-            n = min(_CHUNK, samples - start)
-            grid = (start * DT_S, DT_S, n)
-            path, row, extruding = sample_until(asked, grid, until, axes=3)
-            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
-            at = phases.move_index[row]
-            self._measurement.add(self._samples(verbatim, at, path, came, extruding, came))
-            self._observe(path[:2])
-
-    def _samples(
-        self,
-        item: Piece | VerbatimPart,
-        row: np.ndarray,
-        planned: np.ndarray,
-        executed: np.ndarray,
-        extruding: np.ndarray,
-        sliced: np.ndarray,
-    ) -> MotionSamples:
-        """Return the samples of an item whose moves have been counted.
-
-        `sliced` is how the sliced file is executed, where the firmware rounds.
-        """
-        return MotionSamples(
-            path_mm=planned[:2],
-            executed_mm=executed[:2],
-            z_mm=planned[2],
-            extruding=extruding,
-            row=row,
-            moves=item.moves,
-            first_move=self._sum.moves - len(item.moves),
-            sliced_mm=sliced if self._rounds else None,
-        )
-
-    def _asked(self, item: Piece | VerbatimPart, phases: Phases) -> Phases:
-        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._adapter.step_mm)
-
-    def _stand(self, dwell_s: float) -> None:
-        """Let the machine stand where it is."""
-        self._sum.original_s += dwell_s
-        self._wait(dwell_s)
-
-    def _wait(self, dwell_s: float) -> None:
-        """Let the machine stand in the written file."""
-        self._sum.time_s += dwell_s
-        if dwell_s <= 0.0:
-            return
-        stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
-        if stood is not None:
-            self._observe(stood)
-
-    def _observe(self, command: np.ndarray | None) -> None:
-        if not self._changes:
-            return
-        self._verifier.passed(command)
-        if command is None:
-            self._sum.jumped = True
-            return
-        if self._sum.jumped and command.shape[1]:
-            self._work.compensator.reset(command[:, 0])
-            self._sum.jumped = False
-        self._work.compensator.observe(command)
 
     def _read_back(self, text: bytes) -> Phases:
         """Plan the written lines of a piece by the firmware's rules."""

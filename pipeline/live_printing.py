@@ -23,7 +23,7 @@ from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import Progress, ProgressCallback
 from stillpath.pipeline.reading import DialectName
 from stillpath.pipeline.result import PrintWay, Result, StageTime
-from stillpath.pipeline.simulate import measured, simulate_file
+from stillpath.pipeline.simulate import measured, simulate_motion
 from stillpath.pipeline.ways import file_way, live_way
 
 __all__ = ["LivePrediction", "keep_file", "predict_live", "simulate_live"]
@@ -55,17 +55,9 @@ def simulate_live(
     clock = StageClock()
     with clock.stage("design"):
         design = cached_live_design(machine, cache_dir or default_cache_dir())
-    result = simulate_file(
-        source,
-        machine,
-        plate=plate,
-        dialect=dialect,
-        cache_dir=cache_dir,
-        progress=progress,
-        layers=layers,
-        trace=trace,
-        live=live_filter(machine, design.taps),
-    )
+    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
+    live = live_filter(machine, design.taps)
+    result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
     channels = [design.ranged(channel, machine) for channel in result.channels]
     channels = [
         c.model_copy(update={"label": "printed live"}) if c.name == "after" else c for c in channels
@@ -159,9 +151,7 @@ def _way(
     motion = FileMotion(
         source, options.plate, machine, options.dialect, DT_S, progress, longest_stand_s=STANDING_S
     )
-    measurement = Measurement(
-        machine, DT_S, design.shaper, compensated=True, names=("after",), size=size
-    )
+    measurement = Measurement(machine, DT_S, design.shaper, ("after",), size=size)
     live = LiveMotion(live_filter(machine, design.taps))
     measured(motion, live, measurement, Operation(machine), StageClock())
     measurement.finish()

@@ -28,11 +28,11 @@ from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.piece_compensator import DT_S
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.reading import DialectName
-from stillpath.pipeline.result import NOTHING_COMPENSATED, Result, StageTime
+from stillpath.pipeline.result import NOTHING_COMPENSATED, Result
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
 
-__all__ = ["PlannedTime", "measured", "plan_file", "simulate_file"]
+__all__ = ["PlannedTime", "measured", "plan_file", "simulate_file", "simulate_motion"]
 
 _COLUMNS = ("t", "x", "y", "z", "e")
 
@@ -108,31 +108,38 @@ def simulate_file(
     progress: ProgressCallback | None = None,
     layers: Path | None = None,
     trace: Callable[[Trace], None] | None = None,
-    live: LiveFilter | None = None,
 ) -> Result:
     """Predict the vibration of a file as it is, and with the best firmware shaper.
 
-    Parameters and errors are those of `pipeline.compensate.compensate_file`; with `live` the
-    motion is also what the extra of Klipper makes of it.
+    Parameters and errors are those of `pipeline.compensate.compensate_file`.
     """
-    clock = StageClock()
+    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
+    return simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace)
+
+
+def simulate_motion(
+    motion: FileMotion,
+    *,
+    cache_dir: Path | None = None,
+    layers: Path | None = None,
+    trace: Callable[[Trace], None] | None = None,
+    live: LiveFilter | None = None,
+) -> Result:
+    """Predict the vibration of a file that was opened; parameters as `simulate_file` has them.
+
+    With `live` the motion is also what the extra of Klipper makes of it.
+    """
+    machine, clock = motion.machine, StageClock()
     with clock.stage("reference shaper"):
         shaper = cached_shaper(machine, cache_dir or default_cache_dir(), DT_S)
-    motion = FileMotion(source, plate, machine, dialect, DT_S, progress, longest_stand_s=STANDING_S)
     operation = Operation(machine)
+    names = channel_names(compensated=live is not None)
+    size = motion.source.stat().st_size
     with contextlib.ExitStack() as files:
-        writer = None
-        if layers is not None:
-            names = channel_names(compensated=live is not None)
-            writer = files.enter_context(written_layers(layers, names))
+        writer = None if layers is None else files.enter_context(written_layers(layers, names))
+        take_layer = writer.add if writer else None
         measurement = Measurement(
-            machine,
-            DT_S,
-            shaper,
-            compensated=live is not None,
-            take_layer=writer.add if writer else None,
-            trace=trace,
-            size=source.stat().st_size,
+            machine, DT_S, shaper, names, take_layer=take_layer, trace=trace, size=size
         )
         stream = ShapedMotion(DT_S) if live is None else LiveMotion(live)
         seen = measured(motion, stream, measurement, operation, clock)
@@ -142,14 +149,13 @@ def simulate_file(
     notes = operation.notes()
     if any(label != OFF.label for label in motion.shapers):
         notes.append(f"The file sets the firmware's shaper: {', '.join(motion.shapers)}.")
-    size = source.stat().st_size
     return Result(
         version=__version__,
         machine=machine.name,
         machine_title=machine.title,
         machine_revision=machine.revision,
         settings={"method": "simulate" if live is None else "live"},
-        source_name=source.name,
+        source_name=motion.source.name,
         channels=measurement.channels(),
         best_shaper=shaper.label,
         original_time_s=motion.time_s,
@@ -163,12 +169,8 @@ def simulate_file(
         extruding_s=seen.extruding_s,
         warnings=[*motion.warnings, *measurement.warnings()],
         notes=notes,
-        layers=measurement.layers(),
-        features=measurement.features(motion.feature_names),
-        track=measurement.track(),
-        spectra=measurement.spectra(),
-        layer_views=measurement.layer_views(),
-        stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+        stages=clock.stages(),
+        **measurement.details(motion.feature_names),
         **NOTHING_COMPENSATED,
     )
 

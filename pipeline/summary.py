@@ -19,7 +19,7 @@ from stillpath.pipeline.options import Options
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.pacing.budget_measure import BudgetMeasurement
 from stillpath.pipeline.reading import passed_over
-from stillpath.pipeline.result import Channel, Result, StageTime
+from stillpath.pipeline.result import Channel, Result
 from stillpath.pipeline.selection import Selection
 from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM
@@ -61,7 +61,6 @@ class Summary:
             budget, pairs = self.budget
             total_s = self.totals.original_s, self.totals.time_s
             figures = budget.figures(pairs.sums(), self.reader.feature_names, *total_s)
-        measured = self.measurement
         return Result(
             version=__version__,
             machine=self.machine.name,
@@ -78,13 +77,9 @@ class Summary:
             warnings=list(self._warnings(channels)),
             notes=list(self._notes()),
             confirmation=confirmation_text(self.machine) if self.writer is not None else "",
-            layers=measured.layers(),
-            features=measured.features(self.reader.feature_names),
-            track=measured.track(),
-            spectra=measured.spectra(),
-            layer_views=measured.layer_views(),
-            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in clock.cpu_s.items()],
+            stages=clock.stages(),
             budget=figures,
+            **self.measurement.details(self.reader.feature_names),
         )
 
     def _channels(self) -> list[Channel]:

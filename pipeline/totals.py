@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from stillpath.gcode.pieces import LeftOut, VerbatimPart
 from stillpath.gcode.types import Phases
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
-from stillpath.pipeline.verbatim import last_length_mm
+from stillpath.pipeline.verbatim import feeding, last_length_mm
 
 __all__ = ["Totals"]
 
@@ -52,6 +53,24 @@ class Totals:
         self.gap_max = max(self.gap_max, float(np.max(gap, initial=0.0)))
         end = executed.start_mm[-1, 3] + executed.direction[-1, 3] * last_length_mm(executed)
         self.filament_error = max(self.filament_error, abs(float(end - made.command_mm[3, -1])))
+
+    def add_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
+        """Add motion whose lines are not changed."""
+        motion_s, feeds = phases.duration_s, feeding(phases)
+        self.original_s += motion_s
+        self.time_s += motion_s
+        duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
+        extruding_s = float(np.sum(duration_s[feeds]))
+        self.extruding_s += extruding_s
+        if isinstance(verbatim, LeftOut):
+            self.left_out_s += motion_s
+            self.left_out_extruding_s += extruding_s
+            return
+        self.passed_motion_s += motion_s
+        if np.any(feeds):
+            self.passed_s += extruding_s
+            first = phases.move_index[int(np.argmax(feeds))]
+            self.passed_line = self.passed_line or int(verbatim.moves.line[first])
 
     def figures(self, *, compensates: bool) -> dict[str, Any]:
         """Return the fields of `Result` that are sums, or follow from them.

@@ -9,7 +9,7 @@ import contextlib
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -51,7 +51,6 @@ def write_trajectories(
         ``before_sim_x_mm``, ..., the nozzle according to the machine's model;
         ``before_contour_um``, ``after_contour_um``, its distance to the planned path; ``line`` and
         ``layer`` of the sliced file (-1: before the first layer); ``extruding``, 0 or 1.
-    machine : Machine
     options : Options
         Those of the job. Of an advised file the motion is that of the written one, and so are its
         lines; no column is called ``before``.
@@ -71,19 +70,11 @@ def write_trajectories(
     Raises
     ------
     GcodeError
-        Nothing lies in the window; or as `compensate_file` has it.
-    DesignError, ModelError
-    OSError
+        Nothing lies in the window; or as `compensate_file` has it, with its other errors.
     """
     start_s, stop_s = window_s
-    if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
-        raise GcodeError(
-            f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
-            "or later, and end after its start"
-        )
-    options = options.model_copy(update={"compare_live": False})
-    advised = options.method == "advise"
-    names = ("after",) if advised else ("before", "after")
+    _check_window(start_s, stop_s)
+    names = ("after",) if options.method == "advise" else ("before", "after")
     with (
         _table(target, format, names) as table,
         tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-trajectories-") as folder,
@@ -91,31 +82,39 @@ def write_trajectories(
         window = _Window(table, names, start_s, stop_s)
         written = Path(folder, "written.gcode")
         with contextlib.suppress(_Passed):
-            if advised:
-                compensate_file(source, written, machine, options, cache_dir=cache_dir)
-                simulate_file(
-                    written,
-                    machine,
-                    dialect=options.dialect,
-                    cache_dir=cache_dir,
-                    progress=progress,
-                    trace=window.add,
-                )
-            else:
-                compensate_file(
-                    source,
-                    written,
-                    machine,
-                    options,
-                    cache_dir=cache_dir,
-                    progress=progress,
-                    trace=window.add,
-                )
+            _run(source, written, machine, options, window, cache_dir, progress)
         if window.rows == 0:
             raise GcodeError(
                 f"nothing moves from {start_s:g} s on: the print ends at {window.end_s:.3f} s"
             )
         return window.rows
+
+
+def _check_window(start_s: float, stop_s: float | None) -> None:
+    if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
+        raise GcodeError(
+            f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
+            "or later, and end after its start"
+        )
+
+
+def _run(
+    source: Path,
+    written: Path,
+    machine: Machine,
+    options: Options,
+    window: _Window,
+    cache_dir: Path | None,
+    progress: ProgressCallback | None,
+) -> None:
+    """Compensate a file again; motion of an advised one comes from what was written."""
+    options = options.model_copy(update={"compare_live": False})
+    how: dict[str, Any] = {"cache_dir": cache_dir, "progress": progress, "trace": window.add}
+    if options.method == "advise":
+        compensate_file(source, written, machine, options, cache_dir=cache_dir)
+        simulate_file(written, machine, dialect=options.dialect, **how)
+    else:
+        compensate_file(source, written, machine, options, **how)
 
 
 class _Window:

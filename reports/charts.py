@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
@@ -88,12 +88,7 @@ def draw(chart: Chart, width: float, height: float) -> str:
     low, high = (f(f(ticks), f(ys)) for f in (min, max))
     scaled: Callable[[float], float] = math.log10 if chart.log_x else float
     left_end, right_end = scaled(min(xs)), scaled(max(xs))
-    x_ticks = (
-        _log_ticks(min(xs), max(xs))
-        if chart.log_x
-        else _ticks(min(xs), max(xs), max(2, int((width - _LEFT - right) / 62)))
-    )
-    x_ticks = [x for x in x_ticks if min(xs) <= x <= max(xs)]
+    x_ticks = _x_ticks(min(xs), max(xs), width - _LEFT - right, log=chart.log_x)
     lower = _TOP + _LINE + (_LINE if chart.marks else 0.0)
     bottom = height - _LINE * (1.6 + max(chart.tick(x).count("\n") + 1 for x in x_ticks))
 
@@ -134,17 +129,26 @@ def draw(chart: Chart, width: float, height: float) -> str:
         out.append(f'<path class="{line.style}" d="{_path(line, gaps, at_x, at_y)}"/>')
         if line.name and found:
             ends.append((at_y(found[-1][1]), at_x(found[-1][0]), line))
-    for place, (y, x, line) in zip(
-        _spread([end[0] for end in sorted(ends, key=_first)], lower, bottom),
-        sorted(ends, key=_first),
-        strict=True,
-    ):
-        out.append(
-            f'<path class="{line.style} lead" d="M{x:.1f} {y:.1f}L{width - right + 12:.1f} '
-            f'{place:.1f}"/>'
-        )
-        out.append(_text(width - right + _END_GAP - 3, place + 4, line.name, "start"))
+    out += _named_ends(ends, (lower, bottom), width - right)
     return "".join([*out, "</svg>"])
+
+
+def _x_ticks(low: float, high: float, width: float, *, log: bool) -> list[float]:
+    ticks = _log_ticks(low, high) if log else _ticks(low, high, max(2, int(width / 62)))
+    return [x for x in ticks if low <= x <= high]
+
+
+def _named_ends(
+    ends: Sequence[tuple[float, float, Line]], room: tuple[float, float], right: float
+) -> Iterator[str]:
+    """Yield names beside the ends (y, x) of lines, so far apart that all can be read."""
+    ends = sorted(ends, key=_first)
+    places = _spread([end[0] for end in ends], *room)
+    for place, (y, x, line) in zip(places, ends, strict=True):
+        yield (
+            f'<path class="{line.style} lead" d="M{x:.1f} {y:.1f}L{right + 12:.1f} {place:.1f}"/>'
+        )
+        yield _text(right + _END_GAP - 3, place + 4, line.name, "start")
 
 
 def _first(end: tuple[float, float, Line]) -> float:

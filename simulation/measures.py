@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
+WINDOW_S = 0.08
+"""So far from its sample the nearest point of the path is looked for."""
 _RESIDUAL_S = 0.1
 _SHORTEST_REST_S = 0.02
 _STILL_MM = 1e-9
@@ -161,7 +163,7 @@ class ContourMeter:
     """
 
     def __init__(
-        self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2, channels: int = 1
+        self, dt_s: float = 1e-3, window_s: float = WINDOW_S, stride: int = 2, channels: int = 1
     ) -> None:
         self._window = round(window_s / dt_s)
         self._stride = stride
@@ -220,12 +222,12 @@ class ChosenMeter:
 
     Parameters
     ----------
-    dt_s, window_s, channels
+    dt_s, channels
         As `ContourMeter` has them.
     """
 
-    def __init__(self, dt_s: float = 1e-3, window_s: float = 0.08, channels: int = 1) -> None:
-        self._window = round(window_s / dt_s)
+    def __init__(self, dt_s: float = 1e-3, channels: int = 1) -> None:
+        self._window = round(WINDOW_S / dt_s)
         self._path = np.zeros((2, 0))
         self._points = np.zeros((channels, 2, 0))
         self._centres = np.zeros(0, np.int64)
@@ -270,7 +272,7 @@ class MotionMeter:
 
     Parameters
     ----------
-    dt_s, window_s, stride, channels
+    dt_s, stride, channels
         As `ContourMeter` has them.
 
     Attributes
@@ -279,12 +281,10 @@ class MotionMeter:
         Of every channel, in mm, at every `stride`-th sample.
     """
 
-    def __init__(
-        self, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 2, channels: int = 1
-    ) -> None:
+    def __init__(self, dt_s: float = 1e-3, stride: int = 2, channels: int = 1) -> None:
         self.contour_extruding = [Tally() for _ in range(channels)]
         self.contour_all = [Tally() for _ in range(channels)]
-        self._contour = ContourMeter(dt_s, window_s, stride, channels)
+        self._contour = ContourMeter(dt_s, stride=stride, channels=channels)
         self._stride = stride
         self._seen = self._seen_extruding = 0
         self._extruding = np.zeros(0, bool)
@@ -366,11 +366,9 @@ def tracking_error(y_d_mm: Array, y_mm: Array) -> Array:
     return np.asarray(np.sqrt(difference[0] ** 2 + difference[1] ** 2))
 
 
-def contour_error(
-    y_d_mm: Array, y_mm: Array, dt_s: float = 1e-3, window_s: float = 0.08, stride: int = 1
-) -> Array:
+def contour_error(y_d_mm: Array, y_mm: Array, dt_s: float = 1e-3, stride: int = 1) -> Array:
     """Return the contour error of samples 0, stride, 2 stride, ... of a whole motion."""
-    meter = ContourMeter(dt_s, window_s, stride)
+    meter = ContourMeter(dt_s, stride=stride)
     first = meter.push(y_d_mm, y_mm[None])
     return np.concatenate([first.error_mm[0], meter.flush().error_mm[0]])
 
@@ -380,7 +378,7 @@ def distance_to_path(
     points_mm: Array,
     index: NDArray[np.int64],
     dt_s: float = 1e-3,
-    window_s: float = 0.08,
+    window_s: float = WINDOW_S,
 ) -> Array:
     """Return the contour error of chosen samples only.
 
@@ -405,7 +403,7 @@ class PathDistances:
         The whole planned motion.
     """
 
-    def __init__(self, path_mm: Array, dt_s: float = 1e-3, window_s: float = 0.08) -> None:
+    def __init__(self, path_mm: Array, dt_s: float = 1e-3, window_s: float = WINDOW_S) -> None:
         self._path = np.ascontiguousarray(path_mm)
         self._tables = _room_for_tables(self._path)
         path_tables(self._path, *self._tables)

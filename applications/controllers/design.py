@@ -31,7 +31,7 @@ from stillpath.applications.controllers.response import adapted, disturbance_of,
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.controller import Controller, Extreme
 from stillpath.compensation.feedback.disturbance_observer import design_disturbance_observer
-from stillpath.compensation.feedback.fmsdob import fmsdob
+from stillpath.compensation.feedback.fmsdob import Trim, fmsdob
 from stillpath.compensation.feedback.inverse_dob import inverse_dob
 from stillpath.compensation.feedback.mmp import mmp
 from stillpath.compensation.feedback.multirate import design_multirate
@@ -157,9 +157,7 @@ def _fmsdob(loops: tuple[Loop, ...], o: FmsdobOptions, _: LoopSpec) -> Controlle
         o.targets_hz,
         shape=o.shape,
         bandwidth_hz=o.bandwidth_hz,
-        detuning=o.detuning,
-        zeros=o.zeros,
-        through_band=o.through_band,
+        trim=Trim(o.detuning, o.zeros, o.through_band),
         around=o.around,
         uncertainty=o.uncertainty,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,9 +94,7 @@ def design_report(
     Parameters
     ----------
     machine : Machine
-    axis : str
-        x or y.
-    settings : DesignSettings, optional
+    axis : {"x", "y"}
     errors_percent : sequence of float
         Errors of this axis' frequencies at which every command is tried.
     shapers : sequence of str
@@ -112,20 +111,95 @@ def design_report(
         For an unknown axis, basis or robust mode. A design that is refused is a finding, not an
         error: the report says which and why.
     """
+    made = _designed(machine, axis, settings)
+    trial = Trial(machine, axis, settings.dt_s, motion, errors_percent)
+    missing = [*made.missing, *trial.notes]
+    own = _own_curves(trial, made.by_mode, made.ladder, missing)
+    if tuned is None:
+        tuned = tune_each(machine, trial.y_d_mm, settings.dt_s, trial.extruding, shapers)
+    curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
+    chosen, row = made.by_mode.get(made.mode), made.row
+    limit = next((d.accel_limits_mm_s2(trial.y_d_mm)[row] for d in made.by_mode.values()), None)
+    path_peak, path_rms = trial.path_acceleration()
+    return DesignReport.model_validate(
+        {
+            "version": __version__,
+            "machine": machine.name,
+            "machine_title": machine.title,
+            "machine_revision": machine.revision,
+            "frequencies": _frequencies(machine, axis, settings.dt_s),
+            **made.figures(settings),
+            "chosen": chosen.rungs[row] if chosen and made.mode in own else None,
+            "path_peak_accel_mm_s2": path_peak,
+            "path_rms_accel_mm_s2": path_rms,
+            "accel_limit_mm_s2": limit,
+            "robustness": Robustness(
+                errors_percent=trial.errors_percent, curves=curves, missing=tuple(missing)
+            ),
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Designed:
+    """The designs of an axis, before they are tried.
+
+    Attributes
+    ----------
+    row : int
+        Of the axis.
+    by_mode : dict of str to PreviewFbf
+        For every robust mode that can be designed.
+    missing : list of str
+        Why the others cannot.
+    robust, mode : str
+        That is asked for, and that is designed: without a set all are one.
+    """
+
+    plants: PlantSet
+    row: int
+    by_mode: dict[str, PreviewFbf]
+    missing: list[str]
+    robust: str
+    mode: str
+    lifted: LiftedWindow
+    ladder: tuple[RungFigures, ...]
+
+    def figures(self, settings: DesignSettings) -> dict[str, Any]:
+        """Return what a report says of them."""
+        plants, lifted = self.plants, self.lifted
+        window = round(settings.window_s / settings.dt_s)
+        guarded = lifted.weights if self.mode == "minimax" else plants.weights
+        chosen = self.by_mode.get(self.mode)
+        return {
+            "axis": AXES[self.row],
+            "basis": settings.basis,
+            "robust": self.robust,
+            "along": chosen.along if chosen else settings.along or 1.0,
+            "sampling_s": settings.dt_s,
+            "window_s": settings.window_s,
+            "update_s": settings.update_s,
+            "plant": _plant(plants, self.by_mode.get("minimax"), self.row),
+            "lifted": _singular_values(lifted.plants, lifted.weights, window),
+            "metrics": _metrics(plants, guarded, window),
+            "ladder": self.ladder,
+        }
+
+
+def _designed(machine: Machine, axis: str, settings: DesignSettings) -> _Designed:
     _check_names(axis, settings)
     dt_s, row = settings.dt_s, AXES.index(axis)
     spec = machine.axes["x" if axis == "x" else "y"]
     # What designs see: no command leads for a delay of slow motion (`PreviewFbf`).
     plants = plant_set(spec.without_delay(), dt_s)
-    designers, missing = _designers(machine, settings)
-    robust = _robust_mode(machine, settings, designers)
+    by_mode, missing = _designers(machine, settings)
+    robust = _robust_mode(machine, settings, by_mode)
     # Without a set all robust modes are one.
-    mode = robust if robust in designers or len(plants.members) > 1 else "off"
-    window = round(settings.window_s / dt_s)
-    if mode in designers:
-        lifted = designers[mode].lifted[row]
+    mode = robust if robust in by_mode or len(plants.members) > 1 else "off"
+    if mode in by_mode:
+        lifted = by_mode[mode].lifted[row]
     else:
-        update = round(settings.update_s / dt_s)
+        window, update = (round(s / dt_s) for s in (settings.window_s, settings.update_s))
         # Refused as a whole: its figures say why.
         members, weights = plants.members, plants.weights
         if mode == "off":
@@ -135,43 +209,7 @@ def design_report(
     whole = next((text for text in missing if text.startswith(f"fbf {mode}: ")), None)
     most = functions_within(spec.band_hz, dt_s)
     ladder = _ladder(plants, lifted, settings.basis, dt_s, whole, most)
-
-    trial = Trial(machine, axis, dt_s, motion, errors_percent)
-    missing += trial.notes
-    own = _own_curves(trial, designers, ladder, missing)
-    if tuned is None:
-        tuned = tune_each(machine, trial.y_d_mm, dt_s, trial.extruding, shapers)
-    curves = (trial.uncompensated(), *own.values(), *(trial.shaped(tuned[k]) for k in shapers))
-    guarded = lifted.weights if mode == "minimax" else plants.weights
-    limit = next((d.accel_limits_mm_s2(trial.y_d_mm)[row] for d in designers.values()), None)
-    path_peak, path_rms = trial.path_acceleration()
-    return DesignReport.model_validate(
-        {
-            "version": __version__,
-            "machine": machine.name,
-            "machine_title": machine.title,
-            "machine_revision": machine.revision,
-            "axis": axis,
-            "basis": settings.basis,
-            "robust": robust,
-            "along": designers[mode].along if mode in designers else settings.along or 1.0,
-            "sampling_s": dt_s,
-            "window_s": settings.window_s,
-            "update_s": settings.update_s,
-            "plant": _plant(plants, designers.get("minimax"), row),
-            "frequencies": _frequencies(machine, axis, dt_s),
-            "lifted": _singular_values(lifted.plants, lifted.weights, window),
-            "metrics": _metrics(plants, guarded, window),
-            "ladder": ladder,
-            "chosen": designers[mode].rungs[row] if mode in own else None,
-            "path_peak_accel_mm_s2": path_peak,
-            "path_rms_accel_mm_s2": path_rms,
-            "accel_limit_mm_s2": limit,
-            "robustness": Robustness(
-                errors_percent=trial.errors_percent, curves=curves, missing=tuple(missing)
-            ),
-        }
-    )
+    return _Designed(plants, row, by_mode, missing, robust, mode, lifted, ladder)
 
 
 def _check_names(axis: str, settings: DesignSettings) -> None:

@@ -26,6 +26,14 @@ class LearntRipple:
     sources: tuple[SourceFile, ...]
     summary: str
 
+    def named(self, name: str | None, title: str | None) -> Machine:
+        """Return the machine under a name and title of its own, where they are given."""
+        machine = self.machine
+        if name is not None and name != machine.name:
+            title = title or f"{machine.title}, ripple learnt"
+        update = {"name": name or machine.name, "title": title or machine.title}
+        return Machine.model_validate(machine.model_dump() | update)
+
 
 def learn_from_files(
     files: Sequence[str],
@@ -36,8 +44,6 @@ def learn_from_files(
     gain: float = 0.5,
     remaining: bool = False,
     homing_repeatability_mm: float = 0.0,
-    name: str | None = None,
-    title: str | None = None,
 ) -> LearntRipple:
     """Learn the ripple of an axis from its passes, or update what the machine has.
 
@@ -47,8 +53,6 @@ def learn_from_files(
         Paths of passes (`models.identification.ripple_passes`).
     parts : sequence of str
         What repeats; see `parse_basis`.
-    name, title : str, optional
-        Of the machine, if it is a new one.
 
     Raises
     ------
@@ -71,11 +75,6 @@ def learn_from_files(
         remaining=remaining,
         homing_repeatability_mm=homing_repeatability_mm,
     )
-    if name is not None and name != machine.name:
-        title = title or f"{machine.title}, ripple learnt"
-    update = {"name": name or machine.name, "title": title or machine.title}
-    document = made.model_dump() | update
-    made = Machine.model_validate(document)
     return LearntRipple(made, tuple(f.source for f in inputs), _summary(axis, made, learning))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -16,6 +17,7 @@ from stillpath.models.store import explain
 
 __all__ = [
     "Difference",
+    "StatedMachine",
     "age_warnings",
     "check_before_job",
     "derived_envelope",
@@ -139,14 +141,28 @@ def differences(machine: Machine, config: PrinterConfig) -> list[Difference]:
     return found
 
 
-def machine_from_config(
-    config: PrinterConfig,
-    name: str,
-    *,
-    title: str = "",
-    f_hz: tuple[float | None, float | None] = (None, None),
-    zeta: float = _DEFAULT_ZETA,
-) -> Machine:
+@dataclass(frozen=True, slots=True)
+class StatedMachine:
+    """What somebody says of a machine before it is measured.
+
+    Attributes
+    ----------
+    name : str
+    title : str
+        Empty: the name.
+    f_hz : (float, float)
+        Resonances of X and Y; None: nobody knows.
+    zeta : float
+        Damping ratio of both.
+    """
+
+    name: str
+    title: str = ""
+    f_hz: tuple[float | None, float | None] = (None, None)
+    zeta: float = _DEFAULT_ZETA
+
+
+def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine:
     """Return a machine with the facts of a printer.cfg and plants that were not measured.
 
     The plants are one resonance each with a wide set around it, marked as typed in; a measurement
@@ -155,11 +171,8 @@ def machine_from_config(
     Parameters
     ----------
     config : PrinterConfig
-    name, title : str
-    f_hz : tuple of float
-        Resonances of x and y; by default the input shaper's frequencies, else 50 Hz.
-    zeta : float
-        Damping ratio of both.
+    stated : StatedMachine
+        Without resonances the input shaper's frequencies count, else 50 Hz.
 
     Raises
     ------
@@ -167,12 +180,14 @@ def machine_from_config(
         If the configuration lacks something or is not of a machine we know.
     """
     document: dict[str, Any] = {
-        "name": name,
-        "title": title or name,
+        "name": stated.name,
+        "title": stated.title or stated.name,
         "source": config.name,
         "axes": {
-            axis: typed_in(given or config.number("input_shaper", f"shaper_freq_{axis}", 0), zeta)
-            for axis, given in zip("xy", f_hz, strict=True)
+            axis: typed_in(
+                given or config.number("input_shaper", f"shaper_freq_{axis}", 0), stated.zeta
+            )
+            for axis, given in zip("xy", stated.f_hz, strict=True)
         },
     }
     _refuse_limits_by_axis(config)

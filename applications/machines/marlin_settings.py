@@ -9,7 +9,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stillpath.applications.machines.checks import derived_envelope, typed_in, with_firmware
+from stillpath.applications.machines.checks import (
+    StatedMachine,
+    derived_envelope,
+    typed_in,
+    with_firmware,
+)
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import explain
@@ -38,6 +43,15 @@ _PER_TOOL = {"M92", "M201", "M203", "M900"}
 _LONGEST_LINE = 500
 
 _Words = dict[str, float | None]
+_PLANNER: dict[str, tuple[str, str] | tuple[str, str, float]] = {
+    "accel_mm_s2": ("M204", "P"),
+    "retract_accel_mm_s2": ("M204", "R"),
+    "travel_accel_mm_s2": ("M204", "T"),
+    "min_segment_time_us": ("M205", "B", 20_000.0),
+    "min_feedrate_mm_s": ("M205", "S", 0.0),
+    "min_travel_feedrate_mm_s": ("M205", "T", 0.0),
+}
+"""Command and word of a planner's numbers, and what they are where the word is not printed."""
 
 
 def looks_like_m503(text: str) -> bool:
@@ -76,21 +90,17 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
     def per_axis(command: str) -> dict[str, float]:
         return {axis: word(command, axis.upper()) for axis in "xyze"}
 
-    planner: dict[str, Any] = {
+    by_deviation = found.get("M205", {}).get("J") is not None
+    planner = {
         "max_feedrate_mm_s": per_axis("M203"),
         "max_accel_mm_s2": per_axis("M201"),
-        "accel_mm_s2": word("M204", "P"),
-        "retract_accel_mm_s2": word("M204", "R"),
-        "travel_accel_mm_s2": word("M204", "T"),
-        "min_segment_time_us": word("M205", "B", 20_000.0),
-        "min_feedrate_mm_s": word("M205", "S", 0.0),
-        "min_travel_feedrate_mm_s": word("M205", "T", 0.0),
+        **{field: word(*where) for field, where in _PLANNER.items()},
+        **(
+            {"junction_deviation_mm": word("M205", "J")}
+            if by_deviation
+            else {"jerk_mm_s": per_axis("M205")}
+        ),
     }
-    by_deviation = found.get("M205", {}).get("J") is not None
-    if by_deviation:
-        planner["junction_deviation_mm"] = word("M205", "J")
-    else:
-        planner["jerk_mm_s"] = per_axis("M205")
     section: dict[str, Any] = {}
     if "M493" in found:
         # Version 1 reports Y's frequency as B, version 2 one line for each axis.
@@ -112,13 +122,10 @@ def firmware_section(text: str, name: str) -> dict[str, Any]:
 def machine_from_m503(
     text: str,
     file: str,
-    name: str,
+    stated: StatedMachine,
     *,
     travel_mm: Sequence[float],
     kinematics: str = "cartesian",
-    title: str = "",
-    f_hz: tuple[float | None, float | None] = (None, None),
-    zeta: float = 0.07,
     fields: Sequence[str] = (),
 ) -> Machine:
     """Return a machine with the limits that M503 says and plants that were not measured.
@@ -127,10 +134,10 @@ def machine_from_m503(
     ----------
     text, file : str
         What the printer answered, and the name of the file it stands in.
+    stated : StatedMachine
+        Without resonances those of the firmware's shaper (M593) count, else 50 Hz.
     travel_mm : sequence of float
         How far X, Y and Z reach from 0.
-    f_hz : tuple of float
-        Resonances of x and y; by default those of the firmware's shaper (M593), else 50 Hz.
     fields : sequence of str
         ``FIELD=VALUE`` of the firmware section that M503 does not say.
 
@@ -144,8 +151,8 @@ def machine_from_m503(
     tuned = (shaper["freq_x_hz"], shaper["freq_y_hz"])
     _set_fields(section, fields)
     document = {
-        "name": name,
-        "title": title or name,
+        "name": stated.name,
+        "title": stated.title or stated.name,
         "source": f"M503 in {file}",
         "kinematics": kinematics,
         "travel": {
@@ -154,8 +161,8 @@ def machine_from_m503(
         },
         "firmware": section,
         "axes": {
-            axis: typed_in(given or of_shaper, zeta)
-            for axis, given, of_shaper in zip("xy", f_hz, tuned, strict=True)
+            axis: typed_in(given or of_shaper, stated.zeta)
+            for axis, given, of_shaper in zip("xy", stated.f_hz, tuned, strict=True)
         },
     }
     try:

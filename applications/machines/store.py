@@ -175,7 +175,6 @@ class MachineStore:
         author: str,
         message: str = "",
         sources: Sequence[SourceFile] = (),
-        when: datetime | None = None,
     ) -> Revision:
         """Remember what a ring test said of axes, on top of whatever else has changed.
 
@@ -192,7 +191,7 @@ class MachineStore:
             document["confirmations"] |= entries
             return Machine.model_validate(document), fields
 
-        return self._add(name, confirmed, when=when)
+        return self._add(name, confirmed)
 
     def roll_back(
         self,
@@ -291,7 +290,7 @@ class MachineStore:
         name: str,
         change: Callable[[Revision | None], tuple[Machine, dict[str, Any]]],
         *,
-        when: datetime | None,
+        when: datetime | None = None,
         expected: int | None = None,
     ) -> Revision:
         """Write the revision that `change` makes of the current one, once more if it is late."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def verify_log(
     answer = PlantStream([discretise(s, command.dt_s) for s in specs.values()]).push(command.rows)
     predicted = Signal(0.0, command.dt_s, _acceleration(answer, command.dt_s))
     found = match(predicted, measured)
-    report = {
+    report: dict[str, Any] = {
         "version": __version__,
         "machine": machine.name,
         "machine_title": machine.title,
@@ -78,21 +79,7 @@ def verify_log(
         "log_s": found.log_s,
     }
     if found.explained < _MATCHED or found.plan_end_s <= found.plan_start_s:
-        verdict = (
-            "This log is not of this print: the best place explains "
-            f"{100 * found.explained:.0f} % of what the sensor felt between 2 and 22 Hz."
-        )
-        return ReadbackReport(
-            **report,
-            outcome="another print",
-            verdicts=[verdict],
-            notes=[],
-            compared_s=0.0,
-            plan_start_s=0.0,
-            clock_ppm=0.0,
-            sensor=[],
-            axes=[],
-        )
+        return _another_print(report, found)
     axes, sensor, notes = _in_machine_axes(command, predicted, measured, found, specs)
     judged = [judge(axis, command.dt_s) for axis in axes]
     return ReadbackReport(
@@ -105,6 +92,24 @@ def verify_log(
         clock_ppm=1e6 * (found.rate - 1.0),
         sensor=[[float(v) for v in column] for column in sensor.T],
         axes=judged,
+    )
+
+
+def _another_print(report: dict[str, Any], found: Match) -> ReadbackReport:
+    verdict = (
+        "This log is not of this print: the best place explains "
+        f"{100 * found.explained:.0f} % of what the sensor felt between 2 and 22 Hz."
+    )
+    return ReadbackReport(
+        **report,
+        outcome="another print",
+        verdicts=[verdict],
+        notes=[],
+        compared_s=0.0,
+        plan_start_s=0.0,
+        clock_ppm=0.0,
+        sensor=[],
+        axes=[],
     )
 
 

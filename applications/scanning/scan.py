@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,11 +109,7 @@ def scan_file(
     """
     loop = spec.nominal()
     scale = _scale(spec, settings)
-    if controller is not None and _machine(controller.spec) != _machine(spec):
-        raise DesignError(
-            f"the controller was designed for {controller.spec.name!r}, not for the loop of "
-            f"{spec.name!r}; design it anew"
-        )
+    _check_controller(controller, spec)
     hatches = read_hatches(_text(source))
     samples, rows = _numbered(sample_hatches(hatches, loop.dt_s, settings.timing), hatches)
     wanted = 1e3 * samples.xy_mm
@@ -126,15 +122,12 @@ def scan_file(
     if settings.prefilter != "none":
         outputs["prefilter"] = (prefilter.label, plain.run(command, wanted))
     if controller is not None:
-        blocks = _expecting(controller.blocks, loop, controller.every)
-        added = _Drive(loop, spec, blocks, controller.every, disturbed, warm_up)
+        added = _Drive.with_controller(loop, spec, controller, disturbed, warm_up)
         label = f"{prefilter.label} and {controller.method}".removeprefix("none and ")
         outputs["add-on"] = (label, added.run(command, wanted))
     errors = {
-        name: (label, track_errors(wanted, y, samples.track))
-        for name, (label, y) in outputs.items()
+        k: (label, track_errors(wanted, y, samples.track)) for k, (label, y) in outputs.items()
     }
-    notes = tuple(f"{name} means nothing to a scanner: passed over" for name in hatches.passed_over)
     report = ScanReport(
         version=__version__,
         source=source.name,
@@ -143,9 +136,7 @@ def scan_file(
         unit=spec.unit,
         um_per_unit=scale,
         rate_hz=1.0 / loop.dt_s,
-        prefilter=prefilter.label,
-        preview_samples=prefilter.preview,
-        peak_gain=prefilter.peak,
+        **prefilter.figures(),
         controller=None if controller is None else controller.method,
         disturbance=None if disturbed is None else disturbed.text,
         enters=None if disturbed is None else disturbed.enters,
@@ -154,9 +145,19 @@ def scan_file(
         drawn_mm=float(np.sum(np.hypot(*(hatches.end_mm - hatches.start_mm).T)[hatches.beam])),
         variants=tuple(_variant(name, *found) for name, found in errors.items()),
         tracks=_tracks(hatches, rows, {name: found for name, (_, found) in errors.items()}),
-        notes=notes,
+        notes=tuple(
+            f"{name} means nothing to a scanner: passed over" for name in hatches.passed_over
+        ),
     )
     return Scan(report, samples.t_s, command / scale, samples.track)
+
+
+def _check_controller(controller: LoadedController | None, spec: LoopSpec) -> None:
+    if controller is not None and _machine(controller.spec) != _machine(spec):
+        raise DesignError(
+            f"the controller was designed for {controller.spec.name!r}, not for the loop of "
+            f"{spec.name!r}; design it anew"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,6 +184,14 @@ class _Prefilter:
         elif settings.prefilter == "fbf":
             self.preview = 64
 
+    def figures(self) -> dict[str, Any]:
+        """Return what a report says of it."""
+        return {
+            "prefilter": self.label,
+            "preview_samples": self.preview,
+            "peak_gain": self.peak,
+        }
+
     def apply(self, wanted: Array) -> Array:
         if self._filter is not None:
             return self._filter.apply(wanted)
@@ -205,6 +214,19 @@ class _Drive:
     ) -> None:
         self._loop, self._spec, self._blocks = loop, spec, blocks
         self._every, self._disturbed, self._warm_up = every, disturbed, warm_up
+
+    @classmethod
+    def with_controller(
+        cls,
+        loop: Loop,
+        spec: LoopSpec,
+        controller: LoadedController,
+        disturbed: _Disturbed | None,
+        warm_up: int,
+    ) -> _Drive:
+        """Return the loop with an add-on as a controller would load it."""
+        blocks = _expecting(controller.blocks, loop, controller.every)
+        return cls(loop, spec, blocks, controller.every, disturbed, warm_up)
 
     def run(self, reference: Array, wanted: Array) -> Array:
         """Return the output, shape (2, n), of a machine that stands where the path begins."""

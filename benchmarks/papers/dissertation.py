@@ -16,6 +16,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -27,28 +28,73 @@ from stillpath.compensation.basis import bspline_basis, ce_opt_basis, ce_opt_bas
 from stillpath.compensation.full_preview import FullPreview, independence
 from stillpath.compensation.lifted import free_response, lift, lifted_set
 from stillpath.compensation.metrics import error_of_functions
+from stillpath.compensation.operators import LiftedOperator
 from stillpath.models.plants import DiscretePlant, PairsSpec, PolePair, ZeroPair, discretise
 from stillpath.models.store import load_machine
 
 LIMIT_MM = 10.0
 HERE = Path(__file__).resolve().parent
+NAMES = ("DCT", "B-splines", "CE-Opt")
+
+
+@dataclass(frozen=True, slots=True)
+class Zeros:
+    """Designs over the place of a zero, by basis.
+
+    Attributes
+    ----------
+    places : ndarray, shape (p,)
+    error, effort : dict of ndarray, shape (p, seeds)
+        e/y_d and u/y_d.
+    j_e, j_c : dict of ndarray, shape (p,)
+    unlimited : list of ndarray
+        Effort of B-splines without rank tolerance.
+    """
+
+    places: Array
+    error: dict[str, Array]
+    effort: dict[str, Array]
+    j_e: dict[str, Array]
+    j_c: dict[str, Array]
+    unlimited: list[Array]
 
 
 def figures_2(seeds: int, quick: bool) -> Iterator[Row]:
     """Figures 2.3, 2.4, 3.2, 3.3 and table 3.1: (q - a) / (q - 0.5), n = 990."""
     n = 991
-    places = np.linspace(-5.0, 5.0, 11 if quick else 101)
     noise = white(seeds)
     bases = {"DCT": dct_basis(SAMPLES, n), "B-splines": bspline_basis(SAMPLES, n)}
-    names = ("DCT", "B-splines", "CE-Opt")
+    found = _over_zeros(np.linspace(-5.0, 5.0, 11 if quick else 101), noise, bases, n)
+    yield from _figures_2_3_and_4(found, error_of_functions(n, SAMPLES))
+    at = int(np.argmin(np.abs(found.places - 1)))
+    inside = np.abs(found.places) <= 1
+    more = found.effort["B-splines"] / found.effort["DCT"]
+    yield (
+        "fig 3.1 u/y_d, |a| <= 1: B-splines / DCT",
+        "similar",
+        f"{np.exp(np.log(more)[inside].mean()):.2f}",
+        f"at a = {found.places[at]:g}: {more[at].mean():.2f}",
+    )
+    yield (
+        "fig 3.1 u/y_d, a = 1.02: B-splines / DCT",
+        "11800",
+        _ratio_at_102(noise, bases),
+        "geometric mean over seeds",
+    )
+    ratio = found.j_c["DCT"].max() / found.j_c["CE-Opt"].max()
+    yield ("fig 3.2 max J_c: DCT / CE-Opt", "orders of magnitude", f"{ratio:.3g}", "")
+    yield from _table_31(found)
+
+
+def _over_zeros(places: Array, noise: Array, bases: dict[str, Array], n: int) -> Zeros:
     error, effort, j_e, j_c = (
-        {name: np.empty((len(places), *more)) for name in names}
-        for more in ((seeds,), (seeds,), (), ())
+        {name: np.empty((len(places), *more)) for name in NAMES}
+        for more in (noise.shape[1:], noise.shape[1:], (), ())
     )
     unlimited = []
     for i, a in enumerate(places):
         g = lift(first_order(a), SAMPLES)
-        for name in names:
+        for name in NAMES:
             basis = bases.get(name)
             if basis is None:
                 basis = ce_opt_basis(lifted_set(g.markov[None], [1.0]).gram, n)
@@ -64,45 +110,35 @@ def figures_2(seeds: int, quick: bool) -> Iterator[Row]:
             if name == "B-splines":
                 whole = FullPreview(g, basis, rank_tolerance=0.0)
                 unlimited.append(rms(whole.command(noise)) / rms(noise))
-    closed = error_of_functions(n, SAMPLES)
-    for name in names[:2]:
-        spread = np.ptp(j_e[name]) / closed
+    return Zeros(places, error, effort, j_e, j_c, unlimited)
+
+
+def _figures_2_3_and_4(found: Zeros, closed: float) -> Iterator[Row]:
+    for name in NAMES[:2]:
+        spread = np.ptp(found.j_e[name]) / closed
         lost = "" if spread < 1e-6 else "; the rank tolerance leaves out one direction for |a| > 1"
         yield (
             f"fig 2.4 {name}: J_e over a in [-5, 5]",
             f"{closed:.4f} (2.26)",
-            f"{j_e[name].min():.4f} to {j_e[name].max():.4f}",
-            f"{len(places)} zeros{lost}",
+            f"{found.j_e[name].min():.4f} to {found.j_e[name].max():.4f}",
+            f"{len(found.places)} zeros{lost}",
         )
-        e = error[name].mean(axis=1)
+        e = found.error[name].mean(axis=1)
         yield (
             f"fig 2.3 {name}: e/y_d over a",
             "flat",
             f"{e.min():.3f} to {e.max():.3f}",
             (
-                f"mean of {seeds} seeds; 10 of 1001 directions are left, so one record varies "
-                f"by {error[name].std(axis=1).mean() / e.mean():.0%}"
+                f"mean of {found.error[name].shape[1]} seeds; 10 of 1001 directions are left, so "
+                f"one record varies by {found.error[name].std(axis=1).mean() / e.mean():.0%}"
             ),
         )
-    at = int(np.argmin(np.abs(places - 1)))
-    inside = np.abs(places) <= 1
-    yield (
-        "fig 3.1 u/y_d, |a| <= 1: B-splines / DCT",
-        "similar",
-        f"{np.exp(np.log(effort['B-splines'] / effort['DCT'])[inside].mean()):.2f}",
-        f"at a = {places[at]:g}: {(effort['B-splines'] / effort['DCT'])[at].mean():.2f}",
-    )
-    yield (
-        "fig 3.1 u/y_d, a = 1.02: B-splines / DCT",
-        "11800",
-        _ratio_at_102(noise, bases),
-        "geometric mean over seeds",
-    )
-    ratio = j_c["DCT"].max() / j_c["CE-Opt"].max()
-    yield ("fig 3.2 max J_c: DCT / CE-Opt", "orders of magnitude", f"{ratio:.3g}", "")
+
+
+def _table_31(found: Zeros) -> Iterator[Row]:
     paper = {"DCT": (0.0783, 27.6), "B-splines": (0.0814, 1.02e5), "CE-Opt": (0.0828, 0.706)}
-    for name in names:
-        e = error[name].mean(axis=0)
+    for name in NAMES:
+        e = found.error[name].mean(axis=0)
         yield (
             f"table 3.1 {name}: e/y_d",
             f"{paper[name][0]:.4f}",
@@ -111,12 +147,12 @@ def figures_2(seeds: int, quick: bool) -> Iterator[Row]:
             if e.min() <= paper[name][0] <= e.max()
             else "one record of 10 directions",
         )
-        u = effort[name].mean(axis=0)
+        u = found.effort[name].mean(axis=0)
         note = {
             "DCT": f"seeds {u.min():.3g} to {u.max():.3g}: the zeros just beyond 1 make the mean",
             "B-splines": "the rank tolerance of 1e-12 decides; with none it is rounding noise, "
-            f"{np.mean(unlimited):.0e}",
-            "CE-Opt": f"{len(places)} zeros at equal distances (the paper's are not printed)",
+            f"{np.mean(found.unlimited):.0e}",
+            "CE-Opt": f"{len(found.places)} zeros at equal distances (the paper's are not printed)",
         }[name]
         yield f"table 3.1 {name}: u/y_d", f"{paper[name][1]:.3g}", plus_minus(u), note
 
@@ -240,21 +276,9 @@ def _appendix_h() -> list[Row]:
     ]
     paper = {"CE-Opt": "X .06 Y .05, 1.05 .98", "B-splines": "X .17 Y .94, 1.08 1.12"}
     for name, phi in (("CE-Opt", optimal), ("B-splines", bspline_basis(m, n))):
-        design = FullPreview(g, phi)
-        u = design.command(y_d)
-        sent = np.clip(u, -LIMIT_MM, LIMIT_MM)
-        e = y_d - g.apply(sent)
-        beyond = np.flatnonzero(np.abs(u) > LIMIT_MM)
-        when = f"saturates from {beyond[0] * 1e-4:.3f} s" if len(beyond) else "never saturates"
-        j_c = float(np.linalg.norm(design.functions)) / np.sqrt(m)
-        out.append(
-            (
-                f"{name}: e/y_d, u/y_d",
-                paper[name],
-                f"{rms(e) / rms(y_d):.3g} {rms(sent) / rms(y_d):.3f}",
-                f"{when}, max|u| {np.abs(u).max():.3g} mm, J_c {j_c:.3g}; model only",
-            )
-        )
+        e_y, u_y, about = _sent(FullPreview(g, phi), g, y_d)
+        ours = f"{e_y:.3g} {u_y:.3f}"
+        out.append((f"{name}: e/y_d, u/y_d", paper[name], ours, f"{about}; model only"))
     used = resource.getrusage(resource.RUSAGE_SELF)
     out.append(
         (
@@ -273,6 +297,18 @@ def _appendix_h() -> list[Row]:
         )
     )
     return out
+
+
+def _sent(design: FullPreview, g: LiftedOperator, y_d: Array) -> tuple[float, float, str]:
+    """Return error and effort of a command within the stage's travel, and what limits it."""
+    u = design.command(y_d)
+    sent = np.clip(u, -LIMIT_MM, LIMIT_MM)
+    e = y_d - g.apply(sent)
+    beyond = np.flatnonzero(np.abs(u) > LIMIT_MM)
+    when = f"saturates from {beyond[0] * 1e-4:.3f} s" if len(beyond) else "never saturates"
+    j_c = float(np.linalg.norm(design.functions)) / np.sqrt(len(y_d))
+    about = f"{when}, max|u| {np.abs(u).max():.3g} mm, J_c {j_c:.3g}"
+    return rms(e) / rms(y_d), rms(sent) / rms(y_d), about
 
 
 def figure_i5() -> Iterator[Row]:

@@ -20,6 +20,7 @@ from stillpath.compensation.feedback.fmsdob import (
     Around,
     QFilter,
     Shape,
+    Trim,
     design_q,
     fmsdob,
     forward_model,
@@ -122,7 +123,12 @@ def widths() -> Iterator[Row]:
     )
     for shape, through in cases:
         q = design_q(
-            FAST, [4000.0], shape=shape, bandwidth_hz=400.0, through_band=through, around="plant"
+            FAST,
+            [4000.0],
+            shape=shape,
+            bandwidth_hz=400.0,
+            trim=Trim(through_band=through),
+            around="plant",
         )
         width = notch_width_hz(FAST, q, 4000.0, "plant")
         peak = 20 * np.log10(np.abs(add_on(FAST, q, np.linspace(1, 20000, 40000), "plant")).max())
@@ -132,7 +138,7 @@ def widths() -> Iterator[Row]:
     band = LatticeBandPass.at((4000.0,), (400.0,), FAST.dt_s)
     yield shown("slope of 1 - PQ at 4 kHz, Hermite and 400 Hz BP", "0", f"{abs(band.slope(0)):.1f}",
                 "NOT: d|Q_BP|/dw = 0 does not keep (11), its phase turns")  # fmt: skip
-    detuned = design_q(FAST, [4000.0], bandwidth_hz=40.0, detuning=0.7, around="plant")
+    detuned = design_q(FAST, [4000.0], bandwidth_hz=40.0, trim=Trim(detuning=0.7), around="plant")
     depth = 20 * np.log10(np.abs(add_on(FAST, detuned, np.array([4000.0]), "plant")[0]))
     yield checked("notch depth with detuning k = .7", 20 * np.log10(0.3), depth, 0.01,
                   "1 - k (finding e)", "dB")  # fmt: skip

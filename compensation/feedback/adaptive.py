@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback._adaptive_kernels import track
 from stillpath.compensation.feedback.controller import Controller
-from stillpath.compensation.feedback.fmsdob import Around, QFilter, add_on_blocks, design_q, fmsdob
+from stillpath.compensation.feedback.fmsdob import QFilter, add_on_blocks, design_q, fmsdob
 from stillpath.models.diagrams import Block
 from stillpath.models.loops import Loop
 
@@ -126,9 +126,8 @@ class AdaptiveFmsdob:
         *,
         bandwidth_hz: float = 50.0,
         floor_rms: float = 1e-6,
-        around: Around = "servo",
     ) -> None:
-        self._loops, self._tones, self._around = tuple(loops), tones, around
+        self._loops, self._tones = tuple(loops), tones
         self._bandwidth_hz = bandwidth_hz
         self.tracker = FrequencyTracker(tones, loops[0].dt_s, floor_rms)
         top = 0.5 / loops[0].dt_s
@@ -137,7 +136,7 @@ class AdaptiveFmsdob:
         self._last: tuple[float, ...] = ()
         self._judged: tuple[float, ...] = ()
         self._refused: tuple[float, ...] = ()
-        self._unloop = _unlooped(loops[0]) if around == "servo" else (np.ones(1), np.ones(1))
+        self._unloop = _unlooped(loops[0])
         self._memory = np.zeros(max(map(len, self._unloop)) - 1)
 
     @property
@@ -148,7 +147,7 @@ class AdaptiveFmsdob:
     @property
     def blocks(self) -> tuple[Block, ...]:
         """The observer, silent, with its final structure."""
-        return add_on_blocks(self._loops[0], self._silent(), self._around)
+        return add_on_blocks(self._loops[0], self._silent(), "servo")
 
     def hear(self, dhat: Array) -> Retuning | None:
         """Return what to change after the samples `dhat`, None for nothing."""
@@ -172,9 +171,7 @@ class AdaptiveFmsdob:
         """
         if not self._tuned:
             raise DesignError("no tone is identified at present")
-        return fmsdob(
-            self._loops, self._tuned, bandwidth_hz=self._bandwidth_hz, around=self._around
-        )
+        return fmsdob(self._loops, self._tuned, bandwidth_hz=self._bandwidth_hz)
 
     def _retuned(self, targets: tuple[float, ...]) -> Retuning | None:
         if targets == self._tuned:
@@ -186,9 +183,7 @@ class AdaptiveFmsdob:
             if _apart(targets, self._judged) > 0.5 * self._bandwidth_hz:
                 self.controller()
                 self._judged = targets
-            q = design_q(
-                self._loops[0], targets, bandwidth_hz=self._bandwidth_hz, around=self._around
-            )
+            q = design_q(self._loops[0], targets, bandwidth_hz=self._bandwidth_hz)
         except DesignError:
             # Two tones not told apart yet, or a member would be unstable: leave it until they move.
             self._tuned, self._refused = before, targets
@@ -197,9 +192,7 @@ class AdaptiveFmsdob:
         return Retuning(q.blocks("dhat", "c"), reset=far)
 
     def _silent(self) -> QFilter:
-        q = design_q(
-            self._loops[0], self._idle, bandwidth_hz=self._bandwidth_hz, around=self._around
-        )
+        q = design_q(self._loops[0], self._idle, bandwidth_hz=self._bandwidth_hz)
         return QFilter(q.taps, q.band_pass, 0.0)
 
 

@@ -24,6 +24,7 @@ from stillpath.models.loops import Loop
 __all__ = [
     "CoefficientSet",
     "Controller",
+    "Design",
     "Extreme",
     "Prediction",
     "Refusal",
@@ -227,43 +228,55 @@ class Controller:
         return "\n".join([*lines, "", f"#endif /* {guard} */", ""])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """An add-on before it is judged.
+
+    Attributes
+    ----------
+    noise_gain : float, optional
+        Left out: the rms of T over frequency.
+    every : int
+        Ticks of the blocks per sample of the loop.
+    sensor : SensorSpec, optional
+        What the add-on measures with, beside the servo.
+    """
+
+    method: str
+    blocks: tuple[Block, ...]
+    prediction: Prediction
+    coefficients: tuple[CoefficientSet, ...]
+    settings: Mapping[str, object]
+    notes: tuple[str, ...] = ()
+    noise_gain: float | None = None
+    every: int = 1
+    sensor: SensorSpec | None = None
+
+
 def judged(
-    method: str,
-    loops: Sequence[Loop],
-    blocks: Sequence[Block],
-    prediction: Prediction,
-    coefficients: Sequence[CoefficientSet],
-    *,
-    uncertainty: Uncertainty | None = None,
-    noise_gain: float | None = None,
-    every: int = 1,
-    sensor: SensorSpec | None = None,
-    settings: Mapping[str, object] | None = None,
-    notes: Sequence[str] = (),
+    design: Design, loops: Sequence[Loop], uncertainty: Uncertainty | None = None
 ) -> Controller:
     """Return the controller if it may be loaded.
 
     Parameters
     ----------
+    design : Design
     loops : sequence of Loop
         The nominal loop first, then the members it may turn into.
     uncertainty : float or function of f_hz, optional
         Relative plant error that must be survived at every frequency (small gain; sufficient,
         not necessary), at least 1e-4. The members are always checked, exactly.
-    noise_gain : float, optional
-        Left out: the rms of T over frequency.
-    every : int
-        Ticks of the blocks per sample of the loop.
 
     Raises
     ------
     Refusal
         If the loop with the add-on is unstable for a member, or |Delta| >= 1/|T| somewhere.
     """
+    method, prediction = design.method, design.prediction
     _check_small_gain(method, prediction, uncertainty)
     radii = []
     for loop in loops:
-        whole = Diagram((*loop.blocks(every=every, sensor=sensor), *blocks))
+        whole = Diagram((*loop.blocks(every=design.every, sensor=design.sensor), *design.blocks))
         radius = whole.spectral_radius()
         if radius >= 1.0 - 1e-12:
             raise Refusal(
@@ -272,6 +285,7 @@ def judged(
                 "detune, drop the targets where the plant is least known, or identify it better",
             )
         radii.append(radius)
+    noise_gain = design.noise_gain
     if noise_gain is None:
         f = prediction.f_hz
         power = np.trapezoid(np.abs(prediction.t) ** 2, f) / (f[-1] - f[0])
@@ -280,14 +294,14 @@ def judged(
     return Controller(
         method,
         nominal.name,
-        float(nominal.dt_s) / every,
-        tuple(coefficients),
-        tuple(blocks),
+        float(nominal.dt_s) / design.every,
+        design.coefficients,
+        design.blocks,
         prediction,
         noise_gain,
         tuple(radii),
-        dict(settings or {}),
-        (*nominal.notes, *notes),
+        dict(design.settings),
+        (*nominal.notes, *design.notes),
     )
 
 

@@ -21,6 +21,7 @@ from scipy.optimize import brentq
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Prediction,
     Refusal,
     Uncertainty,
@@ -87,9 +88,8 @@ def design_disturbance_observer(
     late = z**-delay * polynomial_response(q_num, q_den, z)
     match = true.plant(f) / assumed.plant(f)
     factor = (1 - late) / (1 + true.s0(f) * late * (match - 1))
-    return judged(
+    design = Design(
         "dob",
-        loops,
         blocks,
         Prediction(f, true.s0(f), np.asarray(factor)),
         (
@@ -97,9 +97,9 @@ def design_disturbance_observer(
             CoefficientSet("own", "iir", {"num": blocks[1].num, "den": blocks[1].den,
                                           "delay": delay}),
         ),
-        uncertainty=uncertainty,
         settings={"cutoff_hz": cutoff_hz, "delay_samples": delay},
     )  # fmt: skip
+    return judged(design, loops, uncertainty)
 
 
 def binomial_q(cutoff_hz: float, dt_s: float) -> tuple[Array, Array]:

@@ -24,6 +24,7 @@ from stillpath.compensation.feedback.bandpass import LatticeBandPass
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Prediction,
     Refusal,
     Uncertainty,
@@ -38,6 +39,7 @@ __all__ = [
     "Around",
     "QFilter",
     "Shape",
+    "Trim",
     "add_on_blocks",
     "design_q",
     "fmsdob",
@@ -101,15 +103,42 @@ class QFilter:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Trim:
+    """What else a Q may be made to do.
+
+    Attributes
+    ----------
+    detuning : float
+        In (0, 1]; below 1 it takes from the notches and gives to the rest.
+    zeros : sequence of (radius, f_hz)
+        Fixed zeros of Q: keep it out of frequencies that must not change.
+    through_band : bool
+        Interpolate 1/(F Q_BP) with its slope instead of 1/F. The band pass turns the phase at
+        the targets, so a Hermite Q after it is no wider than a pointwise one; this undoes the
+        turn, and with it what the band pass had saved elsewhere.
+    """
+
+    detuning: float = 1.0
+    zeros: Sequence[tuple[float, float]] = ()
+    through_band: bool = False
+
+    def settings(self) -> dict[str, object]:
+        """Return what a controller's document says of it."""
+        zeros = [list(zero) for zero in self.zeros]
+        return {"detuning": self.detuning, "zeros": zeros, "through_band": self.through_band}
+
+
+_UNTRIMMED = Trim()
+
+
 def fmsdob(
     loops: Sequence[Loop],
     targets_hz: Sequence[float],
     *,
     shape: Shape = "pointwise",
     bandwidth_hz: float | Sequence[float] | None = 50.0,
-    detuning: float = 1.0,
-    zeros: Sequence[tuple[float, float]] = (),
-    through_band: bool = False,
+    trim: Trim = _UNTRIMMED,
     around: Around = "servo",
     uncertainty: Uncertainty | None = None,
 ) -> Controller:
@@ -124,7 +153,7 @@ def fmsdob(
         against the sampling rate make Hermite filters amplify elsewhere: see `max_add_on`.
     bandwidth_hz : float, sequence of float, or None
         -3 dB width of the band pass; None leaves it out.
-    detuning, zeros, through_band : see `design_q`
+    trim : Trim
     around : "servo" or "plant"
         Forward model, see the module.
     uncertainty : float or function of f_hz, optional
@@ -138,46 +167,41 @@ def fmsdob(
         If the loop would be unstable for a member, or small gain is violated.
     """
     nominal = loops[0]
-    if around == "plant" and nominal.plant_radius >= 1.0 - 1e-9:
-        raise Refusal(
-            "unstable",
-            f"fmsdob on {nominal.name!r}: the plant has a pole at |z| = "
-            f"{nominal.plant_radius:.6f}, so its model alone would drift; use around='servo'",
-        )
+    _check_model(nominal, around)
     q = design_q(
-        nominal,
-        targets_hz,
-        shape=shape,
-        bandwidth_hz=bandwidth_hz,
-        detuning=detuning,
-        zeros=zeros,
-        through_band=through_band,
-        around=around,
+        nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz, trim=trim, around=around
     )
-    widths = _widths(bandwidth_hz, len(targets_hz)) or (0.01 / nominal.dt_s,) * len(targets_hz)
-    f = frequency_grid(nominal.dt_s, targets_hz, widths)
-    check = instant_check(nominal, targets_hz)
-    return judged(
+    asked = _widths(bandwidth_hz, len(targets_hz))
+    f = frequency_grid(nominal.dt_s, targets_hz, asked or (0.01 / nominal.dt_s,) * len(targets_hz))
+    least = instant_check(nominal, targets_hz)
+    design = Design(
         "fmsdob",
-        loops,
         add_on_blocks(nominal, q, around),
         Prediction(f, nominal.s0(f), 1.0 - _forward(nominal, around, f) * _at(q, nominal, f)),
         (*q.coefficients(), _model_coefficients(nominal, around)),
-        uncertainty=uncertainty,
         settings={
             "targets_hz": [float(t) for t in targets_hz],
             "shape": shape,
-            "bandwidth_hz": list(_widths(bandwidth_hz, len(targets_hz))),
-            "detuning": detuning,
-            "zeros": [list(zero) for zero in zeros],
-            "through_band": through_band,
+            "bandwidth_hz": list(asked),
+            **trim.settings(),
             "around": around,
         },
-        notes=[
-            f"narrow band at {target:g} Hz: 1/|T| there at least {20 * math.log10(least):.2f} dB"
-            for target, least in zip(targets_hz, check, strict=True)
-        ],
+        notes=tuple(
+            f"narrow band at {target:g} Hz: 1/|T| there at least {20 * math.log10(value):.2f} dB"
+            for target, value in zip(targets_hz, least, strict=True)
+        ),
     )
+    return judged(design, loops, uncertainty)
+
+
+def _check_model(loop: Loop, around: Around) -> None:
+    """Refuse a forward model that would drift."""
+    if around == "plant" and loop.plant_radius >= 1.0 - 1e-9:
+        raise Refusal(
+            "unstable",
+            f"fmsdob on {loop.name!r}: the plant has a pole at |z| = "
+            f"{loop.plant_radius:.6f}, so its model alone would drift; use around='servo'",
+        )
 
 
 def design_q(
@@ -186,23 +210,10 @@ def design_q(
     *,
     shape: Shape = "pointwise",
     bandwidth_hz: float | Sequence[float] | None = 50.0,
-    detuning: float = 1.0,
-    zeros: Sequence[tuple[float, float]] = (),
-    through_band: bool = False,
+    trim: Trim = _UNTRIMMED,
     around: Around = "servo",
 ) -> QFilter:
-    """Return Q with F Q = `detuning` at the targets.
-
-    Parameters
-    ----------
-    detuning : float
-        In (0, 1]; below 1 it takes from the notches and gives to the rest.
-    zeros : sequence of (radius, f_hz)
-        Fixed zeros of Q: keep it out of frequencies that must not change.
-    through_band : bool
-        Interpolate 1/(F Q_BP) with its slope instead of 1/F. The band pass turns the phase at
-        the targets, so a Hermite Q after it is no wider than a pointwise one; this undoes the
-        turn, and with it what the band pass had saved elsewhere.
+    """Return Q with F Q = `trim.detuning` at the targets; parameters as in `fmsdob`.
 
     Raises
     ------
@@ -210,16 +221,16 @@ def design_q(
         See `fmsdob`.
     """
     w = target_angles(loop, targets_hz)
-    if not 0.0 < detuning <= 1.0:
-        raise DesignError(f"detuning {detuning:g}: take a factor in (0, 1]")
+    if not 0.0 < trim.detuning <= 1.0:
+        raise DesignError(f"detuning {trim.detuning:g}: take a factor in (0, 1]")
     values, slopes = inverse_and_slope(*forward_model(loop, around), w)
     widths = _widths(bandwidth_hz, len(w))
     band = LatticeBandPass.at(tuple(map(float, targets_hz)), widths, loop.dt_s) if widths else None
-    if through_band and band is not None:
+    if trim.through_band and band is not None:
         slopes = slopes - values * np.array([band.slope(i) for i in range(len(w))])
-    angles = [(radius, 2 * math.pi * f_hz * loop.dt_s) for radius, f_hz in zeros]
+    angles = [(radius, 2 * math.pi * f_hz * loop.dt_s) for radius, f_hz in trim.zeros]
     taps = interpolating_fir(w, values, slopes if shape == "hermite" else None, angles)
-    return QFilter(tuple(taps.tolist()), band, detuning)
+    return QFilter(tuple(taps.tolist()), band, trim.detuning)
 
 
 def target_angles(loop: Loop, targets_hz: Sequence[float]) -> Array:

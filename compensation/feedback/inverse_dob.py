@@ -15,6 +15,7 @@ from stillpath.compensation.feedback.bandpass import LatticeBandPass
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Prediction,
     Refusal,
     Uncertainty,
@@ -67,9 +68,8 @@ def inverse_dob(
     f = frequency_grid(nominal.dt_s, targets_hz, widths)
     z = nominal.z(f)
     inverse_num, inverse_den = nominal.plant_den, tuple(numerator.tolist())
-    return judged(
+    design = Design(
         "inverse-dob",
-        loops,
         (
             Block("inverse", (("ym", 1.0),), inverse_num, inverse_den),
             Block("late", (("u", 1.0),), delay=delay),
@@ -81,7 +81,7 @@ def inverse_dob(
             *q.coefficients(),
             CoefficientSet("inverse", "iir", {"num": inverse_num, "den": inverse_den}),
         ),
-        uncertainty=uncertainty,
         settings={"targets_hz": [float(t) for t in targets_hz], "bandwidth_hz": bandwidth_hz},
         notes=(f"the inverse has its largest pole at |z| = {radius:.4f}",),
     )
+    return judged(design, loops, uncertainty)

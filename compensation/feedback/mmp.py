@@ -19,6 +19,7 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Prediction,
     Refusal,
     Uncertainty,
@@ -98,6 +99,11 @@ class Predictor:
             for k, run in enumerate(self.runs)
         ]
         return np.asarray(np.mean(parts, axis=0), complex)
+
+    def coefficients(self) -> CoefficientSet:
+        """Return what a controller loads."""
+        w = tuple(tuple(row) for row in self.w.tolist())
+        return CoefficientSet("predictor", "predictor", {"ratio": self.ratio, "b": self.b, "w": w})
 
     def blocks(self, source: str, target: str) -> tuple[Block, ...]:
         """Return the predictor as blocks; `source` holds its value between slow samples."""
@@ -223,9 +229,7 @@ def mmp(
     sensor : SensorSpec
         Its rate (`every` is L) and age.
     alpha : float or None
-        Of the predictor; None takes the fastest that keeps `noise_gain`.
-    noise_gain : float
-        Largest noise gain of the predictor that is accepted.
+        Of the predictor; None takes the fastest that keeps `noise_gain`, the largest accepted.
 
     Raises
     ------
@@ -235,42 +239,20 @@ def mmp(
         Singular tones, too much noise gain, an unstable member, or small gain violated.
     """
     nominal = loops[0]
-    if nominal.fed_back:
-        raise DesignError(
-            f"mmp on {nominal.name!r}: the servo is fed back and would hear the slow sensor; "
-            "mmp is for sensors beside the servo (disturbed: outside)"
-        )
-    made = (
-        predictor_of_gain(targets_hz, sensor.every, nominal.dt_s, noise_gain, sensor.delay_samples)
-        if alpha is None
-        else predictor(targets_hz, sensor.every, nominal.dt_s, alpha, sensor.delay_samples)
-    )
-    distance = singular_distance_hz(targets_hz, sensor.every * nominal.dt_s)
-    if made.noise_gain > noise_gain:
-        raise Refusal(
-            "singular",
-            f"mmp on {nominal.name!r}: the predictor multiplies sensor noise by "
-            f"{made.noise_gain:.3g} (at most {noise_gain:g}); the tones lie {distance:.3g} Hz "
-            "from tones that look alike. Raise alpha, or change the sensor's rate",
-        )
+    made = _quiet_predictor(nominal, targets_hz, sensor, alpha, noise_gain)
     q = design_q(nominal, targets_hz, shape=shape, bandwidth_hz=bandwidth_hz)
     f = frequency_grid(nominal.dt_s, targets_hz, (bandwidth_hz,) * len(targets_hz))
-    through = nominal.servo(f) * q.response(2 * np.pi * f * nominal.dt_s) * made.response(f)
-    return judged(
+    add_on = 1.0 - nominal.servo(f) * q.response(2 * np.pi * f * nominal.dt_s) * made.response(f)
+    distance = singular_distance_hz(targets_hz, sensor.every * nominal.dt_s)
+    design = Design(
         "mmp",
-        loops,
         (*_compared(nominal, sensor), *made.blocks("dslow", "dhat"), *q.blocks("dhat", "c")),
-        Prediction(f, nominal.s0(f), 1.0 - through),
+        Prediction(f, nominal.s0(f), add_on),
         (
-            CoefficientSet(
-                "predictor",
-                "predictor",
-                {"ratio": made.ratio, "b": made.b, "w": tuple(tuple(r) for r in made.w.tolist())},
-            ),
+            made.coefficients(),
             *q.coefficients(),
             CoefficientSet("model", "iir", {"num": nominal.servo_num, "den": nominal.t0_den}),
         ),
-        uncertainty=uncertainty,
         noise_gain=made.noise_gain,
         sensor=sensor,
         settings={
@@ -286,6 +268,36 @@ def mmp(
             f"the tones lie {distance:.4g} Hz from the singular set",
         ),
     )
+    return judged(design, loops, uncertainty)
+
+
+def _quiet_predictor(
+    loop: Loop,
+    targets_hz: Sequence[float],
+    sensor: SensorSpec,
+    alpha: float | None,
+    noise_gain: float,
+) -> Predictor:
+    """Return the predictor; refuse one that the servo would hear, or that multiplies noise."""
+    if loop.fed_back:
+        raise DesignError(
+            f"mmp on {loop.name!r}: the servo is fed back and would hear the slow sensor; "
+            "mmp is for sensors beside the servo (disturbed: outside)"
+        )
+    every, late = sensor.every, sensor.delay_samples
+    if alpha is None:
+        made = predictor_of_gain(targets_hz, every, loop.dt_s, noise_gain, late)
+    else:
+        made = predictor(targets_hz, every, loop.dt_s, alpha, late)
+    if made.noise_gain > noise_gain:
+        distance = singular_distance_hz(targets_hz, every * loop.dt_s)
+        raise Refusal(
+            "singular",
+            f"mmp on {loop.name!r}: the predictor multiplies sensor noise by "
+            f"{made.noise_gain:.3g} (at most {noise_gain:g}); the tones lie {distance:.3g} Hz "
+            "from tones that look alike. Raise alpha, or change the sensor's rate",
+        )
+    return made
 
 
 def _compared(loop: Loop, sensor: SensorSpec) -> tuple[Block, ...]:

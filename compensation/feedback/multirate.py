@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stillpath.compensation.feedback.controller import (
     Controller,
+    Design,
     Prediction,
     Refusal,
     Uncertainty,
@@ -101,19 +102,18 @@ def design_multirate(
     widths = np.full(len(targets), 0.05 * fundamental_hz)
     f = frequency_grid(nominal.dt_s, targets.tolist(), widths.tolist())
     factor = multirate_factor(nominal, model, inverse, rates.factor, f)
-    return judged(
+    design = Design(
         "rc-multirate",
-        loops,
         blocks,
         Prediction(f, nominal.s0(f), factor),
         repetitive_coefficients(model, inverse),
-        uncertainty=uncertainty,
         every=rates.factor,
         settings={"fundamental_hz": fundamental_hz, "alpha": alpha, "period": rates.period,
                   "nyquist_pairs": nyquist_pairs, "notches_hz": tuple(notches_hz),
                   "factor": rates.factor, "fast_rate_hz": rates.rate_hz},
         notes=inverse.notes,
     )  # fmt: skip
+    return judged(design, loops, uncertainty)
 
 
 def fast_rate(rate_hz: float, fundamental_hz: float) -> FastRate:

@@ -22,6 +22,8 @@ __all__ = ["Margins", "inertia_pd", "loop_margins", "margins"]
 
 Complex = NDArray[np.complex128]
 
+_POINTS = 200_001
+
 
 @dataclass(frozen=True, slots=True)
 class Margins:
@@ -60,9 +62,9 @@ def inertia_pd(b0: float, dt_s: float, f_hz: float, zeta: float) -> tuple[float,
     return (1 + a1 + a2) / (2 * b0), (1 - a2) / (2 * b0)
 
 
-def loop_margins(loop: Loop, points: int = 200_001) -> Margins:
+def loop_margins(loop: Loop) -> Margins:
     """Return the margins of P C, cut open at the plant's input."""
-    f_hz = np.linspace(0.5 / loop.dt_s / points, 0.5 / loop.dt_s, points)
+    f_hz = np.linspace(0.5 / loop.dt_s / _POINTS, 0.5 / loop.dt_s, _POINTS)
     return margins(f_hz, loop.t0(f_hz) / loop.s0(f_hz))
 
 

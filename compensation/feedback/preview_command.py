@@ -19,34 +19,28 @@ __all__ = ["preview_command"]
 
 Array = NDArray[np.float64]
 
+_WINDOW, _UPDATE = 64, 16
+"""Samples that are looked at, and of them those that are committed."""
+_FUNCTIONS = 40
+"""Of the window; functions/(2 window dt) is the cut-off frequency of the command."""
 
-def preview_command(
-    loop: Loop, y_d: Array, *, window: int = 64, update: int = 16, functions: int = 40
-) -> Array:
+
+def preview_command(loop: Loop, y_d: Array) -> Array:
     """Return the reference for a desired position, shape (n,), that starts and ends at rest.
-
-    Parameters
-    ----------
-    loop : Loop
-    y_d : ndarray, shape (n,)
-    window, update : int
-        Samples that are looked at, and of them those that are committed.
-    functions : int
-        Of the window; functions/(2 window dt) is the cut-off frequency of the command.
 
     Raises
     ------
     DesignError
         If the windows' recursion is not stable, or the functions are nearly dependent.
     """
-    lifted = lifted_window([reference_plant(loop)], [1.0], window, update)
-    design = PreviewDesign(lifted, functions)
-    windows = -(-len(y_d) // update)
-    path = np.pad(y_d, (0, windows * update + window - len(y_d)), mode="edge")
-    command = np.empty(windows * update)
+    lifted = lifted_window([reference_plant(loop)], [1.0], _WINDOW, _UPDATE)
+    design = PreviewDesign(lifted, _FUNCTIONS)
+    windows = -(-len(y_d) // _UPDATE)
+    path = np.pad(y_d, (0, windows * _UPDATE + _WINDOW - len(y_d)), mode="edge")
+    command = np.empty(windows * _UPDATE)
     z = lifted.rest_state(float(y_d[0]))
-    for first in range(0, windows * update, update):
-        committed = design.command_gain @ z + design.path_gain @ path[first : first + window]
-        command[first : first + update] = committed
+    for first in range(0, windows * _UPDATE, _UPDATE):
+        committed = design.command_gain @ z + design.path_gain @ path[first : first + _WINDOW]
+        command[first : first + _UPDATE] = committed
         advance_window(lifted.advance, design.state_drive, z, committed)
     return command[: len(y_d)]

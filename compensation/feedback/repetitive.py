@@ -36,6 +36,7 @@ from scipy.special import diric
 from stillpath.compensation.feedback.controller import (
     CoefficientSet,
     Controller,
+    Design,
     Extreme,
     Prediction,
     Refusal,
@@ -268,18 +269,15 @@ def exact_frequency(f_hz: float) -> Fraction:
     return Fraction(round(f_hz * 1000), 1000)
 
 
-def invert_servo(
-    num: Sequence[float], den: Sequence[float], radius: float = _RADIUS
-) -> ServoInverse:
+def invert_servo(num: Sequence[float], den: Sequence[float]) -> ServoInverse:
     """Return a causal, stable inverse of V = num/den up to a preview.
 
     Parameters
     ----------
     num, den : sequence of float
         Powers of z^-1.
-    radius : float
-        Largest pole of the inverse.
     """
+    radius = _RADIUS
     top = np.trim_zeros(np.asarray(num, float), "b")
     delay = int(np.flatnonzero(top)[0])
     top = top[delay:]
@@ -433,13 +431,12 @@ def _designed(
     angle = 2 * np.pi * f * nominal.dt_s
     match = nominal.servo(f) * inverse.response(angle)
     factor = plug_in_factor(model.response(angle), match)
-    return judged(
+    design = Design(
         method,
-        loops,
         blocks,
         Prediction(f, nominal.s0(f), factor),
         repetitive_coefficients(model, inverse),
-        uncertainty=uncertainty,
         settings=asked | {"period": model.period},
         notes=(*inverse.notes, *notes),
     )
+    return judged(design, loops, uncertainty)

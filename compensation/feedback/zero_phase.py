@@ -96,14 +96,13 @@ def design_prefilter(
     kind: str = "zpetc",
     cutoff_hz: float | None = None,
     length: int = _PREVIEW,
-    order: int = 0,
 ) -> Prefilter:
     """Invert the loop's answer to its reference.
 
     Parameters
     ----------
     loop : Loop
-    kind, order
+    kind : str
         See `compensation.inversion.invert`.
     cutoff_hz : float, optional
         Of the zero-phase FIR; none if left out (see `fir_within`).
@@ -118,7 +117,7 @@ def design_prefilter(
     if length < 1:
         raise DesignError(f"low-pass that looks {length} samples ahead; at least 1 is needed")
     # The scale of a reference is the user's: the inverse must reach constants exactly.
-    inversion = invert(kind, reference_plant(loop), order, unit_dc=True)
+    inversion = invert(kind, reference_plant(loop), order=0, unit_dc=True)
     fir = None if cutoff_hz is None else zero_phase_fir(cutoff_hz, loop.dt_s, length)
     return Prefilter(inversion, fir, loop.dt_s)
 

@@ -64,8 +64,8 @@ class Planner(Protocol):
     def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
         """Plan moves that follow the last ones without a stop; return what is settled by now."""
 
-    def queue_moves(self, moves: Moves, limits: Sequence[Limits]) -> None:
-        """Take moves like `push_moves`, to be planned all at once by `flush`."""
+    def plan_whole(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
+        """Plan moves that follow the last ones, all at once, and come to rest."""
 
     def stop(self, dwell_s: float = 0.0) -> Phases:
         """Come to rest after the last move and stand for `dwell_s`."""

@@ -12,7 +12,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import between_stops, empty_phases, join_phases
 from stillpath.gcode.types import Limits, Moves, Phases, ProgramBlock
 
-__all__ = ["QueuePlanner"]
+__all__ = ["QueuePlanner", "with_motion"]
 
 _ROWS = 1024
 _LARGE_TABLE = 64
@@ -72,9 +72,10 @@ class QueuePlanner(ABC):
         """
         return self._plan(moves, 0, len(moves), limits)
 
-    def queue_moves(self, moves: Moves, limits: Sequence[Limits]) -> None:
-        """Take moves like `push_moves`, to be planned all at once by `flush`."""
+    def plan_whole(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
+        """Plan moves that follow the last ones, all at once, and come to rest."""
         self._enter(moves, 0, len(moves), limits)
+        return self.stop()
 
     def stop(self, dwell_s: float = 0.0) -> Phases:
         """Come to rest after the last move and stand for `dwell_s`."""
@@ -102,13 +103,7 @@ class QueuePlanner(ABC):
             larger = np.empty((2 * (self._count + n), self._queue.shape[1]))
             larger[: self._count] = self._queue[: self._count]
             self._queue = larger
-        rows = slice(begun, end)
-        problem, bad = self._append(
-            moves.start_mm[rows],
-            moves.end_mm[rows],
-            moves.speed_mm_s[rows],
-            moves.limits_id[rows],
-        )
+        problem, bad = self._append(moves, slice(begun, end))
         if problem >= 0:
             raise self._error(problem, moves, begun + bad)
         self._moves += n
@@ -119,14 +114,8 @@ class QueuePlanner(ABC):
         return True
 
     @abstractmethod
-    def _append(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-    ) -> tuple[int, int]:
-        """Enter moves after the rows in use; return a problem (or -1) and the move's row."""
+    def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:
+        """Enter moves after the rows in use; return a problem (or -1) and its row of `rows`."""
 
     @abstractmethod
     def _take(self, *, final: bool) -> Phases:
@@ -135,6 +124,21 @@ class QueuePlanner(ABC):
     @abstractmethod
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
         """Say what is wrong with a move."""
+
+
+def with_motion(
+    phases: Phases, times_s: NDArray[np.float64], speeds: NDArray[np.float64]
+) -> Phases:
+    """Return phases with times and speeds as kernels write them, (4, n) each, in their order."""
+    columns = (
+        *times_s,
+        phases.start_mm,
+        phases.direction,
+        *speeds,
+        phases.move_index,
+        phases.s_curve,
+    )
+    return Phases(*columns)
 
 
 def _rows_of(limits: Sequence[Limits], used: NDArray[np.int32]) -> NDArray[np.float64]:

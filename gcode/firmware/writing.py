@@ -17,6 +17,15 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
+from stillpath.gcode.firmware.line_reader import (
+    AXES,
+    EXTRUSION,
+    FEED,
+    NUMBERED,
+    POSITIONING,
+    SET_POSITION,
+    LineReader,
+)
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
@@ -24,17 +33,6 @@ from stillpath.gcode.types import EventKind, Limits, ModalState
 __all__ = ["StreamWriter"]
 
 _BYTES_PER_LINE = 96
-_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
-_MOVE_WITH_SUBCODE = re.compile(rb"^\s*(?:N\d+\s*)?G-?0*[0-35]\.\d", re.IGNORECASE)
-_FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
-_AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
-_FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
-_SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
-_POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G\s*0*9[01](?!\d)")
-_EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M\s*0*8[23](?!\d)")
-_E_WORD = re.compile(rb"E\s*([-+]?(?:\d+\.?\d*|\.\d+))")
-_E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
-_NUMBERED = re.compile(rb"^\s*N\d+\s*")
 _VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
 _ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
@@ -70,7 +68,7 @@ class StreamWriter:
 
     def __init__(self, firmware: FirmwareAdapter, stamp: str) -> None:
         self._stream_commands = firmware.stream_commands()
-        self._e_word = _E_WORD_FOLDED if self._stream_commands.folds_case else _E_WORD
+        self._lines = LineReader(self._stream_commands)
         self._extruder_alone_stops = firmware.extruder_alone_stops
         self._limits_now: Limits | None = None
         """What the printer plans with, while streaming."""
@@ -157,7 +155,7 @@ class StreamWriter:
             conflict = self._stream_commands.conflict(line)
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
-            if events.kind[row] != EventKind.SHAPER or self._is_move(line.split(b";", 1)[0]):
+            if events.kind[row] != EventKind.SHAPER or self._lines.is_move(line.split(b";", 1)[0]):
                 continue  # a line that moves too cannot be said again
             self._shaper_off = False
             if not self._note_shaper(line, int(events.line[row])):
@@ -276,19 +274,19 @@ class StreamWriter:
             return line
         state = piece.modal[int(events.modal_id[k])]
         code = line.split(b";", 1)[0].upper()
-        if self._is_move(code):
+        if self._lines.is_move(code):
             # It goes where the plan is, and the command is somewhere else; a bare F is harmless.
             return _held_back(line) if re.search(rb"[XYZEIJK]", code) else line
-        if _SET_POSITION.match(code):
+        if SET_POSITION.match(code):
             row = min(int(events.move_index[k]), len(piece.moves) - 1)
             planned = float(piece.moves.start_mm[row, 3])
             return line + self._set_again(line, (extruded_mm - planned) / state.extrude_factor)
         # Only what the line itself says changes: our own modes differ from the file's.
-        if _POSITIONING.match(code):
+        if POSITIONING.match(code):
             self._modal = replace(self._modal, absolute_xyz=state.absolute_xyz)
             if self._stream_commands.positioning_sets_extruder:
                 self._modal = replace(self._modal, absolute_e=state.absolute_e)
-        elif _EXTRUSION.match(code):
+        elif EXTRUSION.match(code):
             self._modal = replace(self._modal, absolute_e=state.absolute_e)
         return line
 
@@ -301,9 +299,9 @@ class StreamWriter:
         own = piece.limits[int(moves.limits_id[row])]
         lead = self._limits_to(self._stream_commands.in_stream(own))
         lead += self._file_modes(state)
-        moves_on = self._is_move(code)
+        moves_on = self._lines.is_move(code)
         # Not G10 and G11, whatever words they have: what E reads does not see them.
-        ends = self._extruder_word(code) if state.absolute_e and moves_on else None
+        ends = self._lines.extruder_word(code) if state.absolute_e and moves_on else None
         if ends is not None:
             fed = (float(moves.end_mm[row, 3]) - extruded_mm) / state.extrude_factor
             lead += self._file_extruder(ends - fed)
@@ -311,18 +309,11 @@ class StreamWriter:
         elif self._far_mm is not None and moves_on:
             fed = float(moves.end_mm[row, 3] - moves.start_mm[row, 3])
             self._reads(self._far_mm + fed / state.extrude_factor)
-        if moves_on and not _FEED.search(code):
-            alone = self._stream_commands.factors_need_axes and not _AXES.search(code)
+        if moves_on and not FEED.search(code):
+            alone = self._stream_commands.factors_need_axes and not AXES.search(code)
             factor = 1.0 if alone else state.speed_factor
             lead += _feed_line(float(moves.speed_mm_s[row]) * 60.0 / factor)
         return lead + line
-
-    def _is_move(self, code: bytes) -> bool:
-        """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
-        commands = self._stream_commands
-        further = not commands.one_command and _FURTHER_MOVE.search(code)
-        subcode = commands.ignores_subcodes and _MOVE_WITH_SUBCODE.match(code)
-        return bool(_MOVE.match(code) or further or subcode)
 
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:
@@ -350,18 +341,13 @@ class StreamWriter:
 
         The file counts from there whenever its E is absolute, which may be much later.
         """
-        value_mm = self._extruder_word(line.split(b";", 1)[0])
+        value_mm = self._lines.extruder_word(line.split(b";", 1)[0])
         if value_mm is None:
             return b""
         reads_mm = value_mm + ahead_mm
         self._zero_mm = 0.0
         self._reads(reads_mm)
         return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
-
-    def _extruder_word(self, code: bytes) -> float | None:
-        """Return the E of a line; of several the last, as Marlin does, which alone needs it."""
-        found = self._e_word.findall(code)
-        return float(found[-1]) if found else None
 
     def _file_extruder(self, file_mm: float) -> bytes:
         """Line after which the printer's E reads what the file's does."""
@@ -389,7 +375,7 @@ class StreamWriter:
 
     def _note_shaper(self, line: bytes, number: int) -> bool:
         """Note a line that sets the shaper; tell whether it does."""
-        words = _NUMBERED.sub(b"", line).split()
+        words = NUMBERED.sub(b"", line).split()
         name = words[0].decode("ascii", "replace").upper() if words else ""
         if name.startswith(_ADVANCE):
             return _FURTHER_SHAPER.search(line) is not None

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 from scipy.signal.windows import tukey
 
@@ -62,7 +62,6 @@ def estimate_response(
     log: AccelerationLog,
     excitation: Excitation,
     *,
-    sensor_direction: ArrayLike | None = None,
     aligned: AlignedLog | None = None,
     label: str = "",
     progress: Progress | None = None,
@@ -86,7 +85,7 @@ def estimate_response(
     """
     report = progress or _silent
     report("align", 0.0)
-    aligned = aligned or align(log, excitation, sensor_direction=sensor_direction)
+    aligned = aligned or align(log, excitation)
     report("align", 1.0)
     response = estimate_aligned(log, aligned, excitation, label=label)
     _check_followed(response, excitation)
@@ -183,22 +182,16 @@ def check_plateau(response: FrequencyResponse, excitation: Excitation) -> None:
 def estimate_driven(
     driven: DrivenLog | Sequence[DrivenLog],
     *,
-    half_band_hz: float | None = None,
     label: str = "",
-    progress: Progress | None = None,
 ) -> FrequencyResponse:
     """Return the response of a recorded drive by local least squares.
 
     For a swept sine, a step or any other short record: there Welch's method has only one segment
     at each frequency, and its coherence says nothing. Several logs of the same axis are put into
     one set of equations. Transients are fitted too unless every command begins and ends at the
-    same rest (near both ends of a sweep they can hardly be told from the response).
-
-    Parameters
-    ----------
-    half_band_hz : float, optional
-        Default: what the unknowns need, some 8 bins of one log and fewer of several; more of
-        long logs, so that there are some 4000 points at most.
+    same rest (near both ends of a sweep they can hardly be told from the response). The band around
+    each frequency is what the unknowns need, some 8 bins of one log and fewer of several; more of
+    long logs, so that there are some 4000 points at most.
 
     Returns
     -------
@@ -206,23 +199,18 @@ def estimate_driven(
         At the frequencies with at least -50 dB of the strongest drive.
     """
     logs = _several(driven)
-    report = progress or _silent
     records = []
     transient = not all(_rests(log.command) for log in logs)
-    for i, log in enumerate(logs):
+    for log in logs:
         # Gravity and offsets of sensors are no response.
         command, measured = (
             v - np.mean(v if transient else _ends(v)) for v in (log.command, log.measured)
         )
         records.append(_transformed(command, measured, _rate_hz(log), taper=0.0))
-        report("estimate", (i + 1) / (len(logs) + 1))
     reach = bins_needed(len(records), transient=transient) // 2
-    half = half_band_hz or max(
-        *(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS
-    )
+    half = max(*(reach * r.spacing_hz for r in records), 4.0 * _nyquist_hz(records) / _MOST_POINTS)
     f_hz = _driven_grid(records, half)
     found = local_response(records, f_hz, half, transient=transient)
-    report("estimate", 1.0)
     return _driven_response(logs, f_hz, found, label)
 
 

@@ -133,19 +133,18 @@ def drive_spectrum(excitation: Excitation, f_hz: ArrayLike) -> Array:
     return np.asarray(amplitude**2 / (2 * (high - low)) * harmonics, np.float64)
 
 
-def drive_spectrum_regenerated(
-    excitation: Excitation, f_hz: ArrayLike, rate_hz: float = 3200.0
-) -> Array:
+def drive_spectrum_regenerated(excitation: Excitation, f_hz: ArrayLike) -> Array:
     """Return the drive's spectral density as Klipper's Welch estimate sees the command.
 
     Includes the slow square wave, the transient at both ends of the band, and the bandwidth of
-    the window; interpolated from the bins of a record at `rate_hz`.
+    the window; interpolated from the bins of a record at 3200 Hz.
 
     Returns
     -------
     ndarray, shape of `f_hz`
         (mm/s^2)^2/Hz
     """
+    rate_hz = 3200.0
     profile = regenerate(excitation)
     time_s = np.arange(0.0, profile.duration_s, 1.0 / rate_hz)
     bins, density = klipper_psd(time_s, profile.cell_averages(time_s, 1.0 / rate_hz))

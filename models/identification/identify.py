@@ -6,11 +6,9 @@ a set. What was measured with a weight on the bed or at different places becomes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
-
-import numpy as np
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.alignment import AlignedLog, align, check_pair
@@ -21,11 +19,19 @@ from stillpath.models.identification.estimation import (
     estimate_aligned,
     estimate_driven,
     estimate_response,
-    plateau_gain,
 )
 from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.messages import (
+    body_notes,
+    by_file,
+    fit_warnings,
+    level_warnings,
+    mounting_notes,
+    parted,
+    scale_warnings,
+)
 from stillpath.models.identification.modal_fit import refit
-from stillpath.models.identification.nozzle import Frame, frame_of
+from stillpath.models.identification.nozzle import frame_of
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -34,6 +40,7 @@ from stillpath.models.identification.readers import (
     excitation_notes,
 )
 from stillpath.models.identification.sets import (
+    Origin,
     delay_warning,
     response_set,
     spectrum_set,
@@ -46,7 +53,6 @@ from stillpath.models.identification.types import (
     AxisIdentification,
     DrivenLog,
     Excitation,
-    Fit,
     FrequencyResponse,
     Measurement,
     PlantModel,
@@ -71,15 +77,6 @@ _KINDS: dict[type, Kind] = {
 _BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectrum)
 """Where an axis has measurements of several kinds, the first kind is used."""
 
-_LEVEL_TOLERANCE = 0.15
-_LEVELS = (0.3, 3.0)
-_MOSTLY = 0.8
-_POOR, _POOR_DB = 0.15, 1.1
-_USELESS, _USELESS_DB = 0.5, 6.0
-"""Residuals beyond which a fit is no model of what was measured."""
-_AHEAD_S = 1e-3
-_LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
-_WARNING = "warning: "
 """How readers mark notes that the user must look at."""
 
 
@@ -173,8 +170,10 @@ class _AxisWork:
         self._left_out = [m for m in measured if not isinstance(m.measurement, kind)]
         self._kind = _KINDS[kind]
         names = {m.measurement.source for m in self._used}
-        self._sources = tuple(s for s in sources if s.name in names)
-        self._date = max(filter(None, map(date_in_name, names)), default=None)
+        self._origin = Origin(
+            sources=tuple(s for s in sources if s.name in names),
+            measured_on=max(filter(None, map(date_in_name, names)), default=None),
+        )
 
     def identified(self) -> AxisIdentification:
         """Return the axis with the notes of its files."""
@@ -187,17 +186,17 @@ class _AxisWork:
         self._steps.stepped(f"axis {self._axis}: fitted")
         notes = list(found.notes)
         used = [one.measurement for one in self._used]
-        notes += _by_file((m.source, n) for m in used for n in m.notes)
+        notes += by_file((m.source, n) for m in used for n in m.notes)
         for one in self._left_out:
             notes.append(
                 f"{one.measurement.source}: not used, because a {self._kind} of axis {self._axis} "
                 "says more"
             )
-        notes += _by_file((r.source, n) for r in found.measured for n in r.notes)
-        told, warned = _parted(dict.fromkeys(notes))
+        notes += by_file((r.source, n) for r in found.measured for n in r.notes)
+        told, warned = parted(dict.fromkeys(notes))
         names = list(dict.fromkeys(m.source for m in used))
-        fit_warnings = _fit_warnings(found.fit, names) if found.fit else ()
-        warnings = (*fit_warnings, *found.warnings, *warned)
+        of_fit = fit_warnings(found.fit, names) if found.fit else ()
+        warnings = (*of_fit, *found.warnings, *warned)
         if found.fit is not None:
             check_informative(found.fit, found.measured, names, warnings)
         return replace(found, notes=told, warnings=warnings)
@@ -210,7 +209,7 @@ class _AxisWork:
         assert isinstance(model, PlantModel)
         plants = typed_in_set(model.spec, kind="model file")
         if plants.provenance is not None:
-            about = plants.provenance.model_copy(update={"sources": self._sources})
+            about = plants.provenance.model_copy(update={"sources": self._origin.sources})
             plants = plants.model_copy(update={"provenance": about})
         return AxisIdentification(axis=self._axis, plants=plants)
 
@@ -234,8 +233,7 @@ class _AxisWork:
             kind=self._kind,
             frame_firm=frame_firm or frame is not None,
             max_order=self._max_order,
-            sources=self._sources,
-            measured_on=self._date,
+            origin=self._origin,
             progress=self._steps.within(f"axis {self._axis}: fitting"),
         )
         nominal = found.fit
@@ -247,10 +245,11 @@ class _AxisWork:
         others = tuple(r for r, c in responses if c not in common)
         notes: list[str] = []
         if self._kind == "raw log":
-            warnings = _level_warnings(chosen, nominal)
-            notes = [*self._mounting_notes(chosen), *_body_notes(friction_mm, frame)]
+            warnings = level_warnings(chosen, nominal)
+            mounting = [] if self._settings.sensor_axis else mounting_notes(self._axis, chosen)
+            notes = [*mounting, *body_notes(friction_mm, frame)]
         else:
-            warnings = _scale_warnings(chosen, nominal)
+            warnings = scale_warnings(chosen, nominal)
         found = replace(
             found,
             plants=found.plants.model_copy(update={"friction_mm": friction_mm or None}),
@@ -279,8 +278,7 @@ class _AxisWork:
             column=self._settings.sensor_axis,
             frame_firm=self._settings.frame_firm,
             max_order=self._max_order,
-            sources=self._sources,
-            measured_on=self._date,
+            origin=self._origin,
             progress=self._steps.within(f"axis {self._axis}: fitting"),
         )
         nominal = found.fit
@@ -295,7 +293,7 @@ class _AxisWork:
             for condition in special([c for _, _, c in spectra])
         }
         others = tuple(s for s, _, c in spectra if c not in common)
-        found = replace(found, measured=(*found.measured, *others), notes=tuple(_by_file(notes)))
+        found = replace(found, measured=(*found.measured, *others), notes=tuple(by_file(notes)))
         return scheduled(found, nominal, fits, self._kind)
 
     def _response(self, one: Measured) -> FrequencyResponse:
@@ -347,23 +345,6 @@ class _AxisWork:
         again = estimate_aligned(log, aligned, test, label=response.label)
         return replace(again, notes=response.notes)
 
-    def _mounting_notes(self, responses: Sequence[FrequencyResponse]) -> list[str]:
-        """Say how the sensor sits, where its axes are not the machine's: many are mounted so."""
-        if self._settings.sensor_axis is not None:
-            return []
-        notes = []
-        for response in responses:
-            along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
-            most = max(along, key=along.__getitem__, default=self._axis)
-            if most != self._axis and along[most] > _MOSTLY:
-                text = (
-                    f"the sensor's {most} moved in the test of axis {self._axis}, so it was taken "
-                    "to be mounted so; if it is not, another axis was measured (sensor_axis "
-                    f"{self._axis} refuses such a log)"
-                )
-                notes.append((response.source, text))
-        return _by_file(notes)
-
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
     text = settings.axis or measurement.axis
@@ -382,112 +363,6 @@ def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:
             "X and Y from tests along X and along Y"
         )
     return "x" if abs(x) > abs(y) else "y"
-
-
-def _by_file(told: Iterable[tuple[str, str]]) -> list[str]:
-    """Put the names of all files before what is said of them, each text once."""
-    sources: dict[str, list[str]] = {}
-    for source, text in dict.fromkeys(told):
-        sources.setdefault(text, []).append(source)
-    return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
-
-
-def _body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
-    """Say what else than the axis was seen."""
-    notes = []
-    if friction_mm:
-        notes.append(
-            f"dry friction holds the axis {1e3 * friction_mm:.1f} um behind its command: the "
-            "response is freed of it, and commands make up for it"
-        )
-    if frame is not None:
-        notes.append(
-            f"the frame shakes on its feet at {frame.f_hz:.1f} Hz (what moves is "
-            f"{frame.mass_ratio:.0%} of its mass): the sensor feels it, the nozzle over the bed "
-            "does not, so the response is freed of it (frame_firm leaves it in)"
-        )
-    return notes
-
-
-def _parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Part notes from those that a reader calls a warning."""
-    told = tuple(told)
-    warned = tuple(text for text in told if _WARNING in text)
-    notes = tuple(text for text in told if text not in warned)
-    return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
-
-
-def _fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
-    """Tell of a model that should not be relied on; refuse one that is none."""
-    if fit.magnitude_only:
-        limits, missed = (_POOR_DB, _USELESS_DB), f"{fit.residual:.1f} dB"
-    else:
-        limits, missed = (_POOR, _USELESS), f"{fit.residual:.0%}"
-    remedy = (
-        "Allow more modes (max_order), leave out files of another state of the machine, or "
-        "measure again"
-    )
-    if fit.residual > limits[1]:
-        raise ModelError(
-            f"{', '.join(sources)}: no stable model of {fit.order} modes explains this: it misses "
-            f"{missed}. Check that file, axis and test belong together. {remedy}"
-        )
-    if fit.residual > limits[0]:
-        text = f"the model misses {missed} of what was measured: look at the curves before it is"
-        return (f"{text} used. {remedy}",)
-    return ()
-
-
-def _level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
-    """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
-    names = ", ".join(r.source for r in responses if plateau_gain(r) is None)
-    if not names or abs(fit.gain - 1.0) <= _LEVEL_TOLERANCE:
-        return []
-    seen = f"{names}: by the fit the sensor moved {fit.gain:.2g} times as much as commanded"
-    if not _LEVELS[0] < fit.gain < _LEVELS[1]:
-        raise ModelError(
-            f"{seen}: it does not sit on what moves, or accel_per_hz or its scale is wrong; "
-            "measure at the part that the axis moves"
-        )
-    return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]
-
-
-def _scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
-    """Tell of a command and a measurement that are hardly those of one axis in one unit."""
-    names, warnings = ", ".join(dict.fromkeys(r.source for r in responses)), []
-    if abs(fit.gain - 1.0) > _LEVEL_TOLERANCE:
-        warnings.append(
-            f"{names}: at low frequencies the measurement is {fit.gain:.3g} times the command, and "
-            "was divided by that: an axis that keeps its steps ends where it is told; check that "
-            "both have the same unit, and which columns they are"
-        )
-    warnings += _by_file((r.source, text) for r in responses if (text := _slope_text(r)))
-    if fit.delay_s < -_AHEAD_S:
-        warnings.append(
-            f"{names}: the measurement is {-fit.delay_s * 1e3:.2g} ms ahead of the command: check "
-            "that the two are not exchanged, and their clocks"
-        )
-    return warnings
-
-
-def _slope_text(response: FrequencyResponse) -> str:
-    """Tell of a response that rises or falls like a power of f over its lowest octave."""
-    f_hz = response.f_hz
-    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
-    if np.count_nonzero(known) < _LEAST_POINTS:
-        return ""
-    lowest = known & (f_hz <= 2.0 * f_hz[known].min())
-    if np.count_nonzero(lowest) < _LEAST_POINTS:
-        return ""
-    slope = np.polyfit(np.log(f_hz[lowest]), np.log(np.abs(response.response[lowest])), 1)[0]
-    power = round(float(slope))
-    if power == 0 or abs(slope - power) > _SLOPE_TOLERANCE:
-        return ""
-    return (
-        f"towards low frequencies the response goes like f^{power:d} instead of being level: "
-        "command and measurement must be the same quantity (both position, or both acceleration); "
-        f"multiply the response by (2 pi j f)^{-power:d}"
-    )
 
 
 def _check_directions(found: Mapping[Axis, AxisIdentification]) -> None:

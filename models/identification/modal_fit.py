@@ -59,7 +59,6 @@ def fit_modes(
     measured: FrequencyResponse | Sequence[FrequencyResponse],
     *,
     max_order: int = 4,
-    band_hz: tuple[float, float] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Fit:
     """Fit modes to a frequency response, or pairs where modes do not explain it as well.
@@ -67,8 +66,8 @@ def fit_modes(
     Parameters and errors as of `fitting.fit_response`.
     """
     single = measured if isinstance(measured, FrequencyResponse) else mean_response(measured)
-    pairs = fit_response(single, max_order=max_order, band_hz=band_hz, progress=progress)
-    data = response_data(single, band_hz)
+    pairs = fit_response(single, max_order=max_order, progress=progress)
+    data = response_data(single)
     found = _orders(data, pairs, max_order)
     if not found:
         return pairs
@@ -83,9 +82,7 @@ def fit_modes(
     return replace(_as_fit(data, chosen), trials=trials)
 
 
-def refit(
-    measured: FrequencyResponse, like: Fit, *, band_hz: tuple[float, float] | None = None
-) -> Fit:
+def refit(measured: FrequencyResponse, like: Fit) -> Fit:
     """Fit a plant of the structure of `like`, starting from it: modes, or pairs.
 
     Raises
@@ -94,10 +91,10 @@ def refit(
         If too few points are left to fit.
     """
     if isinstance(like.spec, PairsSpec):
-        return refit_response(measured, like, band_hz=band_hz)
+        return refit_response(measured, like)
     if not isinstance(like.spec, RelativeModesSpec):
         raise ModelError("a plant of modes or pairs is needed to start from; fit a response first")
-    data = response_data(measured, band_hz)
+    data = response_data(measured)
     structure = ModalStructure(len(like.spec.modes), data.unit_hz, grounded=True)
     theta = structure.parameters_of(like.spec)
     ratio = data.response / structure.response(theta, data.f_hz)

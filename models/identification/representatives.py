@@ -80,9 +80,7 @@ def mode_spread(population: Population[RelativeModesSpec]) -> tuple[ModeEstimate
     return tuple(out)
 
 
-def representatives(
-    centres: Sequence[P], crowd: Sequence[P], count: int = MEMBERS
-) -> Population[P]:
+def representatives(centres: Sequence[P], crowd: Sequence[P]) -> Population[P]:
     """Choose members: one in the middle, then, again and again, the one least like those chosen.
 
     Plants differ by the rms of what they make of a path with corners.
@@ -92,8 +90,6 @@ def representatives(
     centres : sequence of PlantSpec
         Candidates for the middle: the one nearest to all of the crowd is taken.
     crowd : sequence of PlantSpec
-    count : int
-        Most members.
     """
     answers = np.array([_PATH * frequency_response(plant, _F_HZ) for plant in crowd])
     middles = np.array([_PATH * frequency_response(plant, _F_HZ) for plant in centres])
@@ -103,7 +99,7 @@ def representatives(
     away = to_all[middle]
     usual = away <= np.quantile(away, _OUTLIERS)
     nearest = away.copy()
-    while len(members) < min(count, len(crowd)):
+    while len(members) < min(MEMBERS, len(crowd)):
         chosen = int(np.argmax(np.where(usual, nearest, -1.0)))
         if nearest[chosen] <= 0.0:
             break

@@ -153,16 +153,22 @@ def learn_ripple(
         ],
     )
     refuse_unobservable(seen)
+    amplitudes, sd_mm, residual = _solved(matrix, aim, waves)
+    ripple = _axis_ripple(_sources(basis, amplitudes, sd_mm), homing_repeatability_mm)
+    total = _rms_beside(matrix[:, 2 * waves :], aim)
+    explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
+    return RippleLearning(ripple, seen, residual, explained)
+
+
+def _solved(matrix: Array, aim: Array, waves: int) -> tuple[Complex, Array, float]:
+    """Return complex amplitudes of the waves, their standard deviations, and what is left (rms)."""
     unknown, *_ = np.linalg.lstsq(matrix, aim, rcond=None)
     left = aim - matrix @ unknown
     residual = math.sqrt(float(left @ left) / len(left))
     spread = residual * np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
     sines, cosines = unknown[: 2 * waves : 2], unknown[1 : 2 * waves : 2]
     sd_mm = np.hypot(spread[: 2 * waves : 2], spread[1 : 2 * waves : 2]) / math.sqrt(2)
-    ripple = _axis_ripple(_sources(basis, sines + 1j * cosines, sd_mm), homing_repeatability_mm)
-    total = _rms_beside(matrix[:, 2 * waves :], aim)
-    explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
-    return RippleLearning(ripple, seen, residual, explained)
+    return sines + 1j * cosines, sd_mm, residual
 
 
 def update_ripple(

@@ -40,7 +40,7 @@ _DT_S = 0.25e-3
 """Fine against the ripple's waves, which the lines between samples would flatten."""
 
 
-def read_pass(text: str, source: str, dt_s: float = _DT_S) -> PassLog:
+def read_pass(text: str, source: str) -> PassLog:
     """Read one pass; the command between the rows is taken as straight.
 
     Parameters
@@ -48,8 +48,6 @@ def read_pass(text: str, source: str, dt_s: float = _DT_S) -> PassLog:
     text : str
     source : str
         The file's name, for messages.
-    dt_s : float
-        Sampling time of the plant it will be compared with.
 
     Raises
     ------
@@ -75,7 +73,7 @@ def read_pass(text: str, source: str, dt_s: float = _DT_S) -> PassLog:
     if len(back):
         raise table.at(int(back[0]) + 1, "time_s does not rise; sort the rows, or cut the log")
     since = time_s - time_s[0]
-    grid = np.arange(int(since[-1] / dt_s) + 1) * dt_s
+    grid = np.arange(int(since[-1] / _DT_S) + 1) * _DT_S
     homed = any(c.strip("#; \t").lower() == "homed" for c in table.comments)
     return PassLog(
         np.interp(grid, since, position_mm), since, measured, kinds[column], homed, source

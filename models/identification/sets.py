@@ -7,6 +7,7 @@ such a measurement.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import date
 
 import numpy as np
@@ -38,6 +39,7 @@ from stillpath.models.provenance import Kind, MeasuredMode, Provenance, SourceFi
 
 __all__ = [
     "PARAMETRIC_SPREAD",
+    "Origin",
     "delay_warning",
     "parametric_members",
     "plant_set_from",
@@ -61,6 +63,17 @@ PARAMETRIC_SPREAD: dict[str, tuple[float, float]] = {
 real axes differ by 0.7 % and 12 % within a session, by 2 % over weeks; damping from a spectrum
 depends on the order that is fitted."""
 
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The files that measurements come from, and their day."""
+
+    sources: tuple[SourceFile, ...] = ()
+    measured_on: date | None = None
+
+
+_UNKNOWN = Origin()
+
 _MOST_MEMBERS = 15
 _SIGMAS = 3.0
 _NO_DIFFERENCE = 0.02
@@ -81,9 +94,7 @@ def response_set(
     kind: Kind = "raw log",
     frame_firm: bool = False,
     max_order: int = 4,
-    band_hz: tuple[float, float] | None = None,
-    sources: Sequence[SourceFile] = (),
-    measured_on: date | None = None,
+    origin: Origin = _UNKNOWN,
     progress: Callable[[float], None] | None = None,
 ) -> AxisIdentification:
     """Identify an axis from one or more responses: repeats, amplitudes, positions, heights.
@@ -110,31 +121,22 @@ def response_set(
     means = [mean_response(group) for group in groups]
     if len(means) > 1:
         # The mean of shifted peaks has humps that no machine has: they must not add modes.
-        max_order = fit_modes(means[0], max_order=max_order, band_hz=band_hz).order
+        max_order = fit_modes(means[0], max_order=max_order).order
     fitted, drawn = _parts(progress)
-    fit = fit_modes(measured, max_order=max_order, band_hz=band_hz, progress=fitted)
-    fits = [refit(m, fit, band_hz=band_hz) for m in means] if len(means) > 1 else []
-    scatter = _noise_scatter(measured, fit)
-    for group, of_mean in zip(groups, fits, strict=False):
-        # Judged about their own mean, whose peaks are as rounded as the nominal plant's.
-        for repeat in group if len(group) > 1 else ():
-            around = _distance(refit(repeat, fit, band_hz=band_hz), of_mean)
-            scatter = np.maximum(scatter, _FEW_REPEATS * around)
-    kept = _outside_scatter(fits, fit, scatter)
+    fit = fit_modes(measured, max_order=max_order, progress=fitted)
+    fits = [refit(m, fit) for m in means] if len(means) > 1 else []
+    kept = _outside_scatter(fits, fit, _scatter(measured, groups, fit, fits))
     if kept:
-        plants = plant_set_from(fit, kept, kind=kind, sources=sources, measured_on=measured_on)
+        plants = plant_set_from(fit, kept, kind=kind, origin=origin)
     else:
         population, delays_s = explain_response(
             measured, fit, frame_firm=frame_firm, progress=drawn
-        )
-        about = provenance_of(
-            fit, kind, measured, delays_s=delays_s, sources=sources, measured_on=measured_on
         )
         plants = PlantSetSpec(
             nominal=population.members[0],
             members=_weighted(population.members, population.weights),
             band_hz=fit.band_hz,
-            provenance=about,
+            provenance=provenance_of(fit, kind, measured, delays_s=delays_s, origin=origin),
         )
     return AxisIdentification(
         axis=axis,
@@ -154,8 +156,7 @@ def spectrum_set(
     column: str | None = None,
     frame_firm: bool = False,
     max_order: int = 4,
-    sources: Sequence[SourceFile] = (),
-    measured_on: date | None = None,
+    origin: Origin = _UNKNOWN,
     progress: Callable[[float], None] | None = None,
 ) -> AxisIdentification:
     """Identify an axis from one or more spectra of the same test.
@@ -199,8 +200,7 @@ def spectrum_set(
             fit,
             "spectrum",
             delays_s=_span([plant.delay_s for plant in members]),
-            sources=sources,
-            measured_on=measured_on,
+            origin=origin,
         ),
     )
     return AxisIdentification(
@@ -224,8 +224,7 @@ def plant_set_from(
     members: Sequence[Fit] = (),
     *,
     kind: Kind,
-    sources: Sequence[SourceFile] = (),
-    measured_on: date | None = None,
+    origin: Origin = _UNKNOWN,
 ) -> PlantSetSpec:
     """Return the set of a nominal fit and the fits of its members.
 
@@ -240,9 +239,7 @@ def plant_set_from(
         nominal=prompt(fit),
         members=listed,
         band_hz=fit.band_hz,
-        provenance=provenance_of(
-            fit, kind, delays_s=delays_s, sources=sources, measured_on=measured_on
-        ),
+        provenance=provenance_of(fit, kind, delays_s=delays_s, origin=origin),
     )
 
 
@@ -265,8 +262,7 @@ def provenance_of(
     measured: Sequence[FrequencyResponse] = (),
     *,
     delays_s: tuple[float, float] | None = None,
-    sources: Sequence[SourceFile] = (),
-    measured_on: date | None = None,
+    origin: Origin = _UNKNOWN,
 ) -> Provenance:
     """Return what a store keeps of how a plant was found.
 
@@ -280,8 +276,8 @@ def provenance_of(
     share, band_hz = coherent_part(measured)
     return Provenance(
         kind=kind,
-        measured_on=measured_on,
-        sources=tuple(sources),
+        measured_on=origin.measured_on,
+        sources=origin.sources,
         residual=fit.residual,
         delay_s=fit.delay_s,
         gain=fit.gain,
@@ -353,13 +349,27 @@ def _distance(member: Fit, nominal: Fit) -> Array:
     return np.asarray(np.abs(ratio - 1), np.float64)
 
 
-def _noise_scatter(measured: Sequence[FrequencyResponse], fit: Fit) -> Array:
-    """Return three standard deviations of a response, relative, 2 % at least, over the band."""
+def _scatter(
+    measured: Sequence[FrequencyResponse],
+    groups: Sequence[Sequence[FrequencyResponse]],
+    fit: Fit,
+    fits: Sequence[Fit],
+) -> Array:
+    """Return how far responses of one state differ, relative, over the band.
+
+    Three standard deviations of the noise, 2 % at least, and more where repeats show more.
+    """
     f = _grid(fit)
     known = [r for r in measured if np.isfinite(r.sd).all()]
     rows = [np.interp(f, r.f_hz, r.sd / np.abs(r.response)) for r in known]
     noise = _SIGMAS * np.median(rows, axis=0) if rows else np.zeros(len(f))
-    return np.maximum(noise, _NO_DIFFERENCE)
+    scatter = np.maximum(noise, _NO_DIFFERENCE)
+    for group, of_mean in zip(groups, fits, strict=False):
+        # Judged about their own mean, whose peaks are as rounded as the nominal plant's.
+        for repeat in group if len(group) > 1 else ():
+            around = _distance(refit(repeat, fit), of_mean)
+            scatter = np.maximum(scatter, _FEW_REPEATS * around)
+    return scatter
 
 
 def _outside_scatter(fits: list[Fit], nominal: Fit, scatter: Array) -> list[Fit]:

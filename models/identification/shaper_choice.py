@@ -61,9 +61,7 @@ class ShaperChoice:
     score: float
 
 
-def choose_shaper_of(
-    spectrum: Spectrum, *, corner_mm_s: float = 5.0
-) -> tuple[ShaperChoice, tuple[ShaperChoice, ...]]:
+def choose_shaper_of(spectrum: Spectrum) -> tuple[ShaperChoice, tuple[ShaperChoice, ...]]:
     """Return `choose_shaper` of a file as Klipper reads it.
 
     The sum over the sensor's axes; of several data sets the worst decides.
@@ -71,9 +69,9 @@ def choose_shaper_of(
     psd = spectrum.psd
     axes = [psd[name] for name in ("x", "y", "z") if name in psd]
     if "xyz" in psd:
-        return choose_shaper(spectrum.f_hz, psd["xyz"], corner_mm_s=corner_mm_s)
+        return choose_shaper(spectrum.f_hz, psd["xyz"])
     rows = np.sum(axes, axis=0) if axes else np.stack([*psd.values()])
-    return choose_shaper(spectrum.f_hz, rows, corner_mm_s=corner_mm_s)
+    return choose_shaper(spectrum.f_hz, rows)
 
 
 def choose_shaper(

@@ -20,6 +20,11 @@ from scipy.optimize import least_squares
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
 from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.messages import (
+    apart_warning,
+    cross_axis_warning,
+    spectrum_level_warning,
+)
 from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.representatives import Population, mode_spread, representatives
 from stillpath.models.identification.scatter import SCATTERS, Scatter
@@ -37,7 +42,7 @@ from stillpath.models.identification.types import (
 )
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["Explained", "explain_spectra", "fit_spectrum", "refit_spectrum"]
+__all__ = ["Explained", "explain_spectra", "refit_spectrum"]
 
 Array = NDArray[np.float64]
 
@@ -70,9 +75,6 @@ _PER_PARAMETER = 2.0
 """Cost of a parameter (Akaike 1974): a mode must explain more than three numbers of noise."""
 _SAME = 0.03
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
-_WRONG_LEVEL, _CROSS = 0.15, 0.2
-_APART_DB = 2.0
-"""Repeats within a session differ by .3 to 1 dB, tables of one axis weeks apart by up to 1.5 dB."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,29 +127,17 @@ def explain_spectra(
     name = _column(single, column)
     search = _Search(single, name, excitation, spectra, max_order)
     found = search.candidates(progress)
-    accepted: list[_Candidate] = []
-    drawn: list[_Candidate] = []
-    for k, scatter in enumerate(SCATTERS):
-        some = search.accepted(found, scatter)
-        accepted += some
-        drawn += search.drawn(some, scatter)
-        if progress:
-            progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
+    accepted, drawn = _explanations(search, found, progress)
     least_db = min(c.residual_db for c in accepted)
     good = [c for c in accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
-    centres = [c.structure.spec(c.theta) for c in good]
-    crowd = [c.structure.spec(c.theta) for c in (*accepted, *drawn)]
-    if not frame_firm:
-        crowd = search.shaken(crowd)
-        centres += [without_frame(plant) for plant in centres]
-    population = representatives(centres, crowd)
+    population = _population(search, good, (*accepted, *drawn), frame_firm=frame_firm)
     chosen = good[population.middle % len(good)]
     gain = float(np.exp(chosen.vector[0]))
     best = {n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders}
     notes = (
-        *_level_warning(gain, excitation),
-        *_cross_warning(*cross_axis_share(single, name, search.model.band_hz), name),
-        *_apart_warning(spectra, search.repeats),
+        *spectrum_level_warning(gain, excitation),
+        *cross_axis_warning(*cross_axis_share(single, name, search.model.band_hz), name),
+        *apart_warning(spectra, search.repeats),
     )
     fit = Fit(
         spec=population.members[0],
@@ -164,18 +154,31 @@ def explain_spectra(
     return Explained(fit, population)
 
 
-def fit_spectrum(
-    spectrum: Spectrum,
-    excitation: Excitation,
-    *,
-    column: str | None = None,
-    max_order: int = 4,
-    progress: Callable[[float], None] | None = None,
-) -> Fit:
-    """Return the plant in the middle of those that explain a spectrum; see `explain_spectra`."""
-    return explain_spectra(
-        [spectrum], excitation, column=column, max_order=max_order, progress=progress
-    ).fit
+def _explanations(
+    search: _Search, found: Sequence[_Candidate], progress: Callable[[float], None] | None
+) -> tuple[list[_Candidate], list[_Candidate]]:
+    """Return the candidates that explain the spectra, and draws around them."""
+    accepted: list[_Candidate] = []
+    drawn: list[_Candidate] = []
+    for k, scatter in enumerate(SCATTERS):
+        some = search.accepted(found, scatter)
+        accepted += some
+        drawn += search.drawn(some, scatter)
+        if progress:
+            progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
+    return accepted, drawn
+
+
+def _population(
+    search: _Search, good: Sequence[_Candidate], some: Sequence[_Candidate], *, frame_firm: bool
+) -> Population[RelativeModesSpec]:
+    """Return the good plant in the middle, and what stands for all."""
+    centres = [c.structure.spec(c.theta) for c in good]
+    crowd = [c.structure.spec(c.theta) for c in some]
+    if not frame_firm:
+        crowd = search.shaken(crowd)
+        centres += [without_frame(plant) for plant in centres]
+    return representatives(centres, crowd)
 
 
 def refit_spectrum(
@@ -445,47 +448,3 @@ def _column(spectrum: Spectrum, column: str | None) -> str:
             f"{', '.join(spectrum.psd)}"
         )
     return column
-
-
-def _level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
-    stated = excitation.accel_per_hz_mm_s
-    if abs(gain - 1) <= 2 * _WRONG_LEVEL:
-        return ()
-    return (
-        (
-            f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
-            f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
-            "its sensor reads right (the shape of the model hardly depends on it)"
-        ),
-    )
-
-
-def _apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
-    """Warn of the two tables that differ most in shape, if they are not of one machine."""
-    pairs = [
-        (float(_DB * np.std(logs[i] - logs[j])), spectra[i].source, spectra[j].source)
-        for i in range(len(logs))
-        for j in range(i)
-    ]
-    apart_db, one, other = max(pairs, default=(0.0, "", ""))
-    if apart_db <= _APART_DB:
-        return ()
-    return (
-        (
-            f"{other} and {one} differ by {apart_db:.1f} dB in shape (repeats: below "
-            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, "
-            "mounting); give only tables of the machine as it prints today"
-        ),
-    )
-
-
-def _cross_warning(share: float, other: str, column: str) -> tuple[str, ...]:
-    if share <= _CROSS:
-        return ()
-    return (
-        (
-            f"sensor axis {other!r} has {share:.0%} of the power of {column!r}: the axes are "
-            "coupled (CoreXY belts of unequal tension?), the frame rocks, or the sensor is turned; "
-            f"the model describes {column!r} alone"
-        ),
-    )

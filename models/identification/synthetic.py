@@ -23,11 +23,11 @@ __all__ = [
     "LIS2DW",
     "Sensor",
     "acceleration_response",
+    "file_axis",
     "simulate_log",
     "simulate_spectrum",
-    "write_calibration_data",
     "write_raw_data",
-    "write_resonances",
+    "write_table",
 ]
 
 Array = NDArray[np.float64]
@@ -147,12 +147,11 @@ def simulate_spectrum(
     *,
     sensor: Sensor = ADXL345,
     rng: np.random.Generator,
-    f_max_hz: float = 200.0,
 ) -> Spectrum:
-    """Return Klipper's power spectral densities of a simulated test, up to `f_max_hz`."""
+    """Return Klipper's power spectral densities of a simulated test, up to 200 Hz."""
     log = simulate_log(plants, excitation, sensor=sensor, lead_s=0.0, tail_s=0.0, rng=rng)
     f, psd = klipper_psd(log.time_s, log.accel_mm_s2)
-    kept = f <= f_max_hz
+    kept = f <= 200.0
     columns = {name: psd[kept, i] for i, name in enumerate("xyz")}
     columns["xyz"] = psd[kept].sum(axis=1)
     return Spectrum(f[kept], columns, log.axis, log.source)
@@ -160,47 +159,9 @@ def simulate_spectrum(
 
 def write_raw_data(log: AccelerationLog, folder: Path, name: str = "20260101_120000") -> Path:
     """Write `raw_data_<axis>_<name>.csv` as Klipper does; return its path."""
-    path = folder / f"raw_data_{_file_axis(log.axis)}_{name}.csv"
+    path = folder / f"raw_data_{file_axis(log.axis)}_{name}.csv"
     rows = np.column_stack([log.time_s, log.accel_mm_s2])
-    _write_table(path, "#time,accel_x,accel_y,accel_z", "%.6f,%.6f,%.6f,%.6f", rows)
-    return path
-
-
-def write_resonances(spectrum: Spectrum, folder: Path, name: str = "20260101_120000") -> Path:
-    """Write `resonances_<axis>_<name>.csv` as Klipper does; return its path."""
-    path = folder / f"resonances_{_file_axis(spectrum.axis)}_{name}.csv"
-    columns = ("x", "y", "z", "xyz")
-    rows = np.column_stack([spectrum.f_hz, *(spectrum.psd[c] for c in columns)])
-    header = ",".join(["freq", *(f"psd_{c}" for c in columns)])
-    _write_table(path, header, "%.1f,%.3e,%.3e,%.3e,%.3e", rows)
-    return path
-
-
-def write_calibration_data(
-    spectrum: Spectrum,
-    folder: Path,
-    name: str = "20260101_120000",
-    *,
-    shapers: Mapping[str, Array] | None = None,
-) -> Path:
-    """Write `calibration_data_<axis>_<name>.csv`, normalised as Klipper does; return its path.
-
-    Densities are divided by f + 0.1 and, below 10 Hz, multiplied by exp(1 - (10/(f + 0.1))^2)
-    (klippy/extras/shaper_calibrate.py, 2026-08).
-
-    Parameters
-    ----------
-    shapers : mapping of str to ndarray, optional
-        Remaining vibrations by column title, like "mzv(52.2)".
-    """
-    path = folder / f"calibration_data_{_file_axis(spectrum.axis)}_{name}.csv"
-    f = spectrum.f_hz
-    scale = np.where(f < 10.0, np.exp(1.0 - (10.0 / (f + 0.1)) ** 2), 1.0) / (f + 0.1)
-    columns, curves = ("x", "y", "z", "xyz"), shapers or {}
-    header = [*(f"psd_{c}" for c in columns), *(["shapers:", *curves] if curves else [])]
-    layout = "%.1f" + ",%.3e" * len(columns) + ("," if curves else "") + ",%.3f" * len(curves)
-    rows = np.column_stack([f, *(spectrum.psd[c] * scale for c in columns), *curves.values()])
-    _write_table(path, ",".join(["freq", *header]), layout, rows)
+    write_table(path, "#time,accel_x,accel_y,accel_z", "%.6f,%.6f,%.6f,%.6f", rows)
     return path
 
 
@@ -249,10 +210,12 @@ def _axis_name(excitation: Excitation) -> str:
     return named.get(excitation.direction, "{:.3f},{:.3f}".format(*excitation.direction))
 
 
-def _file_axis(axis: str | None) -> str:
+def file_axis(axis: str | None) -> str:
+    """Return how Klipper calls an axis in a file's name."""
     return axis if axis in ("x", "y", "z") else f"axis={axis},0.000"
 
 
-def _write_table(path: Path, header: str, layout: str, rows: Array) -> None:
+def write_table(path: Path, header: str, layout: str, rows: Array) -> None:
+    """Write rows of numbers as text."""
     lines = (layout % tuple(row) for row in rows.tolist())
     path.write_text("\n".join([header, *lines, ""]), encoding="ascii")

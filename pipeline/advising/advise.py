@@ -11,7 +11,7 @@ import io
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import OFF
 from stillpath.pipeline.advising.choosing import AsSliced, Choice, choose
-from stillpath.pipeline.advising.earlier import EarlierErrors
 from stillpath.pipeline.advising.inserting import MARK, AdviceWriter, write_advised
 from stillpath.pipeline.advising.messages import (
     beyond_bounds,
@@ -37,6 +36,7 @@ from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.file_motion import STANDING_S, TextMotion
 from stillpath.pipeline.file_rewriting import file_rewriting
 from stillpath.pipeline.files import default_cache_dir
+from stillpath.pipeline.measuring.earlier import EarlierErrors
 from stillpath.pipeline.measuring.layer_files import LayerWriter
 from stillpath.pipeline.measuring.measure import STRIDE, Measurement, channel_names
 from stillpath.pipeline.measuring.points import MotionSamples
@@ -56,7 +56,6 @@ from stillpath.pipeline.result import (
     AxisSpectrum,
     GroupFigures,
     Result,
-    StageTime,
 )
 from stillpath.pipeline.shaping import ShapedMotion
 from stillpath.version import __version__
@@ -129,46 +128,26 @@ class _Job:
     def run(
         self, name: str, facts: SlicerFacts, earlier: EarlierErrors, layers: LayerWriter | None
     ) -> Result:
-        machine, options = self._machine, self._options
-        size = self._source.seek(0, io.SEEK_END)
+        measuring: dict[str, Any] = {"earlier": earlier, "size": self._source.seek(0, io.SEEK_END)}
         original = Measurement(
-            machine, DT_S, self._shaper, compensated=False, noted=earlier.note, size=size
+            self._machine, DT_S, self._shaper, channel_names(compensated=False), **measuring
         )
-        before = SetErrors(machine, DT_S, stride=STRIDE)
-        reading = FirstReading(machine, self._adviser)
+        before = SetErrors(self._machine, DT_S, stride=STRIDE)
+        reading = FirstReading(self._machine, self._adviser)
         with self._clock.stage("measure the original"):
             asked = self._go(
                 self._source, [original, before], "measuring the original", (0.0, 0.25), reading.see
             )
         was = before.errors()
         names = asked.reader.feature_names
-        # What is stored for good must be the printer's own shaper.
-        shaped = not reading.stored_lines or self._adviser.stated is not None
         with self._clock.stage("choose"):
-            self._source.seek(0)
-            samples = take_samples(self._source, machine, self._dialect)
-            errors_um = {f: error.rms_um for f, error in was.items()}
-            choice = choose(
-                samples,
-                AsSliced(names, self._before, errors_um, reading.levels),
-                machine,
-                self._adviser,
-                options.budget_um,
-                lambda share: self._say("choosing", 0.3 + 0.3 * share),
-                shaped=shaped,
-            )
+            choice, first_layer = self._chosen(names, was, reading)
         with self._clock.stage("verify"):
-            writer, now = self._within_bounds(choice, was, asked.time_s, samples.first_layer)
+            writer, now = self._within_bounds(choice, was, asked.time_s, first_layer)
         earlier.rewind()
+        take_layer = layers.add if layers else None
         advised = Measurement(
-            machine,
-            DT_S,
-            self._shaper,
-            compensated=True,
-            names=("after",),
-            take_layer=layers.add if layers else None,
-            beside=earlier.at,
-            size=size,
+            self._machine, DT_S, self._shaper, ("after",), take_layer=take_layer, **measuring
         )
         with self._clock.stage("measure"):
             written = self._go(self._spool, [advised], "measuring", (0.8, 1.0), lambda _: None)
@@ -176,33 +155,56 @@ class _Job:
             layers.finish(names)
         self._say("done", 1.0)
         figures = self._figures(choice, names, was, now, writer.lines)
-        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
-        return self._result(
-            name,
-            facts,
-            asked,
-            written,
-            original,
-            advised,
-            figures,
-            [
-                *stored_settings(
-                    reading.stored_lines,
-                    shaper=self._before.label if figures.shapers else "" if shaped else None,
-                ),
-                *shaper_warnings(
-                    self._unmodelled,
-                    none_known=not self._adviser.shapers,
-                    left=writer.shaper_left,
-                ),
-                *beyond_bounds(
-                    figures.features,
-                    choice.rungs[0],
-                    helpless,
-                    has_budget=options.budget_um is not None,
-                ),
-            ],
+        warnings = self._warnings(reading, choice, names, figures, shaper_left=writer.shaper_left)
+        return self._result(name, facts, asked, written, original, advised, figures, warnings)
+
+    def _shapes(self, reading: FirstReading) -> bool:
+        """Tell whether a shaper may be advised: what is stored must be the printer's own."""
+        return not reading.stored_lines or self._adviser.stated is not None
+
+    def _chosen(
+        self, names: Sequence[str], was: dict[int, ClassError], reading: FirstReading
+    ) -> tuple[Choice, FirstLayer]:
+        """Choose accelerations and shapers on samples of the file."""
+        self._source.seek(0)
+        samples = take_samples(self._source, self._machine, self._dialect)
+        errors_um = {f: error.rms_um for f, error in was.items()}
+        choice = choose(
+            samples,
+            AsSliced(names, self._before, errors_um, reading.levels),
+            self._machine,
+            self._adviser,
+            self._options.budget_um,
+            lambda share: self._say("choosing", 0.3 + 0.3 * share),
+            shaped=self._shapes(reading),
         )
+        return choice, samples.first_layer
+
+    def _warnings(
+        self,
+        reading: FirstReading,
+        choice: Choice,
+        names: Sequence[str],
+        figures: AdviceFigures,
+        *,
+        shaper_left: bool,
+    ) -> list[str]:
+        """Say what is stored for good, what of the shaper is not known, and what errs too much."""
+        unshaped = "" if self._shapes(reading) else None
+        given_back = self._before.label if figures.shapers else unshaped
+        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
+        return [
+            *stored_settings(reading.stored_lines, shaper=given_back),
+            *shaper_warnings(
+                self._unmodelled, none_known=not self._adviser.shapers, left=shaper_left
+            ),
+            *beyond_bounds(
+                figures.features,
+                choice.rungs[0],
+                helpless,
+                has_budget=self._options.budget_um is not None,
+            ),
+        ]
 
     def _within_bounds(
         self,
@@ -357,12 +359,7 @@ class _Job:
             peak_velocity_mm_s=0.0,
             peak_accel_mm_s2=max((f.accel_mm_s2 or 0.0 for f in figures.features), default=0.0),
             extruding_s=sum(group.seconds for group in features),
-            warnings=[
-                *self._doubts,
-                *asked.warnings,
-                *warnings,
-                *advised.warnings(),
-            ],
+            warnings=[*self._doubts, *asked.warnings, *warnings, *advised.warnings()],
             notes=[*self._notes, *kept_beyond(figures.features), _UNDO],
             layers=_merged(original.layers(), advised.layers()),
             features=features,
@@ -370,7 +367,7 @@ class _Job:
             spectra=_merged_spectra(original.spectra(), advised.spectra()),
             layer_views=advised.layer_views(),
             advice=figures,
-            stages=[StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self._clock.cpu_s.items()],
+            stages=self._clock.stages(),
             **NOTHING_COMPENSATED,
         )
 

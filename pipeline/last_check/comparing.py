@@ -260,28 +260,34 @@ class LastCheck:
         if line in self._idle and line != wanted.code:
             written.skip(end + 1)
             return
+        if self._takes_line(line, wanted):
+            written.skip(end + 1)
+            if self._streaming and self._wanted is None:
+                self._take_harmless()
+
+    def _takes_line(self, line: bytes, wanted: Wanted) -> bool:
+        """Take a line that is no move of ours, unless the one waited for came before."""
         code = line if line == wanted.code else code_of(line)
         if code:
-            if not self._takes(code, held_back=False):
-                if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
-                    if self._came_already():
-                        return
-                    raise self._strange(code, wanted.code)
-                if self._earlier:
-                    self._earlier.append(code)
-                self._after.carry_out(code)
-                if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
-                    self._idle.add(line)
+            if self._takes(code, held_back=False):
+                return True
+            if not (_IN_STREAM.match(code) or _SHAPER.search(code)):
+                if self._came_already():
+                    return False
+                raise self._strange(code, wanted.code)
+            if self._earlier:
+                self._earlier.append(code)
+            self._after.carry_out(code)
+            if _ANYWHERE.match(code) is not None and len(self._idle) < _MOST_IDLE:
+                self._idle.add(line)
         elif line.startswith(_HELD):
             if not self._takes(code_of(line[len(_HELD) :]), held_back=True):
                 if self._came_already():
-                    return
+                    return False
                 raise self._strange(line, wanted.code)
         elif (off := _OFF.match(line)) is not None:
             self._leave(int(off[1]) if off[1] else ALL)
-        written.skip(end + 1)
-        if self._streaming and self._wanted is None:
-            self._take_harmless()
+        return True
 
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""

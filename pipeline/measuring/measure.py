@@ -9,6 +9,7 @@ layers that are given away.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
+from stillpath.pipeline.measuring.earlier import EarlierErrors
 from stillpath.pipeline.measuring.layer_views import LayerViews
 from stillpath.pipeline.measuring.layers import LayerRecorder, LayerTile
 from stillpath.pipeline.measuring.maxima import RINGING_S, Maxima
@@ -55,16 +57,12 @@ class Measurement:
     dt_s : float
     shaper : BestShaper
         The reference shaper.
-    compensated : bool
-        Whether there is a channel `after` beside `before` and `shaper`. If not, `before` is the
-        executed motion: the firmware's own shaper may be in it.
-    names : sequence of str, optional
-        Channels to measure, where it is not all of these.
-    beside : callable, optional
-        Gives the errors of the other channels at measured points, (2, n): `before` and `shaper`,
-        measured earlier (`pipeline.advising.earlier`), for what is shown along the path.
-    noted : callable, optional
-        Is given measured points with their errors.
+    names : tuple of str
+        Channels, of those that `channel_names` has. Without `after`, `before` is the executed
+        motion: the firmware's own shaper may be in it.
+    earlier : EarlierErrors, optional
+        Keeps the errors of `before` and `shaper` where they are measured; where `after` is, gives
+        them back for what is shown along the path.
     take_layer : callable, optional
         Is given every layer as soon as it is measured; channels as `channel_names` has them.
     trace : callable, optional
@@ -78,33 +76,32 @@ class Measurement:
         machine: Machine,
         dt_s: float,
         shaper: BestShaper,
+        names: tuple[str, ...],
         *,
-        compensated: bool,
-        names: tuple[str, ...] | None = None,
         take_layer: Callable[[LayerTile], None] | None = None,
         trace: Callable[[Trace], None] | None = None,
-        beside: Callable[[MeasuredPoints], Array] | None = None,
-        noted: Callable[[MeasuredPoints, Array], None] | None = None,
+        earlier: EarlierErrors | None = None,
         size: int | None = None,
     ) -> None:
-        self._beside, self._noted = beside, noted
+        compensated = "after" in names
+        self._beside = earlier.at if earlier and compensated else None
+        self._noted = earlier.note if earlier and not compensated else None
         all_of_it = trace is not None or (size is not None and size < _SMALL_BYTES)
         self._stride = 1 if all_of_it else STRIDE
         self._tracer = None if trace is None else Tracer(trace)
         self._dt_s = dt_s
         self._band = BandContent(machine, dt_s)
-        self._names = names or channel_names(compensated=compensated)
-        shown = channel_names(compensated=True) if beside else self._names
+        self._names = names
+        shown = channel_names(compensated=True) if self._beside else names
         self._shown = shown
-        self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(self._names))
-        self._layers, self._features = (GroupTally(len(self._names)) for _ in range(2))
-        sparse = self._stride > 1 and "after" in self._names
-        exact = self._names.index("after") if sparse else None
-        self._maxima = Maxima(dt_s, len(self._names), exact)
-        self._answers = Responses(machine, dt_s, shaper, self._names, compensated=compensated)
+        self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(names))
+        self._layers, self._features = (GroupTally(len(names)) for _ in range(2))
+        exact = names.index("after") if self._stride > 1 and compensated else None
+        self._maxima = Maxima(dt_s, len(names), exact)
+        self._answers = Responses(machine, dt_s, shaper, names)
         self._shaper_label = f"best shaper ({shaper.label})"
         self._track = _Bins(len(shown))
-        self._spectra = ErrorSpectra(machine, dt_s, self._names)
+        self._spectra = ErrorSpectra(machine, dt_s, names)
         self._views = LayerViews(shown)
         takers = [self._views.add] + ([take_layer] if take_layer else [])
         self._tiles = LayerRecorder(len(shown), self._stride * dt_s, takers)
@@ -284,6 +281,16 @@ class Measurement:
     def spectra(self) -> list[AxisSpectrum]:
         """Return the spectra of the error along X and Y."""
         return self._spectra.spectra()
+
+    def details(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the fields of `Result` that go further than channels; `names` are of features."""
+        return {
+            "layers": self.layers(),
+            "features": self.features(names),
+            "track": self.track(),
+            "spectra": self.spectra(),
+            "layer_views": self.layer_views(),
+        }
 
 
 def channel_names(*, compensated: bool) -> tuple[str, ...]:

@@ -55,7 +55,6 @@ class Responses:
     names : sequence of str
         Channels: `before` is the sliced file (the executed motion, if nothing is compensated),
         `after` the executed motion, `shaper` the sliced file, shaped.
-    compensated : bool
     """
 
     def __init__(
@@ -64,11 +63,9 @@ class Responses:
         dt_s: float,
         shaper: BestShaper,
         names: tuple[str, ...],
-        *,
-        compensated: bool,
     ) -> None:
         self._machine, self._dt_s, self._names = machine, dt_s, names
-        self._compensated = compensated
+        self._compensated = "after" in names
         self._point = EMPTY
         self._pulses = [
             shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
@@ -78,7 +75,7 @@ class Responses:
         self._least = 1 if machine.schedules else _LEAST_SAMPLES
         # A linear machine's answer to the shaped path is its answer to the path, shaped.
         linear = not machine.schedules and not machine.ripple
-        self._shapes_answer = linear and compensated and {"before", "shaper"} <= set(names)
+        self._shapes_answer = linear and self._compensated and {"before", "shaper"} <= set(names)
         self._streams: dict[str, MachineStream] = {}
         self._planned, self._executed = np.zeros((2, 0)), np.zeros((2, 0))
         """Planned: the path, and below it the sliced file, where that is not the same."""

@@ -8,6 +8,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import State
 
 from stillpath.applications.identification.archive import Archive
 from stillpath.applications.machines.resolve import Resolver
@@ -99,7 +100,20 @@ def create_app(
         redoc_url=None,
         docs_url=None,
     )
-    state = app.state
+    _prepare(app.state, settings, keys_required=keys_required)
+    app.add_middleware(
+        Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
+    )
+    app.add_middleware(metrics.Measured, metrics=app.state.metrics)
+    app.add_middleware(Proxies, trusted=settings.trusted_proxies)
+    problems.install(app)
+    app.add_exception_handler(NotYet, not_yet)
+    _include_routes(app)
+    return app
+
+
+def _prepare(state: State, settings: Settings, *, keys_required: bool) -> None:
+    """Set what needs neither database nor workers."""
     state.settings = settings
     state.keys_required = keys_required
     state.limits = Limits(settings.requests_per_minute)
@@ -112,13 +126,9 @@ def create_app(
         lambda: state.hub.watchers,
         lambda: state.disk.free_bytes() if settings.disk_reserve_bytes else None,
     )
-    app.add_middleware(
-        Guard, allowed_hosts=hosts_of(settings, keys_required), trusts_all=not keys_required
-    )
-    app.add_middleware(metrics.Measured, metrics=state.metrics)
-    app.add_middleware(Proxies, trusted=settings.trusted_proxies)
-    problems.install(app)
-    app.add_exception_handler(NotYet, not_yet)
+
+
+def _include_routes(app: FastAPI) -> None:
     app.include_router(health.router)
     app.include_router(pages.router)
     for part in (
@@ -140,7 +150,6 @@ def create_app(
         metrics,
     ):
         app.include_router(part.router, responses=problems.responses(401, 403, 422, 429, 503))
-    return app
 
 
 async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncExitStack) -> None:

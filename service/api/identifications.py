@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,38 +63,39 @@ class IdentificationView(BaseModel):
     report: IdentificationReport
 
 
-def _settings(
-    axis: str | None = None,
-    accel_per_hz: Annotated[float | None, Query(gt=0)] = None,
-    min_freq: Annotated[float | None, Query(gt=0)] = None,
-    max_freq: Annotated[float | None, Query(gt=0)] = None,
-    hz_per_sec: Annotated[float | None, Query(gt=0)] = None,
-    sweeping_accel: Annotated[float | None, Query(ge=0)] = None,
-    firmware_date: Annotated[str | None, Query(description="Of the Klipper version.")] = None,
-    sensor_axis: Annotated[str | None, Query(description="x, y or z")] = None,
-    sensor_turned: bool = False,
-    frame_firm: bool = False,
-    repair_rounding: bool = False,
-    dc_gain: Annotated[float | None, Query(gt=0, description="That a model may have.")] = None,
-    sampling_s: Annotated[float | None, Query(gt=0, description="Of a discrete model.")] = None,
-) -> ReadSettings:
-    given = {
-        "axis": axis,
-        "accel_per_hz_mm_s": accel_per_hz,
-        "f_start_hz": min_freq,
-        "f_end_hz": max_freq,
-        "hz_per_s": hz_per_sec,
-        "sweeping_accel_mm_s2": sweeping_accel,
-        "firmware_date": firmware_date,
-        "sensor_axis": sensor_axis,
-        "sensor_turned": sensor_turned,
-        "frame_firm": frame_firm,
-        "repair_rounding": repair_rounding,
-        "dc_gain": dc_gain,
-        "sampling_s": sampling_s,
-    }
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """What files of measurements do not say of themselves."""
+
+    axis: str | None = None
+    accel_per_hz: Annotated[float | None, Query(gt=0)] = None
+    min_freq: Annotated[float | None, Query(gt=0)] = None
+    max_freq: Annotated[float | None, Query(gt=0)] = None
+    hz_per_sec: Annotated[float | None, Query(gt=0)] = None
+    sweeping_accel: Annotated[float | None, Query(ge=0)] = None
+    firmware_date: Annotated[str | None, Query(description="Of the Klipper version.")] = None
+    sensor_axis: Annotated[str | None, Query(description="x, y or z")] = None
+    sensor_turned: bool = False
+    frame_firm: bool = False
+    repair_rounding: bool = False
+    dc_gain: Annotated[float | None, Query(gt=0, description="That a model may have.")] = None
+    sampling_s: Annotated[float | None, Query(gt=0, description="Of a discrete model.")] = None
+
+
+_FIELDS = {
+    "accel_per_hz": "accel_per_hz_mm_s",
+    "min_freq": "f_start_hz",
+    "max_freq": "f_end_hz",
+    "hz_per_sec": "hz_per_s",
+    "sweeping_accel": "sweeping_accel_mm_s2",
+}
+"""Of `ReadSettings`, where the parameter is called as in Klipper."""
+
+
+def _settings(given: Annotated[_Reading, Depends()]) -> ReadSettings:
+    known = {_FIELDS.get(k, k): v for k, v in asdict(given).items() if v is not None}
     try:
-        return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
+        return ReadSettings.model_validate(known)
     except ValidationError as error:
         raise Problem(422, "Bad parameter", explain(error)) from None
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from stillpath.applications.machines import marlin_settings
-from stillpath.applications.machines.checks import machine_from_config
+from stillpath.applications.machines.checks import StatedMachine, machine_from_config
 from stillpath.applications.machines.klipper_config import parse_printer_config
 from stillpath.applications.machines.revision import source_file
 from stillpath.models.errors import ModelError
@@ -17,9 +17,7 @@ from stillpath.models.machine import Machine
 from stillpath.service.api.access import Admin
 from stillpath.service.api.machine_views import RevisionView
 from stillpath.service.api.machines import (
-    Author,
-    IfMatch,
-    Message,
+    Change,
     Name,
     as_problems,
     store_revision,
@@ -83,9 +81,7 @@ async def put_settings(
     name: Name,
     caller: Admin,
     given: Annotated[_Given, Depends()],
-    author: Author = None,
-    message: Message = "",
-    if_match: IfMatch = None,
+    change: Annotated[Change, Depends()],
 ) -> RevisionView:
     """Make a machine of a printer.cfg or of an answer to M503; its plants are still to be measured.
 
@@ -113,19 +109,17 @@ async def put_settings(
             response,
             name,
             caller,
+            replace(change, message=change.message or f"from {file}"),
             made,
-            if_match=if_match,
-            author=author,
-            message=message or f"from {file}",
             sources=[source_file(file, content)],
         )
 
 
 def _new(text: str, file: str, name: str, given: _Given) -> Machine:
-    f_hz = (given.fx, given.fy)
+    stated = StatedMachine(name, given.title, (given.fx, given.fy))
     if not marlin_settings.looks_like_m503(text):
         config = parse_printer_config(text, file)
-        return machine_from_config(config, name, title=given.title, f_hz=f_hz)
+        return machine_from_config(config, stated)
     if not given.travel:
         raise Problem(
             422,
@@ -135,9 +129,7 @@ def _new(text: str, file: str, name: str, given: _Given) -> Machine:
     return marlin_settings.machine_from_m503(
         text,
         file,
-        name,
+        stated,
         travel_mm=marlin_settings.read_travel(given.travel),
         kinematics=given.kinematics,
-        title=given.title,
-        f_hz=f_hz,
     )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import date
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from stillpath.applications.machines.diff import diff
@@ -34,7 +35,7 @@ from stillpath.service.security.callers import Caller
 
 __all__ = [
     "Author",
-    "IfMatch",
+    "Change",
     "Message",
     "Name",
     "as_problems",
@@ -75,6 +76,15 @@ IfMatch = Annotated[
 router = APIRouter(prefix="/v1/machines", tags=["machines"])
 
 
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Who changes a machine, why, and which state of it."""
+
+    author: Author = None
+    message: Message = ""
+    if_match: IfMatch = None
+
+
 def look_up(request: Request, name: str) -> Machine:
     """Return the newest state of a machine, approved or not; raise `Problem` if there is none."""
     with as_problems():
@@ -92,11 +102,9 @@ def store_revision(
     response: Response,
     name: str,
     caller: Caller,
+    change: Change,
     make: Callable[[Machine | None], Machine],
     *,
-    if_match: str | None,
-    author: str | None,
-    message: str,
     sources: Sequence[SourceFile] = (),
 ) -> RevisionView:
     """Store what is made of a machine's current state as its next revision, and fill the answer.
@@ -109,17 +117,17 @@ def store_revision(
     Raises
     ------
     Problem
-        409 for a built-in machine, 412 or 428 as `if_match` demands.
+        409 for a built-in machine, 412 or 428 as `change.if_match` demands.
     ModelError
     """
     store = _store(request)
-    expected = _expected(store, name, if_match)
+    expected = _expected(store, name, change.if_match)
     machine = make(store.current(name).machine if expected else None)
     made = store.add_revision(
         name,
         machine,
-        author=author or caller.owner,
-        message=message,
+        author=change.author or caller.owner,
+        message=change.message,
         sources=sources,
         expected=expected,
     )
@@ -175,29 +183,19 @@ async def put_machine(
     response: Response,
     name: Name,
     caller: Admin,
-    author: Author = None,
-    message: Message = "",
-    if_match: IfMatch = None,
+    change: Annotated[Change, Depends()],
 ) -> RevisionView:
     """Make a document the machine's current state, as a new revision.
 
     To change a machine say by `If-Match` which state the change was made on. A document that
     changes nothing makes no revision.
     """
-    await run_in_threadpool(_expected, _store(request), name, if_match)  # before the body
+    await run_in_threadpool(_expected, _store(request), name, change.if_match)  # before the body
     content = await receive_document(request, max_bytes=_LARGEST_BYTES)
     with as_problems():
         machine = read_machine(content)
         return await run_in_threadpool(
-            store_revision,
-            request,
-            response,
-            name,
-            caller,
-            lambda _: machine,
-            if_match=if_match,
-            author=author,
-            message=message,
+            store_revision, request, response, name, caller, change, lambda _: machine
         )
 
 

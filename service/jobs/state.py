@@ -285,17 +285,7 @@ def advance(job: Job, event: Event) -> Job:
     if isinstance(event, Claimed):
         if job.state is not JobState.QUEUED:
             raise Stale(f"job {job.id} is {job.state}, not queued")
-        return replace(
-            job,
-            state=JobState.RUNNING,
-            attempt=job.attempt + 1,
-            worker=event.worker,
-            stage="starting",
-            progress=0.0,
-            eta_s=None,
-            started_at=event.at,
-            heartbeat_at=event.at,
-        )
+        return _running(job, event)
     if isinstance(event, Cancelled):
         if job.state.is_final:
             raise Stale(f"job {job.id} is {job.state} already")
@@ -335,6 +325,20 @@ def advance(job: Job, event: Event) -> Job:
             if lost.losses < event.max_attempts:
                 return _waiting(lost)
             return _failed(lost, _lost_problem(lost, event), event.at)
+
+
+def _running(job: Job, event: Claimed) -> Job:
+    return replace(
+        job,
+        state=JobState.RUNNING,
+        attempt=job.attempt + 1,
+        worker=event.worker,
+        stage="starting",
+        progress=0.0,
+        eta_s=None,
+        started_at=event.at,
+        heartbeat_at=event.at,
+    )
 
 
 def _waiting(job: Job) -> Job:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -66,13 +66,10 @@ class AuditLog:
     Parameters
     ----------
     engine : Engine
-    clock : callable
-        Seconds since the epoch.
     """
 
-    def __init__(self, engine: Engine, *, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self._clock = clock
         self._denied: OrderedDict[tuple[str | None, ...], float] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -90,7 +87,7 @@ class AuditLog:
     ) -> dict[str, Any]:
         """Return a row, for who writes it in the transaction of what was done."""
         return {
-            "at": self._clock(),
+            "at": time.time(),
             "owner": caller.owner,
             "key_id": caller.key_id,
             "remote": None if caller.remote is None else caller.remote[:64],
@@ -118,7 +115,7 @@ class AuditLog:
         Without that limit anybody could fill the disk with rows.
         """
         what = (caller.remote, caller.key_id, why)
-        now = self._clock()
+        now = time.time()
         with self._lock:
             if now - self._denied.get(what, 0.0) < _DENIED_SECONDS:
                 return

@@ -311,10 +311,10 @@ def test_rests_of_a_file_stay_apart_from_what_the_firmware_joins_with_them() -> 
     firmware = machine(min_steps_per_segment=6)
     points = [[0, 0, 0, 0], [10, 0, 0, 1], [10.05, 0, 0, 1], [10.05, 0, 0, 0.2]]
     moves = moves_through(points, 50.0)
-    joined, apart = (Planner(firmware, rests_apart=rests_apart) for rests_apart in (False, True))
-    for planner in (joined, apart):
-        planner.queue_moves(moves, [initial_limits(firmware)])
-    swallowed, told = joined.flush(), apart.flush()
+    limits = [initial_limits(firmware)]
+    swallowed, told = (
+        Planner(firmware, rests_apart=apart).plan_whole(moves, limits) for apart in (False, True)
+    )
     assert duration(swallowed)[1] == 0.0
     assert swallowed.direction[2, 0] > 0.0
     assert np.all(duration(told) > 0.0)

@@ -253,7 +253,7 @@ def test_tallies_are_the_whole_array_s() -> None:
     command = path + 0.02 * np.sin(np.arange(n) / 30.0)
     command[:, 0] = path[:, 0]
     measurement = Measurement(
-        machine, 1e-3, BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0), compensated=True
+        machine, 1e-3, BestShaper("mzv", 40.0, 40.0, 0.1, 0.0, 0.0), ("before", "after", "shaper")
     )
     rng = np.random.default_rng(4)
     cuts = np.unique(np.concatenate([[0, n], rng.integers(0, n, 17)]))

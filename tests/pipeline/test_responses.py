@@ -49,7 +49,7 @@ def pushed(
 @pytest.mark.parametrize("compensated", [True, False])
 def test_parts(ender: Machine, compensated: bool) -> None:
     names = NAMES if compensated else ("before", "shaper")
-    answers = Responses(ender, DT_S, SHAPER, names, compensated=compensated)
+    answers = Responses(ender, DT_S, SHAPER, names)
     pulses = [shaper_pulses("mzv", f_hz, 0.1) for f_hz in (SHAPER.fx_hz, SHAPER.fy_hz)]
     for seed in (1, 2):  # the machine comes to stand in between
         path, executed = walk(seed, 12_000), walk(seed + 10, 12_000)

@@ -32,13 +32,17 @@ from stillpath.gcode.firmware.klipper.stream_commands import IN_STREAM_MARK_MM_S
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
-from stillpath.gcode.types import Limits, Phases
+from stillpath.gcode.types import Limits
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import CommandLimits
 
 __all__ = ["KlipperEncoder", "stream_limits"]
 
 
+_GRID = 100
+"""1e-6 mm, of X and Y; the last point of every stretch keeps all the file's digits. Rounding to
+1 um is noise at all frequencies, and a resonance above the model's band makes microns of it
+(docs/tried.md)."""
 _Z_GRID = 10
 """A slow climb, a vase's, on steps of a um is flat and then too steep for Z's low acceleration."""
 _PASSES = 4
@@ -81,18 +85,13 @@ class KlipperEncoder:
     firmware : Klipper
     limits : KlipperLimits
         What the stream runs under.
-    decimals : int
-        Of X and Y (Z has 5); the last point of every stretch keeps all the file's digits. Rounding
-        to 1 um is noise at all frequencies, and a resonance above the model's band makes microns
-        of it (docs/tried.md).
     """
 
-    def __init__(self, firmware: Klipper, limits: KlipperLimits, *, decimals: int = 4) -> None:
-        self._firmware = firmware
-        self._grid = 10 ** (6 - decimals)
-        self.grid_mm = self._grid / UNITS_PER_MM
-        self._grids = np.array([self._grid, self._grid, min(self._grid, _Z_GRID)])
-        self._limits = limits
+    grid_mm = _GRID / UNITS_PER_MM
+
+    def __init__(self, firmware: Klipper, limits: KlipperLimits) -> None:
+        self._firmware, self._limits = firmware, limits
+        self._grids = np.array([_GRID, _GRID, _Z_GRID])
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
         """First guess of the rests' durations: their own moves between stretches of the stream."""
@@ -101,8 +100,9 @@ class KlipperEncoder:
             if group.rest:
                 rows[group.first : group.last] = np.arange(group.first, group.last)
         moves = piece.moves
-        limits = limits_in_force(piece, rows, self._limits)
-        phases = self._plan(moves.start_mm, moves.end_mm, moves.speed_mm_s, *limits)
+        limits_id, limits = limits_in_force(piece, rows, self._limits)
+        own = as_moves(moves.start_mm, moves.end_mm, moves.speed_mm_s, limits_id)
+        phases = Planner(self._firmware).plan_whole(own, limits)
         return group_durations(phases, groups)
 
     def encode(self, piece: Piece, timeline: Timeline, segments: Segments) -> Encoded:
@@ -141,7 +141,8 @@ class KlipperEncoder:
                 predicted,
             )
             chosen = np.where(ours, feedrate / 60.0, speed)
-            phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
+            written = as_moves(start_mm, end_mm, chosen, limits_id)
+            phases = Planner(self._firmware).plan_whole(written, limits)
             actual = phases.accel_s + phases.cruise_s + phases.decel_s
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
@@ -178,15 +179,3 @@ class KlipperEncoder:
             start_mm, end_mm, limits_id, table, facts, length, accel, speed, junction, stops
         )
         return length, accel, speed, junction, stops
-
-    def _plan(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-        limits: Sequence[Limits],
-    ) -> Phases:
-        planner = Planner(self._firmware)
-        planner.queue_moves(as_moves(start_mm, end_mm, speed_mm_s, limits_id), limits)
-        return planner.flush()

@@ -11,12 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.klipper import _planner_kernels as kernels
 from stillpath.gcode.firmware.planning import empty_phases
-from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.firmware.queueing import QueuePlanner, with_motion
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.firmware import Klipper
 
@@ -60,18 +59,12 @@ class Planner(QueuePlanner):
         # A queue that settles nothing is not searched again before it has doubled.
         return self._count >= self._retry
 
-    def _append(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-    ) -> tuple[int, int]:
+    def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:
         self._count, problem, bad = kernels.append(
-            start_mm,
-            end_mm,
-            speed_mm_s,
-            limits_id,
+            moves.start_mm[rows],
+            moves.end_mm[rows],
+            moves.speed_mm_s[rows],
+            moves.limits_id[rows],
             self._limits,
             self._facts,
             self._moves,
@@ -97,20 +90,7 @@ class Planner(QueuePlanner):
         kernels.drop(self._queue, settled, self._count)
         self._count -= settled
         self._retry = 2 * self._count
-        return Phases(
-            times[0],
-            times[1],
-            times[2],
-            times[3],
-            phases.start_mm,
-            phases.direction,
-            speeds[0],
-            speeds[1],
-            speeds[2],
-            speeds[3],
-            phases.move_index,
-            phases.s_curve,
-        )
+        return with_motion(phases, times, speeds)
 
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
         line = int(moves.line[row])

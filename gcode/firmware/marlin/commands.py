@@ -46,22 +46,20 @@ _M205 = {
 _M204 = {"P": "print_accel_mm_s2", "R": "retract_accel_mm_s2", "T": "travel_accel_mm_s2"}
 
 
-def axis_limits(fields: str, unit: float = 1.0) -> Handler:
+def axis_limits(fields: str) -> Handler:
     """M201 and M203: one limit per axis.
 
     Parameters
     ----------
     fields : str
         Name of the limit with ``{axis}`` for x, y, z, e.
-    unit : float
-        What the firmware's unit is in mm and s.
     """
 
     def handle(state: MachineState, command: Command) -> int:
         given = state.numbers(command, "XYZE")
         values = {}
         for letter, value in given.items():
-            scaled = value * unit * float(state.f[at.F_UNIT_MM])
+            scaled = value * float(state.f[at.F_UNIT_MM])
             if scaled <= 0.0:
                 state.warn(f"{command.name} {letter}{value:g} is not above 0 and is passed over")
                 continue

@@ -228,16 +228,8 @@ class MarlinEncoder:
                 break
             # Rates have steps: a full correction would swing to and fro.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
-        encoded = encoded_piece(timeline, moves, limits, feedrate, phases)
-        # What the first step from rest takes too long, the stretch begins later.
-        first = ours & np.append(True, ~ours)[:-1]
-        delay_s = np.zeros(len(timeline.groups))
-        delay_s[moves.group[first]] = (actual - moves.planned_s)[first]
-        counts = [group.last - group.first for group in timeline.groups]
-        return replace(
-            encoded,
-            group_start_s=encoded.group_start_s + delay_s,
-            row_start_s=encoded.row_start_s + np.repeat(delay_s, counts),
+        return _begun_late(
+            encoded_piece(timeline, moves, limits, feedrate, phases), moves, timeline
         )
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
@@ -353,6 +345,21 @@ class MarlinEncoder:
         planner = Planner(self._firmware, corexy=self._corexy)
         moves = as_moves(start_mm, end_mm, speed_mm_s, limits_id)
         return join_phases([planner.push_moves(moves, limits), planner.flush()])
+
+
+def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Encoded:
+    """Begin stretches later by what their first step from rest takes too long."""
+    ours, phases = moves.row < 0, encoded.phases
+    first = ours & np.append(True, ~ours)[:-1]
+    duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    delay_s = np.zeros(len(timeline.groups))
+    delay_s[moves.group[first]] = (duration_s - moves.planned_s)[first]
+    counts = [group.last - group.first for group in timeline.groups]
+    return replace(
+        encoded,
+        group_start_s=encoded.group_start_s + delay_s,
+        row_start_s=encoded.row_start_s + np.repeat(delay_s, counts),
+    )
 
 
 def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.float64]) -> None:

@@ -15,7 +15,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.marlin import _block_kernels as blocks
 from stillpath.gcode.firmware.marlin import _planner_kernels as kernels
 from stillpath.gcode.firmware.planning import empty_phases
-from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.firmware.queueing import QueuePlanner, with_motion
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.firmware import Marlin
 
@@ -67,18 +67,12 @@ class Planner(QueuePlanner):
         self._state[blocks.S_ENTRY2] = -1.0
         return phases
 
-    def _append(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-    ) -> tuple[int, int]:
+    def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:
         self._count, problem, bad = blocks.append(
-            start_mm,
-            end_mm,
-            speed_mm_s,
-            limits_id,
+            moves.start_mm[rows],
+            moves.end_mm[rows],
+            moves.speed_mm_s[rows],
+            moves.limits_id[rows],
             self._limits,
             self._facts,
             self._moves,
@@ -111,20 +105,8 @@ class Planner(QueuePlanner):
         )
         kernels.drop(self._queue, settled, self._count)
         self._count -= settled
-        return Phases(
-            times[0],
-            times[1],
-            times[2],
-            times[3],
-            phases.start_mm,
-            phases.direction,
-            speeds[0],
-            speeds[1],
-            speeds[2],
-            speeds[3],
-            phases.move_index,
-            np.full(settled, self._s_curve),
-        )
+        phases.s_curve[:] = self._s_curve
+        return with_motion(phases, times, speeds)
 
 
 def planner_facts(firmware: Marlin, *, corexy: bool) -> NDArray[np.float64]:

@@ -129,6 +129,61 @@ def _parts(values: NDArray[np.complex128]) -> NDArray[np.float64]:
     return np.ascontiguousarray(values, dtype=complex).view(np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """A stretch near its start, in samples and steps: sums of squares of large numbers lose digits.
+
+    Attributes
+    ----------
+    origin : ndarray of int64, shape (2,)
+        The step of X and Y that others are counted from.
+    first : float
+        The sample that others are counted from.
+    at : ndarray, shape (n,)
+        When the vertices are.
+    steps : ndarray, shape (n, 3)
+        Where they are: X, Y, and filament as it counts.
+    z : ndarray of int64, shape (n,)
+    command : ndarray, shape (samples, 3)
+        The fit at every sample, as `steps`.
+    """
+
+    origin: NDArray[np.int64]
+    first: float
+    at: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    z: NDArray[np.int64]
+    command: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls,
+        per_mm: NDArray[np.float64],
+        dt_s: float,
+        at_s: NDArray[np.float64],
+        at_mm: NDArray[np.float64],
+    ) -> _Stretch:
+        origin = np.round(at_mm[0, :2] * per_mm[:2]).astype(np.int64)
+        near_mm = at_mm - np.array([*(origin / per_mm[:2]), 0.0, at_mm[0, 3]])
+        steps = np.column_stack([near_mm[:, :2] * per_mm[:2], near_mm[:, 3] / _FILAMENT_MM])
+        first = np.floor(at_s[0] / dt_s)
+        at = at_s / dt_s - first
+        k = np.arange(int(np.ceil(at[-1])) + 2, dtype=np.float64)
+        return cls(
+            origin=origin,
+            first=first,
+            at=at,
+            steps=steps,
+            z=np.round(at_mm[:, 2] * per_mm[2]).astype(np.int64),
+            command=np.column_stack([np.interp(k, at, row) for row in steps.T]),
+        )
+
+    @property
+    def samples(self) -> NDArray[np.int64]:
+        """Number of every sample on the timeline."""
+        return np.arange(len(self.command)) + int(self.first)
+
+
 def _chosen(
     lattice: Lattice,
     dt_s: float,
@@ -139,30 +194,19 @@ def _chosen(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vertices of one stretch and its start, times (n,) and places (n, 4)."""
     at_s, at_mm = _often(lattice, at_s, at_mm)
-    n = len(at_s)
-    scale = lattice.per_mm
-    # From near the start: sums of squares of large numbers would lose digits.
-    origin = np.round(at_mm[0, :2] * scale[:2]).astype(np.int64)
-    origin_mm = np.array([*(origin / scale[:2]), 0.0, at_mm[0, 3]])
-    near_mm = at_mm - origin_mm
-    steps = np.column_stack([near_mm[:, :2] * scale[:2], near_mm[:, 3] / _FILAMENT_MM])
-    z = np.round(at_mm[:, 2] * scale[2]).astype(np.int64)
-    first = np.floor(at_s[0] / dt_s)
-    at = at_s / dt_s - first
-    k = np.arange(int(np.ceil(at[-1])) + 2, dtype=np.float64)
-    command = np.column_stack([np.interp(k, at, row) for row in steps.T])
-    heading = direction[:, np.minimum(k.astype(np.int64) + int(first), direction.shape[1] - 1)].T
+    near, scale, n = _Stretch.of(lattice.per_mm, dt_s, at_s, at_mm), lattice.per_mm, len(at_s)
+    heading = direction[:, np.minimum(near.samples, direction.shape[1] - 1)].T.copy()
     slow, count = np.zeros(n, np.bool_), np.zeros(n, np.int64)
     place, place_at = np.zeros((n, MOST_PLACES, 2), np.int64), np.zeros((n, MOST_PLACES))
     list_places(
-        at,
-        steps[:, :2].copy(),
-        command,
-        z,
+        near.at,
+        near.steps[:, :2].copy(),
+        near.command,
+        near.z,
         lattice.least,
         lattice.corexy,
-        lattice.low - origin,
-        lattice.high - origin,
+        lattice.low - near.origin,
+        lattice.high - near.origin,
         slow,
         place,
         place_at,
@@ -174,9 +218,9 @@ def _chosen(
         place_at,
         count,
         slow,
-        z,
-        command,
-        heading.copy(),
+        near.z,
+        near.command,
+        heading,
         lattice.least,
         scale[0] / scale[:2],
         _CALM * lattice.speed_step_mm_s * scale[:2] * dt_s,
@@ -193,10 +237,10 @@ def _chosen(
     keep = np.flatnonzero(chosen >= 0)
     which = chosen[keep]
     at_kept = place_at[keep, which]
-    kept_mm = np.column_stack([np.interp(at_kept, at, row) for row in at_mm.T])
-    kept_mm[:, :2] = (place[keep, which] + origin) / scale[:2]
+    kept_mm = np.column_stack([np.interp(at_kept, near.at, row) for row in at_mm.T])
+    kept_mm[:, :2] = (place[keep, which] + near.origin) / scale[:2]
     kept_mm[[0, -1]] = at_mm[[0, -1]]
-    kept_s = (at_kept + first) * dt_s
+    kept_s = (at_kept + near.first) * dt_s
     kept_s[[0, -1]] = at_s[[0, -1]]
     return kept_s, kept_mm
 

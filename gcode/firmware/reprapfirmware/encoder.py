@@ -156,7 +156,9 @@ class RepRapEncoder:
         for attempt in range(_PASSES):
             assign_speeds(ours, *foreseen, missed, begin_s, clock_hz, feedrate, predicted)
             chosen = np.where(ours, feedrate / 60.0, speed)
-            phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
+            written = as_moves(start_mm, end_mm, chosen, limits_id)
+            planner = RepRapPlanner(self._firmware, self._kinematics)
+            phases = planner.plan_whole(written, limits)
             # Rests, whose moves brake for what comes later, are foreseen a little wrong; and a peak
             # of speed that is nearly cut off may be or not be, whatever was foreseen.
             miss = phases.accel_s + phases.cruise_s + phases.decel_s - predicted
@@ -269,18 +271,6 @@ class RepRapEncoder:
                 "a longer queue (M595 P, firmware.ring_length) or a larger tolerance would do",
                 line=int(piece.moves.line[0]),
             )
-
-    def _plan(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-        limits: Sequence[Limits],
-    ) -> Phases:
-        planner = RepRapPlanner(self._firmware, self._kinematics)
-        planner.queue_moves(as_moves(start_mm, end_mm, speed_mm_s, limits_id), limits)
-        return planner.flush()
 
 
 def _starts(

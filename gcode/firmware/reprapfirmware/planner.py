@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import empty_phases, join_phases
-from stillpath.gcode.firmware.queueing import QueuePlanner
+from stillpath.gcode.firmware.queueing import QueuePlanner, with_motion
 from stillpath.gcode.firmware.reprapfirmware import _planner_kernels as kernels
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.firmware import RepRapFirmware
@@ -76,26 +76,21 @@ class RepRapPlanner(QueuePlanner):
         self._emitted = 0
         self._standing = True
 
-    def _append(
-        self,
-        start_mm: NDArray[np.float64],
-        end_mm: NDArray[np.float64],
-        speed_mm_s: NDArray[np.float64],
-        limits_id: NDArray[np.int32],
-    ) -> tuple[int, int]:
+    def _append(self, moves: Moves, rows: slice) -> tuple[int, int]:
         before = self._count
         self._count, problem, bad = kernels.append(
-            start_mm,
-            end_mm,
-            speed_mm_s,
-            limits_id,
+            moves.start_mm[rows],
+            moves.end_mm[rows],
+            moves.speed_mm_s[rows],
+            moves.limits_id[rows],
             self._limits,
             self._facts,
             self._moves,
             self._queue,
             before,
         )
-        if self._count - before < len(speed_mm_s):
+        start_mm, end_mm = moves.start_mm[rows], moves.end_mm[rows]
+        if self._count - before < len(start_mm):
             for row in np.flatnonzero(np.all(start_mm == end_mm, axis=1)).tolist():
                 self._still.append((self._moves + row, start_mm[row].copy()))
         if self._standing and self._count:
@@ -139,20 +134,7 @@ class RepRapPlanner(QueuePlanner):
             self._time_s = float(times[:, -1].sum())
         self._count = kernels.drop(self._queue, self._count, self._state)
         self._emitted = int(self._state[kernels.S_FROZEN])
-        planned = Phases(
-            t_s=times[0],
-            accel_s=times[1],
-            cruise_s=times[2],
-            decel_s=times[3],
-            start_mm=phases.start_mm,
-            direction=phases.direction,
-            start_mm_s=speeds[0],
-            cruise_mm_s=speeds[1],
-            end_mm_s=speeds[2],
-            accel_mm_s2=speeds[3],
-            move_index=phases.move_index,
-            s_curve=phases.s_curve,
-        )
+        planned = with_motion(phases, times, speeds)
         return self._with_still(planned, final=final) if self._still else planned
 
     def _with_still(self, planned: Phases, *, final: bool) -> Phases:

@@ -18,6 +18,7 @@ from stillpath.compensation.feedback.fmsdob import (
     Around,
     QFilter,
     Shape,
+    Trim,
     add_on_blocks,
     design_q,
     fmsdob,
@@ -156,16 +157,16 @@ def test_velocity_loop_keeps_its_tracking() -> None:
 
 
 def test_detuning_limits_the_depth() -> None:
-    q = design_q(SLOW.nominal(), [1500.0], detuning=0.7)
+    q = design_q(SLOW.nominal(), [1500.0], trim=Trim(detuning=0.7))
     depth = np.abs(add_on(SLOW.nominal(), q, np.array([1500.0]), "servo"))[0]
     assert depth == pytest.approx(0.3, abs=1e-9)
     with pytest.raises(DesignError, match="detuning"):
-        design_q(SLOW.nominal(), [1500.0], detuning=1.5)
+        design_q(SLOW.nominal(), [1500.0], trim=Trim(detuning=1.5))
 
 
 def test_fixed_zeros() -> None:
     zeros = [(1.0, 0.0), (1.0, 5000.0), (0.98, 300.0)]
-    q = design_q(SLOW.nominal(), [1500.0], bandwidth_hz=None, zeros=zeros)
+    q = design_q(SLOW.nominal(), [1500.0], bandwidth_hz=None, trim=Trim(zeros=zeros))
     assert len(q.taps) == 2 + 1 + 1 + 2
     points = [1.0, -1.0, 0.98 * np.exp(2j * np.pi * 300 * 1e-4)]
     for z in points:
@@ -179,8 +180,8 @@ def test_width_after_a_band_pass() -> None:
     f = 4000 + np.linspace(-400, 400, 80001)
     widths = {}
     for shape, through in (("pointwise", False), ("hermite", False), ("hermite", True)):
-        q = design_q(loop, [4000], shape=shape, bandwidth_hz=400, through_band=through,
-                     around="plant")  # fmt: skip
+        q = design_q(loop, [4000], shape=shape, bandwidth_hz=400,
+                     trim=Trim(through_band=through), around="plant")  # fmt: skip
         widths[shape, through] = 0.01 * (np.abs(add_on(loop, q, f, "plant")) < 0.1).sum()
     assert widths["pointwise", False] == pytest.approx(37, abs=1)
     assert widths["hermite", False] == pytest.approx(41, abs=1)
@@ -300,7 +301,7 @@ def test_targets_outside_the_band(target_hz: float) -> None:
 @pytest.mark.parametrize("zero", [(0.0, 100.0), (1.0, float("nan")), (-1.0, 100.0)])
 def test_fixed_zeros_are_points(zero: tuple[float, float]) -> None:
     with pytest.raises(DesignError, match="fixed zeros"):
-        fmsdob(SLOW.loops(), [1500.0], zeros=[zero])
+        fmsdob(SLOW.loops(), [1500.0], trim=Trim(zeros=[zero]))
 
 
 def test_blocked_target() -> None:

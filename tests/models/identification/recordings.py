@@ -18,10 +18,10 @@ from stillpath.models.identification.synthetic import (
     simulate_log,
     simulate_spectrum,
     write_raw_data,
-    write_resonances,
 )
 from stillpath.models.identification.types import AccelerationLog, Excitation, Spectrum
 from stillpath.models.plants import PairsSpec, PlantSpec, PolePair
+from tests.models.identification.klipper_files import write_resonances
 
 __all__ = [
     "BROKEN",

@@ -21,7 +21,6 @@ from stillpath.models.identification.synthetic import (
     Sensor,
     simulate_log,
     simulate_spectrum,
-    write_calibration_data,
     write_raw_data,
 )
 from stillpath.models.machine import Machine
@@ -35,6 +34,7 @@ from stillpath.models.plants import (
     frequency_response,
 )
 from stillpath.models.store import load_machine
+from tests.models.identification.klipper_files import write_calibration_data
 from tests.models.identification.recordings import (
     BROKEN,
     LEGACY,

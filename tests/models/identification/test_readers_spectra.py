@@ -14,11 +14,10 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import ReadSettings, read_content, read_measurements
 from stillpath.models.identification.synthetic import (
     simulate_spectrum,
-    write_calibration_data,
-    write_resonances,
 )
 from stillpath.models.identification.types import Excitation, FrequencyResponse, Spectrum
 from stillpath.models.plants import PairsSpec, PolePair
+from tests.models.identification.klipper_files import write_calibration_data, write_resonances
 
 RATE_HZ = 3193.7
 

@@ -11,6 +11,7 @@ import pytest
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_response, mean_spectrum
 from stillpath.models.identification.sets import (
+    Origin,
     delay_warning,
     parametric_members,
     plant_set_from,
@@ -60,9 +61,8 @@ def spectrum(spec: ModesSpec, seed: int = 0) -> Spectrum:
 
 
 def test_one_response_makes_a_set_of_what_explains_it() -> None:
-    found = response_set(
-        [response(plant())], axis="x", sources=[SOURCE], measured_on=date(2026, 8, 1)
-    )
+    origin = Origin((SOURCE,), date(2026, 8, 1))
+    found = response_set([response(plant())], axis="x", origin=origin)
     members = found.plants.weighted_members()
     assert 4 < len(members) <= 16
     assert members[0].plant == found.plants.nominal

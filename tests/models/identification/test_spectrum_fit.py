@@ -14,7 +14,6 @@ from stillpath.models.identification.frame import without_frame
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.spectrum_fit import (
     explain_spectra,
-    fit_spectrum,
     refit_spectrum,
 )
 from stillpath.models.identification.spectrum_model import (
@@ -77,7 +76,7 @@ def test_modes_of_a_simulated_spectrum(
     modes: Modes, gains: tuple[float, ...], noise: float, test: Excitation
 ) -> None:
     """Within 0.5 % and 15 % (reference notes, section 9), from Klipper's 2.3 Hz wide bins."""
-    fit = fit_spectrum(simulated(modes, gains, test, noise), test)
+    fit = explain_spectra([simulated(modes, gains, test, noise)], test).fit
     check_usable(fit)
     assert fit.gain == pytest.approx(1.0, abs=0.03)
     for f, zeta in modes:
@@ -90,10 +89,12 @@ def test_modes_of_a_simulated_spectrum(
 
 @pytest.mark.slow
 def test_trials_tell_what_each_order_leaves() -> None:
-    fit = fit_spectrum(simulated(OUT_OF_BAND, (0.75, 0.2, 0.05), LEGACY), LEGACY)
+    fit = explain_spectra([simulated(OUT_OF_BAND, (0.75, 0.2, 0.05), LEGACY)], LEGACY).fit
     assert [t.order for t in fit.trials] == [1, 2, 3, 4]
     assert fit.trials[0].residual > 3 > fit.trials[1].residual > 0.2 > fit.trials[2].residual
-    alone = fit_spectrum(simulated(OUT_OF_BAND, (0.75, 0.2, 0.05), LEGACY), LEGACY, max_order=2)
+    alone = explain_spectra(
+        [simulated(OUT_OF_BAND, (0.75, 0.2, 0.05), LEGACY)], LEGACY, max_order=2
+    ).fit
     assert [t.order for t in alone.trials] == [1, 2]
 
 
@@ -158,7 +159,7 @@ def test_window_keeps_the_power_of_a_flat_spectrum() -> None:
 
 def test_wrong_level_is_told() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
-    fit = fit_spectrum(spectrum, replace(LEGACY, accel_per_hz_mm_s=120.0))
+    fit = explain_spectra([spectrum], replace(LEGACY, accel_per_hz_mm_s=120.0)).fit
     assert fit.gain == pytest.approx(0.625, rel=0.05)
     assert any("implies accel_per_hz = 7" in n and "stated are 120" in n for n in fit.notes)
     # The shape does not depend on it.
@@ -187,9 +188,12 @@ def test_column_that_follows_the_drive() -> None:
     assert driven_column(spectrum) == "x"
     turned = replace(spectrum, psd={"x": spectrum.psd["y"], "z": spectrum.psd["x"]})
     assert driven_column(turned) == "z"
-    assert fit_spectrum(turned, LEGACY).spec == fit_spectrum(spectrum, LEGACY, column="x").spec
+    assert (
+        explain_spectra([turned], LEGACY).fit.spec
+        == explain_spectra([spectrum], LEGACY, column="x").fit.spec
+    )
     with pytest.raises(ModelError, match="no column 'q'; there are x, z"):
-        fit_spectrum(turned, LEGACY, column="q")
+        explain_spectra([turned], LEGACY, column="q")
 
 
 @pytest.mark.slow
@@ -197,21 +201,23 @@ def test_coupled_axes_are_told() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     coupled = replace(spectrum, psd={**spectrum.psd, "y": 0.3 * spectrum.psd["x"]})
     assert cross_axis_share(coupled, "x", (8.0, 130.0)) == (pytest.approx(0.3), "y")
-    assert any("'y' has 30% of the power of 'x'" in n for n in fit_spectrum(coupled, LEGACY).notes)
-    assert not any("power of" in n for n in fit_spectrum(spectrum, LEGACY).notes)
+    assert any(
+        "'y' has 30% of the power of 'x'" in n for n in explain_spectra([coupled], LEGACY).fit.notes
+    )
+    assert not any("power of" in n for n in explain_spectra([spectrum], LEGACY).fit.notes)
 
 
 def test_dead_column_and_short_band_are_refused() -> None:
     spectrum = simulated(NARROW, (0.7, 0.3), LEGACY)
     dead = replace(spectrum, psd={"x": np.zeros(len(spectrum.f_hz))}, source="a.csv")
     with pytest.raises(ModelError, match=r"a\.csv: column 'x' is zero"):
-        fit_spectrum(dead, LEGACY)
+        explain_spectra([dead], LEGACY)
     with pytest.raises(ModelError, match="at least 30 are needed; check max_freq"):
-        fit_spectrum(spectrum, replace(LEGACY, f_end_hz=40.0))
+        explain_spectra([spectrum], replace(LEGACY, f_end_hz=40.0))
 
 
 def test_refit_keeps_the_structure() -> None:
-    fit = fit_spectrum(simulated(NARROW, (0.7, 0.3), LEGACY), LEGACY)
+    fit = explain_spectra([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY).fit
     moved = ((37.0, 0.018), (60.0, 0.024))
     member = refit_spectrum(simulated(moved, (0.7, 0.3), LEGACY), LEGACY, fit)
     assert member.order == fit.order
@@ -234,7 +240,7 @@ def test_main_mode_of_real_axes(shared_dir: Path, file: str, f_hz: float, peak: 
     """Figures of an independent fit of the same files (reference notes, section 5)."""
     (spectrum,) = read_measurements(shared_dir / "measurements" / f"{file}.csv")
     assert isinstance(spectrum, Spectrum)
-    fit = fit_spectrum(spectrum, LEGACY)
+    fit = explain_spectra([spectrum], LEGACY).fit
     f = np.linspace(*fit.band_hz, 2000)
     size = np.abs(frequency_response(fit.spec, f))
     # Of pairs, and at the edge of the band: not the same structure.

@@ -16,9 +16,7 @@ from stillpath.models.identification.synthetic import (
     acceleration_response,
     simulate_log,
     simulate_spectrum,
-    write_calibration_data,
     write_raw_data,
-    write_resonances,
 )
 from stillpath.models.identification.types import Excitation, Spectrum
 from stillpath.models.plants import (
@@ -30,6 +28,7 @@ from stillpath.models.plants import (
     ZeroPair,
     frequency_response,
 )
+from tests.models.identification.klipper_files import write_calibration_data, write_resonances
 
 SHORT = Excitation((1.0, 0.0), 5.0, 9.0, 60.0, 2.0)
 NEW = Excitation((1.0, 0.0))

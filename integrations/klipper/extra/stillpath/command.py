@@ -29,8 +29,9 @@ class Plan:
         self.phases.clear()
         self.here = (x, y)
 
-    def add(self, t, accel_t, cruise_t, decel_t, x, y, _z, rx, ry, _rz, start_v, cruise_v, accel):
+    def add(self, *move):
         """Take a move as `trapq_append` does."""
+        t, accel_t, cruise_t, decel_t, x, y, _z, rx, ry, _rz, start_v, cruise_v, accel = move
         if not rx and not ry:
             return
         for seconds, v, a in (

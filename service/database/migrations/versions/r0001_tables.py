@@ -11,19 +11,9 @@ down_revision = None
 
 def upgrade() -> None:
     """Make the tables."""
-    op.create_table(
-        "audit",
-        sa.Column("id", sa.Integer(), autoincrement=True, nullable=False),
-        sa.Column("at", sa.Float(), nullable=False),
-        sa.Column("owner", sa.String(length=64), nullable=False),
-        sa.Column("key_id", sa.String(length=16), nullable=True),
-        sa.Column("remote", sa.String(length=64), nullable=True),
-        sa.Column("action", sa.String(length=64), nullable=False),
-        sa.Column("subject", sa.String(length=255), nullable=True),
-        sa.Column("details", sa.JSON(none_as_null=True), nullable=True),
-        sa.PrimaryKeyConstraint("id", name=op.f("audit_pkey")),
-    )
-    op.create_index(op.f("audit_at_index"), "audit", ["at"], unique=False)
+    _make_jobs()
+    _make_beside_jobs()
+    _make_access()
     op.create_table(
         "documents",
         sa.Column("path", sa.String(length=255), nullable=False),
@@ -31,6 +21,16 @@ def upgrade() -> None:
         sa.Column("created_at", sa.Float(), nullable=False),
         sa.PrimaryKeyConstraint("path", name=op.f("documents_pkey")),
     )
+    op.create_table(
+        "leases",
+        sa.Column("name", sa.String(length=32), nullable=False),
+        sa.Column("holder", sa.String(length=64), nullable=False),
+        sa.Column("expires_at", sa.Float(), nullable=False),
+        sa.PrimaryKeyConstraint("name", name=op.f("leases_pkey")),
+    )
+
+
+def _make_jobs() -> None:
     op.create_table(
         "jobs",
         sa.Column("id", sa.String(length=32), nullable=False),
@@ -71,27 +71,9 @@ def upgrade() -> None:
     op.create_index("jobs_by_dedupe_key", "jobs", ["owner", "dedupe_key"], unique=False)
     op.create_index("jobs_by_owner", "jobs", ["owner", "created_at"], unique=False)
     op.create_index("jobs_by_state", "jobs", ["state", "priority", "created_at"], unique=False)
-    op.create_table(
-        "keys",
-        sa.Column("id", sa.String(length=16), nullable=False),
-        sa.Column("owner", sa.String(length=64), nullable=False),
-        sa.Column("name", sa.String(length=120), nullable=False),
-        sa.Column("sha256", sa.String(length=64), nullable=False),
-        sa.Column("scopes", sa.String(length=64), nullable=False),
-        sa.Column("created_at", sa.Float(), nullable=False),
-        sa.Column("expires_at", sa.Float(), nullable=True),
-        sa.Column("revoked_at", sa.Float(), nullable=True),
-        sa.Column("used_at", sa.Float(), nullable=True),
-        sa.PrimaryKeyConstraint("id", name=op.f("keys_pkey")),
-        sa.UniqueConstraint("sha256", name=op.f("keys_sha256_unique")),
-    )
-    op.create_table(
-        "leases",
-        sa.Column("name", sa.String(length=32), nullable=False),
-        sa.Column("holder", sa.String(length=64), nullable=False),
-        sa.Column("expires_at", sa.Float(), nullable=False),
-        sa.PrimaryKeyConstraint("name", name=op.f("leases_pkey")),
-    )
+
+
+def _make_beside_jobs() -> None:
     op.create_table(
         "submissions",
         sa.Column("owner", sa.String(length=64), nullable=False),
@@ -118,3 +100,33 @@ def upgrade() -> None:
         sa.UniqueConstraint("job_id", "kind", name=op.f("deliveries_job_id_unique")),
     )
     op.create_index(op.f("deliveries_state_index"), "deliveries", ["state"], unique=False)
+
+
+def _make_access() -> None:
+    op.create_table(
+        "audit",
+        sa.Column("id", sa.Integer(), autoincrement=True, nullable=False),
+        sa.Column("at", sa.Float(), nullable=False),
+        sa.Column("owner", sa.String(length=64), nullable=False),
+        sa.Column("key_id", sa.String(length=16), nullable=True),
+        sa.Column("remote", sa.String(length=64), nullable=True),
+        sa.Column("action", sa.String(length=64), nullable=False),
+        sa.Column("subject", sa.String(length=255), nullable=True),
+        sa.Column("details", sa.JSON(none_as_null=True), nullable=True),
+        sa.PrimaryKeyConstraint("id", name=op.f("audit_pkey")),
+    )
+    op.create_index(op.f("audit_at_index"), "audit", ["at"], unique=False)
+    op.create_table(
+        "keys",
+        sa.Column("id", sa.String(length=16), nullable=False),
+        sa.Column("owner", sa.String(length=64), nullable=False),
+        sa.Column("name", sa.String(length=120), nullable=False),
+        sa.Column("sha256", sa.String(length=64), nullable=False),
+        sa.Column("scopes", sa.String(length=64), nullable=False),
+        sa.Column("created_at", sa.Float(), nullable=False),
+        sa.Column("expires_at", sa.Float(), nullable=True),
+        sa.Column("revoked_at", sa.Float(), nullable=True),
+        sa.Column("used_at", sa.Float(), nullable=True),
+        sa.PrimaryKeyConstraint("id", name=op.f("keys_pkey")),
+        sa.UniqueConstraint("sha256", name=op.f("keys_sha256_unique")),
+    )

@@ -1,0 +1,41 @@
+"""What a line of the file does, as far as its writer must know: by its text alone."""
+
+from __future__ import annotations
+
+import re
+
+from stillpath.gcode.firmware.base import StreamCommands
+
+__all__ = ["AXES", "EXTRUSION", "FEED", "NUMBERED", "POSITIONING", "SET_POSITION", "LineReader"]
+
+AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
+FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
+SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
+POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G\s*0*9[01](?!\d)")
+EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M\s*0*8[23](?!\d)")
+NUMBERED = re.compile(rb"^\s*N\d+\s*")
+
+_MOVE = re.compile(rb"^\s*(?:N\d+\s*)?(?:G-?0*[0-35](?![\d.])|[XYZEIJK]\s*[-+.\d])", re.IGNORECASE)
+_MOVE_WITH_SUBCODE = re.compile(rb"^\s*(?:N\d+\s*)?G-?0*[0-35]\.\d", re.IGNORECASE)
+_FURTHER_MOVE = re.compile(rb"(?:^|[\s\d])G-?0*[0-35](?![\d.])", re.IGNORECASE)
+_E_WORD = re.compile(rb"E\s*([-+]?(?:\d+\.?\d*|\.\d+))")
+_E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
+
+
+class LineReader:
+    """Tell what lines do, by the rules of a firmware. Comments must be cut off."""
+
+    def __init__(self, commands: StreamCommands) -> None:
+        self._commands = commands
+        self._e_word = _E_WORD_FOLDED if commands.folds_case else _E_WORD
+
+    def is_move(self, code: bytes) -> bool:
+        """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
+        further = not self._commands.one_command and _FURTHER_MOVE.search(code)
+        subcode = self._commands.ignores_subcodes and _MOVE_WITH_SUBCODE.match(code)
+        return bool(_MOVE.match(code) or further or subcode)
+
+    def extruder_word(self, code: bytes) -> float | None:
+        """Return the E of a line; of several the last, as Marlin does, which alone needs it."""
+        found = self._e_word.findall(code)
+        return float(found[-1]) if found else None

@@ -1,0 +1,210 @@
+"""What a person should know of a measurement and of the model that was fitted to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.models.errors import ModelError
+from stillpath.models.identification.estimation import plateau_gain
+from stillpath.models.identification.nozzle import Frame
+from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
+
+__all__ = [
+    "apart_warning",
+    "body_notes",
+    "by_file",
+    "cross_axis_warning",
+    "fit_warnings",
+    "level_warnings",
+    "mounting_notes",
+    "parted",
+    "scale_warnings",
+    "spectrum_level_warning",
+]
+
+Array = NDArray[np.float64]
+
+_MOSTLY = 0.8
+_CROSS = 0.2
+_APART_DB = 2.0
+"""Repeats within a session differ by .3 to 1 dB, tables of one axis weeks apart by up to 1.5 dB."""
+_DB = 10 / np.log(10)
+_LEVEL_TOLERANCE = 0.15
+_LEVELS = (0.3, 3.0)
+_POOR, _POOR_DB = 0.15, 1.1
+_USELESS, _USELESS_DB = 0.5, 6.0
+"""Residuals beyond which a fit is no model of what was measured."""
+_AHEAD_S = 1e-3
+_LEAST_COHERENCE, _LEAST_POINTS, _SLOPE_TOLERANCE = 0.95, 4, 0.2
+_WARNING = "warning: "
+
+
+def by_file(told: Iterable[tuple[str, str]]) -> list[str]:
+    """Put the names of all files before what is said of them, each text once."""
+    sources: dict[str, list[str]] = {}
+    for source, text in dict.fromkeys(told):
+        sources.setdefault(text, []).append(source)
+    return [f"{', '.join(names)}: {text}" for text, names in sources.items()]
+
+
+def mounting_notes(axis: str, responses: Sequence[FrequencyResponse]) -> list[str]:
+    """Say how the sensor sits, where its axes are not the machine's: many are mounted so."""
+    notes = []
+    for response in responses:
+        along = dict(zip("xyz", map(abs, response.sensor_direction or ()), strict=False))
+        most = max(along, key=along.__getitem__, default=axis)
+        if most != axis and along[most] > _MOSTLY:
+            text = (
+                f"the sensor's {most} moved in the test of axis {axis}, so it was taken "
+                "to be mounted so; if it is not, another axis was measured (sensor_axis "
+                f"{axis} refuses such a log)"
+            )
+            notes.append((response.source, text))
+    return by_file(notes)
+
+
+def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
+    """Say what else than the axis was seen."""
+    notes = []
+    if friction_mm:
+        notes.append(
+            f"dry friction holds the axis {1e3 * friction_mm:.1f} um behind its command: the "
+            "response is freed of it, and commands make up for it"
+        )
+    if frame is not None:
+        notes.append(
+            f"the frame shakes on its feet at {frame.f_hz:.1f} Hz (what moves is "
+            f"{frame.mass_ratio:.0%} of its mass): the sensor feels it, the nozzle over the bed "
+            "does not, so the response is freed of it (frame_firm leaves it in)"
+        )
+    return notes
+
+
+def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Part notes from those that a reader calls a warning."""
+    told = tuple(told)
+    warned = tuple(text for text in told if _WARNING in text)
+    notes = tuple(text for text in told if text not in warned)
+    return notes, tuple(text.replace(_WARNING, "", 1) for text in warned)
+
+
+def fit_warnings(fit: Fit, sources: Sequence[str]) -> tuple[str, ...]:
+    """Tell of a model that should not be relied on; refuse one that is none."""
+    if fit.magnitude_only:
+        limits, missed = (_POOR_DB, _USELESS_DB), f"{fit.residual:.1f} dB"
+    else:
+        limits, missed = (_POOR, _USELESS), f"{fit.residual:.0%}"
+    remedy = (
+        "Allow more modes (max_order), leave out files of another state of the machine, or "
+        "measure again"
+    )
+    if fit.residual > limits[1]:
+        raise ModelError(
+            f"{', '.join(sources)}: no stable model of {fit.order} modes explains this: it misses "
+            f"{missed}. Check that file, axis and test belong together. {remedy}"
+        )
+    if fit.residual > limits[0]:
+        text = f"the model misses {missed} of what was measured: look at the curves before it is"
+        return (f"{text} used. {remedy}",)
+    return ()
+
+
+def level_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
+    """Judge the level by the fit, where nothing followed at the frequencies that tell it."""
+    names = ", ".join(r.source for r in responses if plateau_gain(r) is None)
+    if not names or abs(fit.gain - 1.0) <= _LEVEL_TOLERANCE:
+        return []
+    seen = f"{names}: by the fit the sensor moved {fit.gain:.2g} times as much as commanded"
+    if not _LEVELS[0] < fit.gain < _LEVELS[1]:
+        raise ModelError(
+            f"{seen}: it does not sit on what moves, or accel_per_hz or its scale is wrong; "
+            "measure at the part that the axis moves"
+        )
+    return [f"{seen}; check accel_per_hz in printer.cfg and the sensor's scale"]
+
+
+def scale_warnings(responses: Sequence[FrequencyResponse], fit: Fit) -> list[str]:
+    """Tell of a command and a measurement that are hardly those of one axis in one unit."""
+    names, warnings = ", ".join(dict.fromkeys(r.source for r in responses)), []
+    if abs(fit.gain - 1.0) > _LEVEL_TOLERANCE:
+        warnings.append(
+            f"{names}: at low frequencies the measurement is {fit.gain:.3g} times the command, and "
+            "was divided by that: an axis that keeps its steps ends where it is told; check that "
+            "both have the same unit, and which columns they are"
+        )
+    warnings += by_file((r.source, text) for r in responses if (text := _slope_text(r)))
+    if fit.delay_s < -_AHEAD_S:
+        warnings.append(
+            f"{names}: the measurement is {-fit.delay_s * 1e3:.2g} ms ahead of the command: check "
+            "that the two are not exchanged, and their clocks"
+        )
+    return warnings
+
+
+def _slope_text(response: FrequencyResponse) -> str:
+    """Tell of a response that rises or falls like a power of f over its lowest octave."""
+    f_hz = response.f_hz
+    known = (f_hz > 0) & (np.abs(response.response) > 0) & ~(response.coherence < _LEAST_COHERENCE)
+    if np.count_nonzero(known) < _LEAST_POINTS:
+        return ""
+    lowest = known & (f_hz <= 2.0 * f_hz[known].min())
+    if np.count_nonzero(lowest) < _LEAST_POINTS:
+        return ""
+    slope = np.polyfit(np.log(f_hz[lowest]), np.log(np.abs(response.response[lowest])), 1)[0]
+    power = round(float(slope))
+    if power == 0 or abs(slope - power) > _SLOPE_TOLERANCE:
+        return ""
+    return (
+        f"towards low frequencies the response goes like f^{power:d} instead of being level: "
+        "command and measurement must be the same quantity (both position, or both acceleration); "
+        f"multiply the response by (2 pi j f)^{-power:d}"
+    )
+
+
+def spectrum_level_warning(gain: float, excitation: Excitation) -> tuple[str, ...]:
+    """Warn of a level that another accel_per_hz would explain better."""
+    stated = excitation.accel_per_hz_mm_s
+    if abs(gain - 1) <= 2 * _LEVEL_TOLERANCE:
+        return ()
+    return (
+        (
+            f"the level at low frequency implies accel_per_hz = {gain * stated:.0f}, stated are "
+            f"{stated:g} ({gain - 1:+.0%}); check accel_per_hz, and that this axis was tested and "
+            "its sensor reads right (the shape of the model hardly depends on it)"
+        ),
+    )
+
+
+def apart_warning(spectra: Sequence[Spectrum], logs: Array) -> tuple[str, ...]:
+    """Warn of the two tables that differ most in shape, if they are not of one machine."""
+    pairs = [
+        (float(_DB * np.std(logs[i] - logs[j])), spectra[i].source, spectra[j].source)
+        for i in range(len(logs))
+        for j in range(i)
+    ]
+    apart_db, one, other = max(pairs, default=(0.0, "", ""))
+    if apart_db <= _APART_DB:
+        return ()
+    return (
+        (
+            f"{other} and {one} differ by {apart_db:.1f} dB in shape (repeats: below "
+            f"{_APART_DB:g} dB): something was changed between them (belt tension, mass, "
+            "mounting); give only tables of the machine as it prints today"
+        ),
+    )
+
+
+def cross_axis_warning(share: float, other: str, column: str) -> tuple[str, ...]:
+    """Warn of another axis that moved too."""
+    if share <= _CROSS:
+        return ()
+    return (
+        (
+            f"sensor axis {other!r} has {share:.0%} of the power of {column!r}: the axes are "
+            "coupled (CoreXY belts of unequal tension?), the frame rocks, or the sensor is turned; "
+            f"the model describes {column!r} alone"
+        ),
+    )

@@ -1,0 +1,148 @@
+"""The motion along a file: measured, added up, and shown to the compensator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stillpath.compensation.base import Compensator
+from stillpath.gcode.firmware.planning import intended
+from stillpath.gcode.pieces import Piece, VerbatimPart
+from stillpath.gcode.sampler import sample_phases, sample_until
+from stillpath.gcode.types import Phases
+from stillpath.pipeline.file_motion import STANDING_S
+from stillpath.pipeline.measuring.measure import Measurement
+from stillpath.pipeline.measuring.points import MotionSamples
+from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, as_executed
+from stillpath.pipeline.totals import Totals
+from stillpath.pipeline.verbatim import feeding
+from stillpath.pipeline.verifying import Verifier
+
+__all__ = ["MotionRecord"]
+
+_CHUNK = 1 << 17
+
+
+class MotionRecord:
+    """Samples of pieces, and what becomes of motion that nobody changes.
+
+    Parameters
+    ----------
+    step_mm : (float, float, float, float)
+        Steps of X Y Z E that the firmware rounds to; 0: it does not.
+    measurement : Measurement
+    totals : Totals
+    changing : (Compensator, Verifier), optional
+        Who must know all motion of the machine; None: the file is not changed.
+    """
+
+    def __init__(
+        self,
+        step_mm: tuple[float, float, float, float],
+        measurement: Measurement,
+        totals: Totals,
+        changing: tuple[Compensator, Verifier] | None,
+    ) -> None:
+        self._step_mm, self._rounds = step_mm, max(step_mm[:2]) > 0.0
+        self._measurement, self._sum, self._changing = measurement, totals, changing
+
+    def begin(self, piece: Piece) -> None:
+        """Let a piece begin where the machine stands."""
+        if self._sum.jumped and self._changing is not None:
+            # Homed, say: the machine did not come here along the path.
+            self._changing[0].reset(self._asked(piece, piece.phases).start_mm[0, :2])
+            self._sum.jumped = False
+
+    def as_written(
+        self, piece: Piece, paced: Piece, made: CompensatedPiece, executed: Phases
+    ) -> MotionSamples:
+        """Planned and executed motion of a piece on one grid of real time."""
+        asked = self._asked(paced, paced.phases)
+        planned, position, row, extruding = as_executed(made, asked, executed)
+        came = planned
+        if self._rounds:
+            moved = replace(paced.phases, t_s=made.encoded.row_start_s)
+            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
+        return self._samples(piece, row, planned, position, extruding, came)
+
+    def as_sliced(self, piece: Piece) -> MotionSamples:
+        """Motion of a piece as the firmware makes it of the sliced file."""
+        phases = piece.phases
+        grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
+        path, row = sample_phases(self._asked(piece, phases), grid)
+        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+        return self._samples(piece, row, path, came, feeding(phases)[row], came)
+
+    def pass_by(self, verbatim: VerbatimPart, part: Phases | float | None) -> None:
+        """Measure what a verbatim part does: motion, standing [s], or (None) losing its place."""
+        if part is None:
+            self._measurement.jump()
+            if self._changing is not None:
+                self._changing[1].passed(None)
+                self._sum.jumped = True
+        elif isinstance(part, Phases):
+            self._sum.add_verbatim(verbatim, part)
+            self._move(verbatim, part)
+        else:
+            self._sum.original_s += part
+            self.wait(part)
+
+    def wait(self, dwell_s: float) -> None:
+        """Let the machine stand in the written file."""
+        self._sum.time_s += dwell_s
+        if dwell_s <= 0.0:
+            return
+        stood = self._measurement.stand(round(min(dwell_s, STANDING_S) / DT_S))
+        if stood is not None:
+            self._observe(stood)
+
+    def _move(self, verbatim: VerbatimPart, phases: Phases) -> None:
+        duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
+        until = np.where(feeding(phases), phases.t_s + duration_s, -np.inf)
+        asked = self._asked(verbatim, phases)
+        samples = max(round(phases.duration_s / DT_S), 1)
+        for start in range(0, samples, _CHUNK):
+            grid = (start * DT_S, DT_S, min(_CHUNK, samples - start))
+            path, row, extruding = sample_until(asked, grid, until, axes=3)
+            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+            at = phases.move_index[row]
+            self._measurement.add(self._samples(verbatim, at, path, came, extruding, came))
+            self._observe(path[:2])
+
+    def _observe(self, command_mm: np.ndarray) -> None:
+        if self._changing is None:
+            return
+        compensator, verifier = self._changing
+        verifier.passed(command_mm)
+        if self._sum.jumped and command_mm.shape[1]:
+            compensator.reset(command_mm[:, 0])
+            self._sum.jumped = False
+        compensator.observe(command_mm)
+
+    def _samples(
+        self,
+        item: Piece | VerbatimPart,
+        row: np.ndarray,
+        planned: np.ndarray,
+        executed: np.ndarray,
+        extruding: np.ndarray,
+        sliced: np.ndarray,
+    ) -> MotionSamples:
+        """Return the samples of an item whose moves have been counted.
+
+        `sliced` is how the sliced file is executed, where the firmware rounds.
+        """
+        return MotionSamples(
+            path_mm=planned[:2],
+            executed_mm=executed[:2],
+            z_mm=planned[2],
+            extruding=extruding,
+            row=row,
+            moves=item.moves,
+            first_move=self._sum.moves - len(item.moves),
+            sliced_mm=sliced if self._rounds else None,
+        )
+
+    def _asked(self, item: Piece | VerbatimPart, phases: Phases) -> Phases:
+        return intended(phases, item.moves.start_mm, item.moves.end_mm, self._step_mm)
