@@ -15,6 +15,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Self, TypeVar
 from urllib.parse import quote, urlsplit
@@ -227,7 +228,8 @@ class Client:
     ) -> JobView:
         """Return a job when it is over, in whatever way.
 
-        It is watched by server-sent events, and asked for where these do not come through.
+        It is watched by server-sent events, and asked for where these do not come through, and
+        shortly before `timeout_s` is over.
 
         Parameters
         ----------
@@ -241,9 +243,9 @@ class Client:
         streams, pause_s = True, _FIRST_PAUSE_S
         seen: str | None = None
         while True:
-            if streams:
+            if streams and _may_be_silent(deadline):
                 try:
-                    for event_id, job in self._events(job_id, seen):
+                    for event_id, job in self._events(job_id, seen, deadline):
                         seen = event_id
                         pause_s = _FIRST_PAUSE_S
                         if tell is not None:
@@ -398,8 +400,10 @@ class Client:
             reason = f"the server does not accept the key (401): {reason}"
         raise ClientError(str(reason), status, problem)
 
-    def _events(self, job_id: str, seen: str | None) -> Iterator[tuple[str, JobView]]:
-        """Yield id and job of every event; return when the stream ends."""
+    def _events(
+        self, job_id: str, seen: str | None, deadline: float | None
+    ) -> Iterator[tuple[str, JobView]]:
+        """Yield id and job of every event; return when the stream ends or the deadline is near."""
         headers = {"Accept": "text/event-stream"}
         if seen is not None:
             headers["Last-Event-ID"] = seen
@@ -413,7 +417,8 @@ class Client:
                     raise _Broken(answer.reason_phrase)
                 if answer.status_code != 200 or not kind.startswith("text/event-stream"):
                     raise _NoEvents
-                for event in _parsed(answer.iter_lines()):
+                lines = takewhile(lambda _: _may_be_silent(deadline), answer.iter_lines())
+                for event in _parsed(lines):
                     if event.get("event") == "job":
                         yield event.get("id", ""), JobView.model_validate_json(event["data"])
         except httpx2.TransportError as error:
@@ -552,6 +557,11 @@ def _parsed(lines: Iterator[str]) -> Iterator[dict[str, str]]:
             name, _, value = line.partition(":")
             value = value.removeprefix(" ")
             event[name] = f"{event[name]}\n{value}" if name in event and name == "data" else value
+
+
+def _may_be_silent(deadline: float | None) -> bool:
+    """Whether a stream that falls silent now is given up before the deadline."""
+    return deadline is None or time.monotonic() + _SILENCE_S < deadline
 
 
 def _check_time(deadline: float | None, job: JobView) -> None:
