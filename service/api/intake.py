@@ -151,7 +151,7 @@ class Intake:
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
             pinned = await to_thread.run_sync(
-                self._admit, wanted, caller, incoming, limiter=limiter
+                self._admit, wanted, caller, incoming, idempotency_key, limiter=limiter
             )
             upload = await receive_upload(
                 request, incoming, max_bytes=self._settings.max_upload_bytes, disk=self._disk
@@ -176,14 +176,17 @@ class Intake:
             request.app.state.work.notify()
         return taken
 
-    def _admit(self, wanted: JobQuery, caller: Caller, incoming: Path) -> PinnedMachine:
+    def _admit(
+        self, wanted: JobQuery, caller: Caller, incoming: Path, idempotency_key: str | None
+    ) -> PinnedMachine:
         """Refuse what can be refused before the body, and write the machine beside its place.
 
         Whatever is done now, nobody waits for who has sent the body.
         """
         self._check_targets(wanted)
         pinned = self._pinned(wanted)
-        self._check_room(caller)
+        if not self._is_known(caller, idempotency_key):
+            self._check_room(caller)
         self._disk.check()
         pinned.write(incoming.with_suffix(".machine"))
         return pinned
@@ -340,6 +343,10 @@ class Intake:
         if known != fingerprint:
             raise _conflict(key)
         return job
+
+    def _is_known(self, caller: Caller, key: str | None) -> bool:
+        """Return whether the request may be one that has its job already, which needs no room."""
+        return key is not None and self._store.submitted(caller.owner, key) is not None
 
     def _check_room(self, caller: Caller) -> None:
         """Refuse before the body is read; adding the job checks again, in its transaction."""
