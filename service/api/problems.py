@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -20,12 +19,11 @@ from stillpath.models.complaints import complaint
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from stillpath.service.storage.base import StorageError
-from stillpath.service.storage.disk import NoRoom
+from stillpath.service.storage.disk import DISK_FULL, NoRoom
 
 __all__ = ["Problem", "install", "problem_response", "responses"]
 
 _METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Problem(Exception):  # named as in RFC 9457
@@ -97,13 +95,13 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(StorageError)
     async def _no_storage(request: Request, error: StorageError) -> Response:
-        if error.errno in _FULL:
+        if error.errno in DISK_FULL:
             return _full(request, error)
         return _away(request, "The storage does not answer", error)
 
     @app.exception_handler(OSError)
     async def _system(request: Request, error: OSError) -> Response:
-        if error.errno in _FULL:
+        if error.errno in DISK_FULL:
             return _full(request, error)
         raise error
 

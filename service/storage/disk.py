@@ -12,7 +12,10 @@ import structlog
 
 from stillpath.service.private import private_folder
 
-__all__ = ["Disk", "NoRoom"]
+__all__ = ["DISK_FULL", "Disk", "NoRoom"]
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Numbers of errors that say that a disk takes no more."""
 
 _MIB = 1 << 20
 _BALLAST = "disk-reserve"

@@ -180,6 +180,7 @@ def test_a_dying_worker_is_replaced_and_its_job_tried_once_more(client: TestClie
     assert job["state"] == "done"
     job = until(client, client.post(JOBS, content=b"die").headers["location"], over)
     assert job["error"]["title"] == "The worker was lost"
+    assert "memory is the usual reason" in job["error"]["detail"]
     assert client.get("/readyz").status_code == 200
     job = until(client, client.post(JOBS, content=b"G1 X1").headers["location"], over)
     assert job["state"] == "done"
