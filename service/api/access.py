@@ -17,7 +17,7 @@ from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBea
 
 from stillpath.service.api.limits import Limits, name_of
 from stillpath.service.api.patience import patience_of
-from stillpath.service.api.problems import Problem
+from stillpath.service.api.problems import NO_KEY, Problem
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.callers import LOCAL, Caller, Scope
@@ -119,8 +119,7 @@ def _caller(request: Request, shown: str | None) -> Caller:
         _turn_away(
             request,
             Caller("-", frozenset(), remote=remote),
-            "No key came with the request. Send one as 'Authorization: Bearer sp_...' or "
-            "'X-Api-Key: sp_...'; `stillpath keys create` makes one.",
+            NO_KEY,
         )
     keys: KeyStore = request.app.state.keys
     key = keys.find(shown)
@@ -143,7 +142,7 @@ def _caller(request: Request, shown: str | None) -> Caller:
 def _turn_away(request: Request, who: Caller, detail: str) -> NoReturn:
     limits: Limits = request.app.state.limits
     limits.take(name_of(who))
-    _deny(request, who, 401, "Unknown caller", detail)
+    _deny(request, who, 401, "Unauthorized", detail)
 
 
 def _deny(request: Request, who: Caller, status: int, title: str, detail: str) -> NoReturn:

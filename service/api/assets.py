@@ -88,7 +88,7 @@ def _file(kinds: tuple[str, ...], description: str, *more: int) -> dict[int | st
 )
 @router.head("/result", include_in_schema=False)
 async def read_result(request: Request, job_id: JobId, caller: Reader) -> Response:
-    """Stream the written file: of the kind that was handed in. Obeys `Range`.
+    """Stream the written file: of the kind that was submitted. Obeys `Range`.
 
     Of jobs that compute something else, the answer.
     """

@@ -38,7 +38,7 @@ _LONGEST_WAIT_S = 50.0
 """What proxies wait for an answer is a minute, as a rule."""
 _LARGEST_ANSWER_BYTES = 64 << 20
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,6})(?:$|[,;\s])")
-_UNKNOWN = problem(500, "The job failed", "Its reason is unknown.")
+_UNKNOWN = problem(500, "Job failed", "Its reason is unknown.")
 _T = TypeVar("_T")
 
 WAITING: dict[int | str, dict[str, Any]] = {
@@ -154,7 +154,7 @@ async def answered(request: Request, caller: Caller, question: Question) -> Job:
         case JobState.FAILED:
             raise Problem.of(job.problem or _UNKNOWN)
         case JobState.CANCELLED:
-            raise Problem(409, "It was cancelled", "The job was cancelled; ask again.")
+            raise Problem(409, "Job cancelled", "The job was cancelled; ask again.")
         case _:
             raise NotYet(job)
 
@@ -166,7 +166,7 @@ async def answer_of(request: Request, job: Job) -> Any:
     if size > _LARGEST_ANSWER_BYTES:
         raise Problem(
             422,
-            "The answer is too large",
+            "Result too large",
             f"It has {size} bytes; fetch /v1/jobs/{job.id}/result.",
         )
     try:

@@ -24,7 +24,7 @@ router = APIRouter(prefix="/v1", tags=["controllers"])
     "/loops",
     response_model=list[LoopFigures],
     responses=WAITING,
-    summary="List the closed-loop machines",
+    summary="List closed-loop machines",
 )
 async def list_loops(request: Request, caller: Reader) -> Any:
     """Return the built-in closed-loop machines and the methods that fit each."""

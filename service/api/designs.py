@@ -54,7 +54,7 @@ Asked = Annotated[DesignReport, Depends(_asked)]
     "/design",
     response_model=DesignReport,
     responses={200: {"content": {"text/html": {}}}, **WAITING, **responses(404, 422)},
-    summary="Look at the design for an axis",
+    summary="Get the design for an axis",
 )
 async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") -> Response:
     """Return the figures as JSON, or as a page if that is what `Accept` names first.
@@ -73,7 +73,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
     "/design.html",
     response_class=HTMLResponse,
     responses={**WAITING, **responses(404, 422)},
-    summary="Look at the design for an axis, as a page",
+    summary="Get the design for an axis, as a page",
 )
 async def read_design_page(found: Asked) -> HTMLResponse:
     """Return one self-contained HTML page."""

@@ -95,7 +95,7 @@ def _settings(
     try:
         return ReadSettings.model_validate({k: v for k, v in given.items() if v is not None})
     except ValidationError as error:
-        raise Problem(422, "Bad parameter", explain(error)) from None
+        raise Problem(422, "Invalid parameter", explain(error)) from None
 
 
 @router.post(
@@ -133,7 +133,9 @@ async def post_measurements(
     machines: Resolver = request.app.state.machines
     if not trial and not caller.may(Scope.ADMIN):
         raise Problem(
-            403, "Not allowed", "To change a machine needs a key with the scope admin; a trial not."
+            403,
+            "Not allowed",
+            "Changing a machine requires a key with the `admin` scope; a trial does not.",
         )
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
@@ -173,7 +175,7 @@ async def post_measurements(
 
 
 @router.get(
-    "/identification", responses=responses(404, 422), summary="How the machine's plants were found"
+    "/identification", responses=responses(404, 422), summary="Get the identification of a machine"
 )
 def read_identification(request: Request, name: Name, _: Reader) -> IdentificationReport:
     """Return the figures of the identification that led to the machine as it stands."""
@@ -184,7 +186,7 @@ def read_identification(request: Request, name: Name, _: Reader) -> Identificati
     "/identification.html",
     response_class=HTMLResponse,
     responses=responses(404, 422),
-    summary="How the machine's plants were found, as a page",
+    summary="Get the identification of a machine, as a page",
 )
 def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLResponse:
     """Return one self-contained HTML page: measured and model, modes, shapers."""
@@ -243,7 +245,9 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
     """Return the files of a form."""
     if not is_form(request):
         raise Problem(
-            422, "No form", "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv)."
+            422,
+            "Multipart form required",
+            "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv).",
         )
     files = await receive_files(
         request, folder, max_bytes=_LARGEST_BYTES, max_files=_MOST_FILES, disk=disk
@@ -251,7 +255,7 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
     if not files:
         raise Problem(
             422,
-            "The machine cannot be used",
+            "Machine not usable",
             "the form holds no file; send at least one measurement",
         )
     return files

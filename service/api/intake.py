@@ -328,10 +328,12 @@ class Intake:
             if wanted.printer is not None:
                 printer_for(self._printers, wanted.printer, start=wanted.print)
         except TargetRefused as error:
-            raise Problem(422, "It must not be sent there", str(error)) from None
+            raise Problem(422, "Target not allowed", str(error)) from None
         if wanted.print and wanted.printer is None:
             raise Problem(
-                422, "No printer", "`print` needs a printer: name one of /v1/printers as well."
+                422,
+                "Printer required",
+                "`print` needs a printer: name one of /v1/printers as well.",
             )
 
     def _earlier(self, caller: Caller, key: str, fingerprint: str) -> Job | None:
@@ -353,13 +355,13 @@ class Intake:
         jobs, kept_bytes = self._store.usage(caller.owner)
         if jobs >= self._quota.max_jobs:
             raise _too_many(
-                f"{caller.owner!r} has {jobs} jobs that are not over, the limit is "
+                f"{caller.owner!r} has {jobs} unfinished jobs, the limit is "
                 f"{self._quota.max_jobs}; wait for some, or cancel them."
             )
         if kept_bytes >= self._quota.max_bytes:
             raise _no_space(
                 f"{caller.owner!r} keeps {kept_bytes} bytes, and {self._quota.max_bytes} is the "
-                "limit; delete jobs that are over."
+                "limit; delete finished jobs."
             )
 
     def _pinned(self, wanted: JobQuery) -> PinnedMachine:
@@ -374,7 +376,7 @@ class Intake:
         except NotApproved as error:
             raise Problem(422, "Machine not approved", str(error)) from None
         except ModelError as error:
-            raise Problem(422, "The machine cannot be used", str(error)) from None
+            raise Problem(422, "Machine not usable", str(error)) from None
         printer = None if wanted.printer is None else self._printers.get(wanted.printer)
         if printer is None:
             return found
@@ -437,7 +439,7 @@ def _no_space(detail: str) -> Problem:
 
 
 def _too_many(detail: str) -> Problem:
-    return Problem(429, "Too much at once", detail, headers={"Retry-After": "30"})
+    return Problem(429, "Quota exceeded", detail, headers={"Retry-After": "30"})
 
 
 def _conflict(key: str | None) -> Problem:

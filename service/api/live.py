@@ -37,7 +37,7 @@ async def read_live_filter(request: Request, name: Name, caller: Reader) -> Resp
     """
     machine = await run_in_threadpool(to_print_with, request, name)
     if machine.live_refusal is not None:
-        raise Problem(422, "It cannot print live", machine.live_refusal)
+        raise Problem(422, "Live printing not available", machine.live_refusal)
     job = await answered(
         request,
         caller,

@@ -60,7 +60,7 @@ async def read_trajectories(
     if not 0 < stop_s - start_s <= _LONGEST_S:
         raise Problem(
             422,
-            "Bad parameter",
+            "Invalid parameter",
             f"start_s {start_s:g} to stop_s {stop_s:g} must be a period of at most {_LONGEST_S:g} "
             "s; ask for longer ones in parts.",
         )

@@ -20,11 +20,11 @@ __all__ = [
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 _REFUSED = {
-    JobKind.TRAJECTORIES: "No trajectories",
-    JobKind.IDENTIFICATION: "The machine cannot be used",
-    JobKind.DESIGN: "No such design",
-    JobKind.CONTROLLER: "No such controller",
-    JobKind.LIVE: "It cannot print live",
+    JobKind.TRAJECTORIES: "Trajectories not available",
+    JobKind.IDENTIFICATION: "Machine not usable",
+    JobKind.DESIGN: "Design not possible",
+    JobKind.CONTROLLER: "Controller not possible",
+    JobKind.LIVE: "Live printing not available",
 }
 """Titles, where what was asked cannot be computed."""
 

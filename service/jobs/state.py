@@ -121,7 +121,7 @@ class Job:
     room_bytes : int or None
         Room on the disk that it needs at least, if there was too little once.
     webhook : str or None
-        Address that is told when the job is over.
+        Address that is notified when the job ends.
     printer, print_after : str or None, bool
         Printer that the result is uploaded to, and whether it then starts to print.
     """
@@ -239,7 +239,7 @@ class Lost:
     """The worker died, or the service stopped, in the middle of the job.
 
     `blame` says whether the job may be the reason: a service that was stopped is not. `problem` is
-    what the job fails with after the last attempt, where more is known than that its worker is gone.
+    what the job fails with in the end, where more is known than that its worker is gone.
     """
 
     attempt: int

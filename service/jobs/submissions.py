@@ -46,7 +46,7 @@ _ADD, _ADD_AUDIT = tables.jobs.insert(), tables.audit.insert()
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """What one owner may have: jobs that are not over, and bytes of all jobs that are kept."""
+    """What one owner may have: unfinished jobs, and bytes of all jobs that are kept."""
 
     max_jobs: int
     max_bytes: int
@@ -157,7 +157,7 @@ def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
     jobs, size = usage(connection, job.owner)
     if jobs >= limits.max_jobs:
         raise QuotaExceeded(
-            f"{job.owner!r} has {jobs} jobs that are not over, the limit is {limits.max_jobs}; "
+            f"{job.owner!r} has {jobs} unfinished jobs, the limit is {limits.max_jobs}; "
             "wait for some or cancel them"
         )
     if size + job.source_bytes > limits.max_bytes:

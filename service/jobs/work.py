@@ -52,6 +52,6 @@ class Work:
         return self._reconciler.slots
 
     @property
-    def is_ready(self) -> str | None:
+    def not_ready_reason(self) -> str | None:
         """Why jobs are not done at the moment; None if they are."""
         return self._reconciler.trouble

@@ -98,7 +98,7 @@ class Disk:
         return (
             f"the disk of the service has {max(left, 0) // _MIB} MiB left{size}; "
             f"{self._reserve_bytes // _MIB} MiB stay free for the jobs that were accepted "
-            "(STILLPATH_DISK_RESERVE_BYTES). Delete jobs that are over, or make room on it"
+            "(STILLPATH_DISK_RESERVE_BYTES). Delete finished jobs, or make room on it"
         )
 
     def check(self, more_bytes: int = 0) -> None:

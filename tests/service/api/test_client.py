@@ -247,7 +247,8 @@ def test_a_job_that_only_waits_is_given_up_in_time(monkeypatch: pytest.MonkeyPat
         pytest.raises(ClientError, match="still queued; given up"),
     ):
         client.wait("5f2c", timeout_s=1.0)
-    assert whole and not any(whole)
+    assert whole
+    assert not any(whole)
 
 
 def test_strangers_and_redirections():
