@@ -289,17 +289,14 @@ class Intake:
         added: Job | None = None
         try:
             self._storage.put_all(files)
-            added = self._store.add(
-                job,
-                idempotency=idempotency,
-                limits=self._quota,
-                shared=shared,
-                audit_row=audit_row,
-            )
-        except SpaceExceeded as error:
-            raise _no_space(str(error)) from None
-        except QuotaExceeded as error:
-            raise _too_many(str(error)) from None
+            with _as_problems():
+                added = self._store.add(
+                    job,
+                    idempotency=idempotency,
+                    limits=self._quota,
+                    shared=shared,
+                    audit_row=audit_row,
+                )
         except IdempotencyConflict:
             raise _conflict(idempotency and idempotency[0]) from None
         finally:
@@ -352,17 +349,8 @@ class Intake:
 
     def _check_room(self, caller: Caller) -> None:
         """Refuse before the body is read; adding the job checks again, in its transaction."""
-        jobs, kept_bytes = self._store.usage(caller.owner)
-        if jobs >= self._quota.max_jobs:
-            raise _too_many(
-                f"{caller.owner!r} has {jobs} unfinished jobs, the limit is "
-                f"{self._quota.max_jobs}; wait for some, or cancel them."
-            )
-        if kept_bytes >= self._quota.max_bytes:
-            raise _no_space(
-                f"{caller.owner!r} keeps {kept_bytes} bytes, and {self._quota.max_bytes} is the "
-                "limit; delete finished jobs."
-            )
+        with _as_problems():
+            self._quota.check(caller.owner, *self._store.usage(caller.owner))
 
     def _pinned(self, wanted: JobQuery) -> PinnedMachine:
         """Return the job's machine, with warnings about it and about its printer."""
@@ -434,12 +422,15 @@ def _result_name(source_name: str, method: str) -> str:
     return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
-def _no_space(detail: str) -> Problem:
-    return Problem(507, "No space left", detail)
-
-
-def _too_many(detail: str) -> Problem:
-    return Problem(429, "Quota exceeded", detail, headers={"Retry-After": "30"})
+@contextmanager
+def _as_problems() -> Iterator[None]:
+    """Turn a quota that is full into a problem document."""
+    try:
+        yield
+    except SpaceExceeded as error:
+        raise Problem(507, "No space left", str(error)) from None
+    except QuotaExceeded as error:
+        raise Problem(429, "Quota exceeded", str(error), headers={"Retry-After": "30"}) from None
 
 
 def _conflict(key: str | None) -> Problem:
