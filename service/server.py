@@ -13,11 +13,11 @@ import uvicorn
 
 from stillpath.service.api import create_app
 from stillpath.service.database.engine import DatabaseAway, database_url, open_database
-from stillpath.service.exclusive import exclusive
+from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.task import Runner
 from stillpath.service.jobs.worker import run_task
 from stillpath.service.logs import configure_logging
-from stillpath.service.private import private_folder
+from stillpath.service.permissions import private_folder
 from stillpath.service.processes import quiet_tracker
 from stillpath.service.security.keys import keys_needed
 from stillpath.service.settings import Settings

@@ -13,10 +13,8 @@ from stillpath.applications.identification.archive import Archive
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.applications.machines.store import MachineStore
 from stillpath.service.api import (
-    assets,
     controllers,
     designs,
-    documents,
     events,
     frequency,
     health,
@@ -31,6 +29,8 @@ from stillpath.service.api import (
     pages,
     printers,
     problems,
+    report_schema,
+    results,
     trajectories,
 )
 from stillpath.service.api.computing import NotYet, not_yet
@@ -52,7 +52,7 @@ from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.keys import KeyStore, announce_first_key
 from stillpath.service.settings import Settings
 from stillpath.service.storage.disk import Disk
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.factory import open_storage
 from stillpath.version import __version__
 
 __all__ = ["create_app"]
@@ -124,9 +124,9 @@ def create_app(
     for part in (
         jobs,
         events,
-        assets,
+        results,
         trajectories,
-        documents,
+        report_schema,
         machines,
         machine_settings,
         frequency,
@@ -164,7 +164,7 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
         max_age_days=settings.measurement_max_age_days,
     )
     state.identifications = Archive(open_documents(settings, engine, "identifications"))
-    state.layers = assets.Layers(storage)
+    state.layers = results.Layers(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(
         settings,

@@ -24,7 +24,7 @@ from starlette.responses import JSONResponse, Response
 
 from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.models.machine import Machine
-from stillpath.service.api.finding import no_such_job
+from stillpath.service.api.job_lookup import no_such_job
 from stillpath.service.api.problems import Problem
 from stillpath.service.api.schemas import JobView
 from stillpath.service.jobs.problems import problem

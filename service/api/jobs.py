@@ -12,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 
 from stillpath.gcode.containers.sniff import Kind
 from stillpath.service.api.access import Reader, Submitter, Uploader, Watcher
-from stillpath.service.api.finding import JobId, find, no_such_job
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
+from stillpath.service.api.job_lookup import JobId, find, no_such_job
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
 from stillpath.service.database.engine import DatabaseAway

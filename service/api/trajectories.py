@@ -10,9 +10,9 @@ from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
 from stillpath.service.api.computing import WAITING, Question, answered
-from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.file_responses import MEDIA, stored
+from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
-from stillpath.service.api.stored import MEDIA, stored
 from stillpath.service.jobs.state import JobKind
 
 __all__ = ["router"]

@@ -22,7 +22,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
 from stillpath.service.database.migrations import LATEST
-from stillpath.service.private import private_file, private_folder
+from stillpath.service.permissions import private_file, private_folder
 
 if TYPE_CHECKING:
     from sqlalchemy import Table

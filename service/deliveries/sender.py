@@ -19,7 +19,7 @@ from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.deliveries import rows
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
-from stillpath.service.deliveries.posting import Reply, Unanswered, Unreached
+from stillpath.service.deliveries.http_requests import Reply, Unanswered, Unreached
 from stillpath.service.deliveries.printers import Printer, printer_for, upload, what_started
 from stillpath.service.deliveries.rows import Delivery
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook

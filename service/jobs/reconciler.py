@@ -197,7 +197,7 @@ class Reconciler:
     def _take_over(self) -> None:
         """Give back what ran when the service before us ended; its workers ended with it.
 
-        Only with a database that no other service uses (`service.exclusive` keeps the folder);
+        Only with a database that no other service uses (`service.instance_lock` keeps the folder);
         otherwise silence tells.
         """
         if self._store.engine.dialect.name == "sqlite":

@@ -44,7 +44,7 @@ from stillpath.service.processes import limit_memory
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError
 from stillpath.service.storage.disk import DISK_FULL, Disk
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.factory import open_storage
 
 __all__ = ["Workplace", "execute", "run_job", "run_task"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from stillpath.service.private import private_folder
+from stillpath.service.permissions import private_folder
 
 __all__ = ["DISK_FULL", "Disk", "NoRoom"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from stillpath.service.deliveries import sender
-from stillpath.service.deliveries.posting import Reply
+from stillpath.service.deliveries.http_requests import Reply
 from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
 from stillpath.service.deliveries.targets import TargetRefused
 from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads

@@ -14,10 +14,10 @@ from starlette.responses import Response
 
 from stillpath.gcode.containers.sniff import Kind, kind_of
 from stillpath.service.api.access import Reader
-from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, stored
+from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import LayerIndex
-from stillpath.service.api.stored import HEADERS, MEDIA, RANGES, stored
 from stillpath.service.jobs.state import Job, JobKind
 from stillpath.service.storage.base import Storage
 
