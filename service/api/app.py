@@ -33,7 +33,7 @@ from stillpath.service.api import (
     results,
     trajectories,
 )
-from stillpath.service.api.computing import NotYet, not_yet
+from stillpath.service.api.computing import StillRunning, still_running
 from stillpath.service.api.guard import Guard, hosts_of
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
@@ -47,7 +47,7 @@ from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
 from stillpath.service.jobs.work import Work
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.keys import KeyStore, announce_first_key
 from stillpath.service.settings import Settings
@@ -68,7 +68,7 @@ Errors are `application/problem+json` (RFC 9457).
 
 
 def create_app(
-    settings: Settings, *, keys_required: bool = False, runner: Runner = run_task
+    settings: Settings, *, keys_required: bool = False, runner: Runner = run_compensation
 ) -> FastAPI:
     """Return the HTTP application.
 
@@ -118,7 +118,7 @@ def create_app(
     app.add_middleware(metrics.Measured, metrics=state.metrics)
     app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
-    app.add_exception_handler(NotYet, not_yet)
+    app.add_exception_handler(StillRunning, still_running)
     app.include_router(health.router)
     app.include_router(pages.router)
     for part in (

@@ -19,7 +19,7 @@ from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.models.store import explain
 from stillpath.service.api.access import Reader, Uploader
-from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.forms import is_form
 from stillpath.service.api.machine_views import RevisionView
 from stillpath.service.api.machines import Author, Message, Name, as_problems, look_up
@@ -219,7 +219,7 @@ async def _identified(
         received = await _received(request, Path(folder), state.disk)
         named = [file.label.partition("@") for file in received]
         files = [[safe_name(before), condition] for before, _, condition in named]
-        question = Question(
+        asked = ComputeRequest(
             kind=JobKind.IDENTIFICATION,
             machine=given["name"],
             document=start,
@@ -230,8 +230,8 @@ async def _identified(
             source_bytes=sum(file.size_bytes for file in received),
             files=tuple((file.path, file.sha256) for file in received),
         )
-        job = await answered(request, caller, question)
-    found = await answer_of(request, job)
+        job = await run_and_wait(request, caller, asked)
+    found = await read_result(request, job)
     # In a thread: a report has some ten thousand numbers.
     return await run_in_threadpool(
         lambda: (

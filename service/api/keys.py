@@ -119,14 +119,14 @@ def list_keys(request: Request, caller: Admin) -> list[KeyView]:
     responses=responses(401, 403, 413, 422, 429),
     summary="Create an API key",
 )
-def create_key(request: Request, response: Response, wish: KeyCreate, caller: Admin) -> NewKey:
+def create_key(request: Request, response: Response, asked: KeyCreate, caller: Admin) -> NewKey:
     """Make a key and show it, this once."""
-    days = wish.expires_in_days
+    days = asked.expires_in_days
     try:
         key, secret = _keys(request).create(
-            name=wish.name,
-            owner=wish.owner,
-            scopes=wish.scopes,
+            name=asked.name,
+            owner=asked.owner,
+            scopes=asked.scopes,
             expires_at=None if days is None else time.time() + days * _DAY_S,
         )
     except KeyRefused as error:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, Question, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, run_and_wait
 from stillpath.service.api.file_responses import MEDIA, stored
 from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
@@ -65,7 +65,7 @@ async def read_trajectories(
             "s; ask for longer ones in parts.",
         )
     job = await find_done(request, job_id, caller)
-    question = Question(
+    asked = ComputeRequest(
         kind=JobKind.TRAJECTORIES,
         machine=job.machine,
         revision=job.machine_revision,
@@ -79,7 +79,7 @@ async def read_trajectories(
         result_name=f"{Path(job.result_name).stem}.{format}",
         source_name=job.source_name,
     )
-    made = await answered(request, caller, question)
+    made = await run_and_wait(request, caller, asked)
     return await stored(
         request,
         request.app.state.storage,

@@ -6,7 +6,7 @@ from stillpath.service.jobs.cluster import Cluster
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage
 
@@ -27,7 +27,11 @@ class Work:
     """
 
     def __init__(
-        self, settings: Settings, store: JobStore, storage: Storage, runner: Runner = run_task
+        self,
+        settings: Settings,
+        store: JobStore,
+        storage: Storage,
+        runner: Runner = run_compensation,
     ) -> None:
         self._cluster = Cluster(settings, runner)
         self._reconciler = Reconciler(settings, store, storage, self._cluster)

@@ -27,7 +27,7 @@ import structlog
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
-from stillpath.service.jobs.computations import answer
+from stillpath.service.jobs.computations import run_computation
 from stillpath.service.jobs.problems import (
     input_gone,
     never_fits,
@@ -46,7 +46,7 @@ from stillpath.service.storage import Storage, StorageError
 from stillpath.service.storage.disk import DISK_FULL, Disk
 from stillpath.service.storage.factory import open_storage
 
-__all__ = ["Workplace", "execute", "run_job", "run_task"]
+__all__ = ["Workplace", "execute", "run_compensation", "run_job"]
 
 _PATIENCE_S = 60.0
 """How long storage and database may be away before an attempt is given up."""
@@ -129,7 +129,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
     # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
     limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
     if job.kind is not JobKind.COMPENSATION:
-        runner = answer
+        runner = run_computation
     disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
     watch = Watch(
         store,
@@ -154,7 +154,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         workplace.end(0)
 
 
-def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
+def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Compensate the task's file and write its report; see `Runner`."""
     from stillpath.pipeline.compensate import compensate_file
     from stillpath.pipeline.options import Options
