@@ -79,7 +79,10 @@ RobustOption = Annotated[
     ),
 ]
 BasisOption = Annotated[
-    str, typer.Option("--basis", help="Basis of fbf: ce-opt, robust (chosen for the whole set), bspline or dct.")
+    str,
+    typer.Option(
+        "--basis", help="Basis of fbf: ce-opt, robust (chosen for the whole set), bspline or dct."
+    ),
 ]
 BudgetOption = Annotated[
     float | None,

@@ -152,7 +152,10 @@ class RippleOptions:
         float, typer.Option(help="Share by which passes move ripple that is known already.")
     ] = 0.5
     remaining: Annotated[
-        bool, typer.Option("--remaining", help="The passes were recorded with the known ripple compensated.")
+        bool,
+        typer.Option(
+            "--remaining", help="The passes were recorded with the known ripple compensated."
+        ),
     ] = False
     homing_repeatability: Annotated[
         float, typer.Option(metavar="MM", help="How exactly homing repeats.")

@@ -22,7 +22,9 @@ __all__ = ["By", "Message", "RevisionNote", "data_dir", "open_documents", "open_
 
 _Made = TypeVar("_Made")
 
-By = Annotated[str | None, typer.Option("--by", help="Author, recorded with the revision. [default: you]")]
+By = Annotated[
+    str | None, typer.Option("--by", help="Author, recorded with the revision. [default: you]")
+]
 Message = Annotated[str, typer.Option("--message", "-M", help="Why; recorded with the revision.")]
 
 

@@ -91,7 +91,7 @@ def worker(
 
 def _check_storage(settings: Settings) -> None:
     """Refuse an address that names no storage; whether it answers is for later."""
-    from stillpath.service.storage.opened import open_storage
+    from stillpath.service.storage.factory import open_storage
 
     try:
         open_storage(settings)

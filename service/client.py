@@ -30,6 +30,7 @@ from stillpath.service.connection import (
     Connection,
     NoEvents,
     Tell,
+    may_be_silent,
 )
 
 if TYPE_CHECKING:
@@ -171,7 +172,8 @@ class Client:
     ) -> JobView:
         """Return a job when it is over, in whatever way.
 
-        It is watched by server-sent events, and asked for where these do not come through.
+        It is watched by server-sent events, and asked for where these do not come through, and
+        shortly before `timeout_s` is over.
 
         Parameters
         ----------
@@ -185,9 +187,9 @@ class Client:
         streams, pause_s = True, FIRST_PAUSE_S
         seen: str | None = None
         while True:
-            if streams:
+            if streams and may_be_silent(deadline):
                 try:
-                    for event_id, job in self._events(job_id, seen):
+                    for event_id, job in self._events(job_id, seen, deadline):
                         seen = event_id
                         pause_s = FIRST_PAUSE_S
                         if tell is not None:
@@ -297,10 +299,12 @@ class Client:
             if error.status != 404:
                 raise
 
-    def _events(self, job_id: str, seen: str | None) -> Iterator[tuple[str, JobView]]:
-        """Yield id and job of every event; return when the stream ends."""
+    def _events(
+        self, job_id: str, seen: str | None, deadline: float | None
+    ) -> Iterator[tuple[str, JobView]]:
+        """Yield id and job of every event; return when the stream ends or the deadline is near."""
         try:
-            for event in self._connection.events(_path(job_id, "events"), seen):
+            for event in self._connection.events(_path(job_id, "events"), seen, deadline):
                 if event.get("event") == "job":
                     yield event.get("id", ""), JobView.model_validate_json(event["data"])
         except (ValidationError, KeyError):

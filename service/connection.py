@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any, TypeVar
 from urllib.parse import urlsplit
@@ -15,7 +16,15 @@ import httpx2
 
 from stillpath.version import __version__
 
-__all__ = ["FIRST_PAUSE_S", "Broken", "ClientError", "Connection", "NoEvents", "Tell"]
+__all__ = [
+    "FIRST_PAUSE_S",
+    "Broken",
+    "ClientError",
+    "Connection",
+    "NoEvents",
+    "Tell",
+    "may_be_silent",
+]
 
 Tell = Callable[[str, float | None], object]
 """Is told what is being done, and the share that is done if it is known; may raise to stop."""
@@ -140,8 +149,12 @@ class Connection:
         except httpx2.HTTPError:
             return
 
-    def events(self, path: str, last_id: str | None) -> Iterator[dict[str, str]]:
-        """Yield the fields of every event after `last_id`; return when the stream ends.
+    def events(
+        self, path: str, last_id: str | None, deadline: float | None
+    ) -> Iterator[dict[str, str]]:
+        """Yield the fields of every event after `last_id`.
+
+        The stream is left when it ends, or when a silence could outlast the deadline.
 
         Raises
         ------
@@ -159,7 +172,8 @@ class Connection:
                     raise Broken(answer.reason_phrase)
                 if answer.status_code != 200 or not kind.startswith("text/event-stream"):
                     raise NoEvents
-                yield from _parsed(answer.iter_lines())
+                lines = takewhile(lambda _: may_be_silent(deadline), answer.iter_lines())
+                yield from _parsed(lines)
         except httpx2.TransportError as error:
             raise Broken(_reason(error)) from None
 
@@ -262,6 +276,11 @@ def _parsed(lines: Iterator[str]) -> Iterator[dict[str, str]]:
             name, _, value = line.partition(":")
             value = value.removeprefix(" ")
             event[name] = f"{event[name]}\n{value}" if name in event and name == "data" else value
+
+
+def may_be_silent(deadline: float | None) -> bool:
+    """Whether a stream that falls silent now is given up before the deadline."""
+    return deadline is None or time.monotonic() + _SILENCE_S < deadline
 
 
 def _seconds(header: str | None) -> float | None:

@@ -13,11 +13,11 @@ import uvicorn
 
 from stillpath.service.api import create_app
 from stillpath.service.database.engine import DatabaseAway, database_url, open_database
-from stillpath.service.exclusive import exclusive
+from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.task import Runner
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.logs import configure_logging
-from stillpath.service.private import private_folder
+from stillpath.service.permissions import private_folder
 from stillpath.service.processes import quiet_tracker
 from stillpath.service.security.keys import keys_needed
 from stillpath.service.settings import Settings
@@ -33,7 +33,9 @@ _GOODBYE_S = 5
 """How long requests under way may take once the service was asked to end."""
 
 
-def serve_forever(settings: Settings, host: str, port: int, *, runner: Runner = run_task) -> None:
+def serve_forever(
+    settings: Settings, host: str, port: int, *, runner: Runner = run_compensation
+) -> None:
     """Serve until interrupted.
 
     Parameters

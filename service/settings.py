@@ -59,7 +59,7 @@ class Settings(MachineSettings, BaseSettings):
     workers : int
         Processes of its own that do jobs; each handles one at a time.
     max_attempts : int
-        How often a job may lose its worker before it fails.
+        A job fails when it loses its worker for this many times.
     heartbeat_timeout_s : float
         A worker that has been silent for so long is lost.
     cancel_grace_s : float
@@ -67,7 +67,7 @@ class Settings(MachineSettings, BaseSettings):
     max_job_s, max_job_bytes : float, int
         A job that takes longer, or whose process grows larger, fails.
     computing_processes : int
-        Further processes, for jobs that are over within minutes: designs, identifications,
+        Further processes, for jobs of minutes: designs, identifications,
         controllers. With a scheduler: how many of its places are kept for these.
     max_computing_s, max_computing_bytes : float, int
         Such a job that takes longer, or whose process grows larger, fails.
@@ -77,11 +77,11 @@ class Settings(MachineSettings, BaseSettings):
         Stays free on the disk of `data_dir`: uploads that would leave less are refused with status
         507, jobs wait for half of it. 0: the disk is not looked at.
     max_jobs_per_owner, max_bytes_per_owner : int
-        Jobs not yet over, and bytes of all jobs kept, that one owner may have.
+        Unfinished jobs, and bytes of all jobs kept, that one owner may have.
     requests_per_minute : int
         Of one key, or of one address without a key; reading progress does not count.
     keep_days : float
-        Jobs that are over are deleted after so long.
+        Finished jobs are deleted after so long.
     keys : bool, optional
         Whether callers must show a key. By default they must unless the service is bound to
         loopback.

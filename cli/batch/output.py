@@ -19,7 +19,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.pipeline.files import replacing
-from stillpath.service.exclusive import exclusive
+from stillpath.service.instance_lock import exclusive
 
 __all__ = ["Figures", "Outcome", "OutputFolder", "Scratch", "State", "Trouble", "sha256_of"]
 

@@ -190,7 +190,7 @@ class WorkerPool:
         try:
             made = self._works.do(item.source, scratch, machine, self._stopping)
             if _signature(item.source) != began or sha256_of(item.source) != outcome.source_sha256:
-                raise Failure("it was changed while it was read; hand it in again", "computer")
+                raise Failure("it was changed while it was read; submit it again", "computer")
             done = outcome.model_copy(
                 update={
                     "state": "done",

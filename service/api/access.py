@@ -1,7 +1,7 @@
 """What a route asks of its caller: `Reader`, `Submitter` or `Admin` as a parameter.
 
 `Watcher` is a reader whose requests are not counted, for whoever follows a job; `Uploader` is a
-submitter who holds one of his places for uploads until he is answered; `Operator` is an admin, or
+submitter who holds an upload slot until the answer; `Operator` is an admin, or
 somebody on this computer where no keys are asked for.
 """
 
@@ -15,9 +15,9 @@ from typing import Annotated, NoReturn
 from fastapi import Depends, Request
 from fastapi.security import APIKeyHeader, HTTPAuthorizationCredentials, HTTPBearer
 
+from stillpath.service.api.body_timeout import body_timeout_of
 from stillpath.service.api.limits import Limits, name_of
-from stillpath.service.api.patience import patience_of
-from stillpath.service.api.problems import Problem
+from stillpath.service.api.problems import NO_KEY, Problem
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.callers import LOCAL, Caller, Scope
@@ -86,7 +86,7 @@ Operator = Annotated[Caller, Depends(_operator)]
 
 async def _uploader(request: Request, caller: Submitter) -> AsyncIterator[Caller]:
     limits: Limits = request.app.state.limits
-    with limits.uploading(caller, patience_of(request.scope)):
+    with limits.uploading(caller, body_timeout_of(request.scope)):
         yield caller
 
 
@@ -119,8 +119,7 @@ def _caller(request: Request, shown: str | None) -> Caller:
         _turn_away(
             request,
             Caller("-", frozenset(), remote=remote),
-            "No key came with the request. Send one as 'Authorization: Bearer sp_...' or "
-            "'X-Api-Key: sp_...'; `stillpath keys create` makes one.",
+            NO_KEY,
         )
     keys: KeyStore = request.app.state.keys
     key = keys.find(shown)
@@ -143,7 +142,7 @@ def _caller(request: Request, shown: str | None) -> Caller:
 def _turn_away(request: Request, who: Caller, detail: str) -> NoReturn:
     limits: Limits = request.app.state.limits
     limits.take(name_of(who))
-    _deny(request, who, 401, "Unknown caller", detail)
+    _deny(request, who, 401, "Unauthorized", detail)
 
 
 def _deny(request: Request, who: Caller, status: int, title: str, detail: str) -> NoReturn:

@@ -14,10 +14,8 @@ from stillpath.applications.identification.archive import Archive
 from stillpath.applications.machines.resolve import Resolver
 from stillpath.applications.machines.store import MachineStore
 from stillpath.service.api import (
-    assets,
     controllers,
     designs,
-    documents,
     events,
     frequency,
     health,
@@ -32,9 +30,11 @@ from stillpath.service.api import (
     pages,
     printers,
     problems,
+    report_schema,
+    results,
     trajectories,
 )
-from stillpath.service.api.computing import NotYet, not_yet
+from stillpath.service.api.computing import StillRunning, still_running
 from stillpath.service.api.guard import Guard, hosts_of
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
@@ -48,12 +48,12 @@ from stillpath.service.deliveries.sender import Sender
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
 from stillpath.service.jobs.work import Work
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.security.audit import AuditLog
 from stillpath.service.security.keys import KeyStore, announce_first_key
 from stillpath.service.settings import Settings
 from stillpath.service.storage.disk import Disk
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.factory import open_storage
 from stillpath.version import __version__
 
 __all__ = ["create_app"]
@@ -69,7 +69,7 @@ Errors are `application/problem+json` (RFC 9457).
 
 
 def create_app(
-    settings: Settings, *, keys_required: bool = False, runner: Runner = run_task
+    settings: Settings, *, keys_required: bool = False, runner: Runner = run_compensation
 ) -> FastAPI:
     """Return the HTTP application.
 
@@ -107,7 +107,7 @@ def create_app(
     app.add_middleware(metrics.Measured, metrics=app.state.metrics)
     app.add_middleware(Proxies, trusted=settings.trusted_proxies)
     problems.install(app)
-    app.add_exception_handler(NotYet, not_yet)
+    app.add_exception_handler(StillRunning, still_running)
     _include_routes(app)
     return app
 
@@ -134,9 +134,9 @@ def _include_routes(app: FastAPI) -> None:
     for part in (
         jobs,
         events,
-        assets,
+        results,
         trajectories,
-        documents,
+        report_schema,
         machines,
         machine_settings,
         frequency,
@@ -173,7 +173,7 @@ async def _open(app: FastAPI, settings: Settings, runner: Runner, stack: AsyncEx
         max_age_days=settings.measurement_max_age_days,
     )
     state.identifications = Archive(open_documents(settings, engine, "identifications"))
-    state.layers = assets.Layers(storage)
+    state.layers = results.Layers(storage)
     state.checker = Checker(open_documents(settings, engine, "printers"))
     state.intake = Intake(
         settings,

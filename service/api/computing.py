@@ -1,6 +1,6 @@
 """From a request to a job that computes its answer, and back, while the caller waits for it.
 
-The same question, asked again, is answered by the same job: so who waited in vain asks again.
+The same request, made again, is answered by the same job: so who waited in vain asks again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from starlette.responses import JSONResponse, Response
 
 from stillpath.applications.machines.resolve import PinnedMachine
 from stillpath.models.machine import Machine
-from stillpath.service.api.finding import no_such_job
+from stillpath.service.api.job_lookup import no_such_job
 from stillpath.service.api.problems import Problem
 from stillpath.service.api.schemas import JobView
 from stillpath.service.jobs.problems import problem
@@ -32,13 +32,20 @@ from stillpath.service.jobs.state import Cancelled, Job, JobKind, JobState
 from stillpath.service.security.callers import Caller
 from stillpath.version import __version__
 
-__all__ = ["WAITING", "NotYet", "Question", "answer_of", "answered", "not_yet"]
+__all__ = [
+    "WAITING",
+    "ComputeRequest",
+    "StillRunning",
+    "read_result",
+    "run_and_wait",
+    "still_running",
+]
 
 _LONGEST_WAIT_S = 50.0
 """What proxies wait for an answer is a minute, as a rule."""
 _LARGEST_ANSWER_BYTES = 64 << 20
 _WAIT = re.compile(r"(?:^|[,;\s])wait=(\d{1,6})(?:$|[,;\s])")
-_UNKNOWN = problem(500, "The job failed", "Its reason is unknown.")
+_UNKNOWN = problem(500, "Job failed", "Its reason is unknown.")
 _T = TypeVar("_T")
 
 WAITING: dict[int | str, dict[str, Any]] = {
@@ -51,7 +58,7 @@ WAITING: dict[int | str, dict[str, Any]] = {
 """OpenAPI entry of routes whose answer is a job's."""
 
 
-class NotYet(Exception):
+class StillRunning(Exception):
     """The answer takes longer than the caller waits; `job` goes on."""
 
     def __init__(self, job: Job) -> None:
@@ -59,16 +66,16 @@ class NotYet(Exception):
         self.job = job
 
 
-async def not_yet(_: Request, error: Exception) -> Response:
+async def still_running(_: Request, error: Exception) -> Response:
     """Answer with the job."""
-    assert isinstance(error, NotYet)
+    assert isinstance(error, StillRunning)
     view = JobView.of(error.job)
     headers = {"Location": view.links.self, "Retry-After": "1"}
     return JSONResponse(view.model_dump(mode="json"), 202, headers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Question:
+class ComputeRequest:
     """What is to be computed.
 
     Attributes
@@ -118,8 +125,8 @@ class Question:
         )
 
 
-async def answered(request: Request, caller: Caller, question: Question) -> Job:
-    """Return the job of a question when it is done.
+async def run_and_wait(request: Request, caller: Caller, asked: ComputeRequest) -> Job:
+    """Return the job of a request when it is done.
 
     A caller who hangs up before ends it, unless it was there before.
 
@@ -129,17 +136,17 @@ async def answered(request: Request, caller: Caller, question: Question) -> Job:
         Its body must have been read.
     caller : Caller
         Whose turn it is.
-    question : Question
+    asked : ComputeRequest
 
     Raises
     ------
-    NotYet
+    StillRunning
     Problem
         That of the job, if it failed; 429 or 507 if it was not taken.
     """
     state = request.app.state
-    wanted = question.job(caller.owner)
-    job: Job = await run_in_threadpool(_asked, request, question, wanted)
+    wanted = asked.job(caller.owner)
+    job: Job = await run_in_threadpool(_submit, request, asked, wanted)
     if job.id == wanted.id:
         state.work.notify()
     if not job.state.is_final:
@@ -154,19 +161,19 @@ async def answered(request: Request, caller: Caller, question: Question) -> Job:
         case JobState.FAILED:
             raise Problem.of(job.problem or _UNKNOWN)
         case JobState.CANCELLED:
-            raise Problem(409, "It was cancelled", "The job was cancelled; ask again.")
+            raise Problem(409, "Job cancelled", "The job was cancelled; ask again.")
         case _:
-            raise NotYet(job)
+            raise StillRunning(job)
 
 
-async def answer_of(request: Request, job: Job) -> Any:
+async def read_result(request: Request, job: Job) -> Any:
     """Return the answer of a job, which is JSON."""
     storage = request.app.state.storage
     size = job.result_bytes or 0
     if size > _LARGEST_ANSWER_BYTES:
         raise Problem(
             422,
-            "The answer is too large",
+            "Result too large",
             f"It has {size} bytes; fetch /v1/jobs/{job.id}/result.",
         )
     try:
@@ -177,13 +184,13 @@ async def answer_of(request: Request, job: Job) -> Any:
         raise no_such_job(job.id) from None
 
 
-def _asked(request: Request, question: Question, job: Job) -> Job:
+def _submit(request: Request, asked: ComputeRequest, job: Job) -> Job:
     intake = request.app.state.intake
     with tempfile.TemporaryDirectory(dir=intake.folder, prefix="question-") as folder:
-        files = dict(zip(job.sources, (path for path, _ in question.files), strict=False))
-        if question.document is not None:
+        files = dict(zip(job.sources, (path for path, _ in asked.files), strict=False))
+        if asked.document is not None:
             machine = Path(folder, "machine.json")
-            PinnedMachine(machine=question.document).write(machine)
+            PinnedMachine(machine=asked.document).write(machine)
             files[job.machine_file] = machine
         found: Job = intake.ask(job, files)
         return found
@@ -194,7 +201,7 @@ async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
     state = request.app.state
     state.waiting[job.id] += 1
     try:
-        await _while_there(request, _over(request, job.id))
+        await _while_there(request, _wait_until_final(request, job.id))
     except ClientDisconnect:
         if ends_with_caller and state.waiting[job.id] == 1:
             await run_in_threadpool(state.store.apply, job.id, Cancelled(time.time()))
@@ -206,7 +213,7 @@ async def _wait(request: Request, job: Job, *, ends_with_caller: bool) -> None:
             del state.waiting[job.id]
 
 
-async def _over(request: Request, job_id: str) -> None:
+async def _wait_until_final(request: Request, job_id: str) -> None:
     try:
         async with asyncio.timeout(_patience_s(request)):
             async for snapshot in request.app.state.hub.watch(job_id):

@@ -11,7 +11,7 @@ from stillpath.applications.controllers.figures import ControllerReport, LoopFig
 from stillpath.applications.controllers.options import ControllerOptions
 from stillpath.models.loops import builtin_loops
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.jobs.state import JobKind
 
@@ -24,12 +24,12 @@ router = APIRouter(prefix="/v1", tags=["controllers"])
     "/loops",
     response_model=list[LoopFigures],
     responses=WAITING,
-    summary="List the closed-loop machines",
+    summary="List closed-loop machines",
 )
 async def list_loops(request: Request, caller: Reader) -> Any:
     """Return the built-in closed-loop machines and the methods that fit each."""
-    question = Question(kind=JobKind.LOOPS, machine="", options={}, result_name="loops.json")
-    return await answer_of(request, await answered(request, caller, question))
+    asked = ComputeRequest(kind=JobKind.LOOPS, machine="", options={}, result_name="loops.json")
+    return await read_result(request, await run_and_wait(request, caller, asked))
 
 
 @router.post(
@@ -69,13 +69,13 @@ async def design_controller(
             f"No closed-loop machine is called {name!r}. GET /v1/loops lists them; your own goes "
             "into the body as `loop`.",
         )
-    question = Question(
+    asked = ComputeRequest(
         kind=JobKind.CONTROLLER,
         machine=name,
         options=options.model_dump(mode="json", exclude_unset=True),
         result_name="controller.json",
     )
-    made = await answer_of(request, await answered(request, caller, question))
+    made = await read_result(request, await run_and_wait(request, caller, asked))
     vary = {"Vary": "Accept"}
     wanted = format or ("html" if _first(accept) == "text/html" else "json")
     if wanted == "html":

@@ -12,7 +12,7 @@ from stillpath.applications.design.figures import DesignReport
 from stillpath.compensation.defaults import DEFAULT_BASIS
 from stillpath.pipeline.options import BasisName, RobustMode
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.machines import Name, look_up
 from stillpath.service.api.problems import responses
 from stillpath.service.jobs.state import JobKind
@@ -32,10 +32,10 @@ async def _asked(
 ) -> DesignReport:
     machine = await run_in_threadpool(look_up, request, name)
 
-    job = await answered(
+    job = await run_and_wait(
         request,
         caller,
-        Question(
+        ComputeRequest(
             kind=JobKind.DESIGN,
             machine=name,
             document=machine,
@@ -44,7 +44,7 @@ async def _asked(
             result_name=f"design-{axis}.json",
         ),
     )
-    return DesignReport.model_validate(await answer_of(request, job))
+    return DesignReport.model_validate(await read_result(request, job))
 
 
 Asked = Annotated[DesignReport, Depends(_asked)]
@@ -54,7 +54,7 @@ Asked = Annotated[DesignReport, Depends(_asked)]
     "/design",
     response_model=DesignReport,
     responses={200: {"content": {"text/html": {}}}, **WAITING, **responses(404, 422)},
-    summary="Look at the design for an axis",
+    summary="Get the design for an axis",
 )
 async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") -> Response:
     """Return the figures as JSON, or as a page if that is what `Accept` names first.
@@ -73,7 +73,7 @@ async def read_design(found: Asked, accept: Annotated[str, Header()] = "*/*") ->
     "/design.html",
     response_class=HTMLResponse,
     responses={**WAITING, **responses(404, 422)},
-    summary="Look at the design for an axis, as a page",
+    summary="Get the design for an axis, as a page",
 )
 async def read_design_page(found: Asked) -> HTMLResponse:
     """Return one self-contained HTML page."""

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Header, Request
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from stillpath.service.api.access import Watcher
-from stillpath.service.api.finding import JobId, find
 from stillpath.service.api.hub import Hub
+from stillpath.service.api.job_lookup import JobId, find
 from stillpath.service.api.problems import responses
 
 __all__ = ["router"]

@@ -71,7 +71,7 @@ async def read_form(
 
 def broken_form(why: str) -> Problem:
     """Return the problem of a form that cannot be read."""
-    return Problem(422, "Broken form", f"The multipart/form-data body cannot be read: {why}.")
+    return Problem(422, "Invalid form", f"The multipart/form-data body cannot be read: {why}.")
 
 
 class _Form:

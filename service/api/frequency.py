@@ -18,7 +18,9 @@ __all__ = ["router"]
 router = APIRouter(prefix="/v1/machines/{name}", tags=["machines"])
 
 
-@router.get("/response", responses=responses(404, 422), summary="Show the plants over frequency")
+@router.get(
+    "/response", responses=responses(404, 422), summary="Get the frequency response of a machine"
+)
 def show_response(
     request: Request,
     name: str,

@@ -94,7 +94,7 @@ class Guard:
         if scope["path"] not in _HEALTH:
             why = self._wrong_host(host)
         why = why or self._passed_on(headers) or _foreign(scope["method"], host, headers)
-        return None if why is None else Problem(403, "Refused", why)
+        return None if why is None else Problem(403, "Request refused", why)
 
     def _wrong_host(self, host: str) -> str | None:
         try:

@@ -9,7 +9,7 @@ import structlog
 from fastapi import APIRouter, Request
 from starlette.concurrency import run_in_threadpool
 
-from stillpath.service.api.problems import Problem, responses
+from stillpath.service.api.problems import Problem, not_ready, responses
 from stillpath.service.api.schemas import Health
 from stillpath.service.database.engine import StoreError
 from stillpath.service.jobs.store import JobStore
@@ -24,22 +24,22 @@ _FRESH_S = 2.0
 router = APIRouter(tags=["health"])
 
 
-@router.get("/healthz", summary="Is the process alive?")
+@router.get("/healthz", summary="Liveness probe")
 async def healthz() -> Health:
     """Answer as long as the process can."""
     return Health(status="ok", version=__version__)
 
 
-@router.get("/readyz", responses=responses(503), summary="Are jobs taken and done?")
+@router.get("/readyz", responses=responses(503), summary="Readiness probe")
 async def readyz(request: Request) -> Health:
     """Answer `ok` while database, storage, disk and workers do, else 503 and which does not.
 
-    Anybody may ask, as often as he likes: the parts are asked once in two seconds, and why one
+    Anybody may ask, as often as they like: the parts are asked once in two seconds, and why one
     does not answer, which may name other computers, stands in the log.
     """
     part = await request.app.state.readiness.missing(request)
     if part is not None:
-        raise Problem(503, "Not ready", f"{part}: see the log of the service", part=part)
+        raise Problem(503, "Not ready", not_ready(part), part=part)
     return Health(status="ok", version=__version__)
 
 
@@ -80,5 +80,5 @@ def _reason(request: Request) -> tuple[str, str] | None:
     full = disk.refusal()
     if full is not None:
         return "disk", full
-    reason: str | None = request.app.state.work.is_ready
+    reason: str | None = request.app.state.work.not_ready_reason
     return None if reason is None else ("workers", reason)

@@ -20,7 +20,7 @@ from stillpath.models.identification.readers.settings import ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.models.store import explain
 from stillpath.service.api.access import Reader, Uploader
-from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.forms import is_form
 from stillpath.service.api.machine_views import RevisionView
 from stillpath.service.api.machines import Author, Message, Name, as_problems, look_up
@@ -97,7 +97,7 @@ def _settings(given: Annotated[_Reading, Depends()]) -> ReadSettings:
     try:
         return ReadSettings.model_validate(known)
     except ValidationError as error:
-        raise Problem(422, "Bad parameter", explain(error)) from None
+        raise Problem(422, "Invalid parameter", explain(error)) from None
 
 
 @router.post(
@@ -135,7 +135,9 @@ async def post_measurements(
     machines: Resolver = request.app.state.machines
     if not trial and not caller.may(Scope.ADMIN):
         raise Problem(
-            403, "Not allowed", "To change a machine needs a key with the scope admin; a trial not."
+            403,
+            "Not allowed",
+            "Changing a machine requires a key with the `admin` scope; a trial does not.",
         )
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
@@ -175,7 +177,7 @@ async def post_measurements(
 
 
 @router.get(
-    "/identification", responses=responses(404, 422), summary="How the machine's plants were found"
+    "/identification", responses=responses(404, 422), summary="Get the identification of a machine"
 )
 def read_identification(request: Request, name: Name, _: Reader) -> IdentificationReport:
     """Return the figures of the identification that led to the machine as it stands."""
@@ -186,7 +188,7 @@ def read_identification(request: Request, name: Name, _: Reader) -> Identificati
     "/identification.html",
     response_class=HTMLResponse,
     responses=responses(404, 422),
-    summary="How the machine's plants were found, as a page",
+    summary="Get the identification of a machine, as a page",
 )
 def read_identification_page(request: Request, name: Name, _: Reader) -> HTMLResponse:
     """Return one self-contained HTML page: measured and model, modes, shapers."""
@@ -219,7 +221,7 @@ async def _identified(
         received = await _received(request, Path(folder), state.disk)
         named = [file.label.partition("@") for file in received]
         files = [[safe_name(before), condition] for before, _, condition in named]
-        question = Question(
+        asked = ComputeRequest(
             kind=JobKind.IDENTIFICATION,
             machine=given["name"],
             document=start,
@@ -230,8 +232,8 @@ async def _identified(
             source_bytes=sum(file.size_bytes for file in received),
             files=tuple((file.path, file.sha256) for file in received),
         )
-        job = await answered(request, caller, question)
-    found = await answer_of(request, job)
+        job = await run_and_wait(request, caller, asked)
+    found = await read_result(request, job)
     # In a thread: a report has some ten thousand numbers.
     return await run_in_threadpool(
         lambda: (
@@ -245,7 +247,9 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
     """Return the files of a form."""
     if not is_form(request):
         raise Problem(
-            422, "No form", "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv)."
+            422,
+            "Multipart form required",
+            "Send the files as multipart/form-data (curl -F file=@raw_data_x.csv).",
         )
     files = await receive_files(
         request, folder, max_bytes=_LARGEST_BYTES, max_files=_MOST_FILES, disk=disk
@@ -253,7 +257,7 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
     if not files:
         raise Problem(
             422,
-            "The machine cannot be used",
+            "Machine not usable",
             "the form holds no file; send at least one measurement",
         )
     return files

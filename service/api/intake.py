@@ -151,7 +151,7 @@ class Intake:
         job_id = uuid.uuid4().hex
         with self._incoming(job_id) as incoming:
             pinned = await to_thread.run_sync(
-                self._admit, wanted, caller, incoming, limiter=limiter
+                self._admit, wanted, caller, incoming, idempotency_key, limiter=limiter
             )
             upload = await receive_upload(
                 request, incoming, max_bytes=self._settings.max_upload_bytes, disk=self._disk
@@ -176,14 +176,17 @@ class Intake:
             request.app.state.work.notify()
         return taken
 
-    def _admit(self, wanted: JobQuery, caller: Caller, incoming: Path) -> PinnedMachine:
+    def _admit(
+        self, wanted: JobQuery, caller: Caller, incoming: Path, idempotency_key: str | None
+    ) -> PinnedMachine:
         """Refuse what can be refused before the body, and write the machine beside its place.
 
         Whatever is done now, nobody waits for who has sent the body.
         """
         self._check_targets(wanted)
         pinned = self._pinned(wanted)
-        self._check_room(caller)
+        if not self._is_known(caller, idempotency_key):
+            self._check_room(caller)
         self._disk.check()
         pinned.write(incoming.with_suffix(".machine"))
         return pinned
@@ -286,17 +289,14 @@ class Intake:
         added: Job | None = None
         try:
             self._storage.put_all(files)
-            added = self._store.add(
-                job,
-                idempotency=idempotency,
-                limits=self._quota,
-                shared=shared,
-                audit_row=audit_row,
-            )
-        except SpaceExceeded as error:
-            raise _no_space(str(error)) from None
-        except QuotaExceeded as error:
-            raise _too_many(str(error)) from None
+            with _as_problems():
+                added = self._store.add(
+                    job,
+                    idempotency=idempotency,
+                    limits=self._quota,
+                    shared=shared,
+                    audit_row=audit_row,
+                )
         except IdempotencyConflict:
             raise _conflict(idempotency and idempotency[0]) from None
         finally:
@@ -325,10 +325,12 @@ class Intake:
             if wanted.printer is not None:
                 printer_for(self._printers, wanted.printer, start=wanted.print)
         except TargetRefused as error:
-            raise Problem(422, "It must not be sent there", str(error)) from None
+            raise Problem(422, "Target not allowed", str(error)) from None
         if wanted.print and wanted.printer is None:
             raise Problem(
-                422, "No printer", "`print` needs a printer: name one of /v1/printers as well."
+                422,
+                "Printer required",
+                "`print` needs a printer: name one of /v1/printers as well.",
             )
 
     def _earlier(self, caller: Caller, key: str, fingerprint: str) -> Job | None:
@@ -341,19 +343,14 @@ class Intake:
             raise _conflict(key)
         return job
 
+    def _is_known(self, caller: Caller, key: str | None) -> bool:
+        """Return whether the request may be one that has its job already, which needs no room."""
+        return key is not None and self._store.submitted(caller.owner, key) is not None
+
     def _check_room(self, caller: Caller) -> None:
         """Refuse before the body is read; adding the job checks again, in its transaction."""
-        jobs, kept_bytes = self._store.usage(caller.owner)
-        if jobs >= self._quota.max_jobs:
-            raise _too_many(
-                f"{caller.owner!r} has {jobs} jobs that are not over, the limit is "
-                f"{self._quota.max_jobs}; wait for some, or cancel them."
-            )
-        if kept_bytes >= self._quota.max_bytes:
-            raise _no_space(
-                f"{caller.owner!r} keeps {kept_bytes} bytes, and {self._quota.max_bytes} is the "
-                "limit; delete jobs that are over."
-            )
+        with _as_problems():
+            self._quota.check(caller.owner, *self._store.usage(caller.owner))
 
     def _pinned(self, wanted: JobQuery) -> PinnedMachine:
         """Return the job's machine, with warnings about it and about its printer."""
@@ -367,7 +364,7 @@ class Intake:
         except NotApproved as error:
             raise Problem(422, "Machine not approved", str(error)) from None
         except ModelError as error:
-            raise Problem(422, "The machine cannot be used", str(error)) from None
+            raise Problem(422, "Machine not usable", str(error)) from None
         printer = None if wanted.printer is None else self._printers.get(wanted.printer)
         if printer is None:
             return found
@@ -425,12 +422,15 @@ def _result_name(source_name: str, method: str) -> str:
     return f"{source_name[: len(source_name) - len(suffix)]}.stillpath{suffix or '.gcode'}"
 
 
-def _no_space(detail: str) -> Problem:
-    return Problem(507, "No space left", detail)
-
-
-def _too_many(detail: str) -> Problem:
-    return Problem(429, "Too much at once", detail, headers={"Retry-After": "30"})
+@contextmanager
+def _as_problems() -> Iterator[None]:
+    """Turn a quota that is full into a problem document."""
+    try:
+        yield
+    except SpaceExceeded as error:
+        raise Problem(507, "No space left", str(error)) from None
+    except QuotaExceeded as error:
+        raise Problem(429, "Quota exceeded", str(error), headers={"Retry-After": "30"}) from None
 
 
 def _conflict(key: str | None) -> Problem:

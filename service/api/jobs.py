@@ -1,4 +1,4 @@
-"""Routes of jobs: hand in, list, ask, cancel, delete."""
+"""Routes of jobs: submit, list, get, cancel, delete."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from starlette.concurrency import run_in_threadpool
 
 from stillpath.gcode.containers.sniff import Kind
 from stillpath.service.api.access import Reader, Submitter, Uploader, Watcher
-from stillpath.service.api.finding import JobId, find, no_such_job
 from stillpath.service.api.hub import Hub
 from stillpath.service.api.intake import Intake
+from stillpath.service.api.job_lookup import JobId, find, no_such_job
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import DeliveryView, JobPage, JobQuery, JobView
 from stillpath.service.database.engine import DatabaseAway
@@ -99,7 +99,7 @@ async def list_jobs(
             cursor=cursor,
         )
     except BadCursor as error:
-        raise Problem(422, "Bad cursor", str(error)) from None
+        raise Problem(422, "Invalid cursor", str(error)) from None
     if page.next_cursor is not None:
         address = request.url.include_query_params(cursor=page.next_cursor)
         response.headers["Link"] = f'<{address.path}?{address.query}>; rel="next"'
@@ -115,7 +115,7 @@ async def list_jobs(
         **responses(403, 408, 413, 422, 429, 507),
     },
     openapi_extra=upload_body(),
-    summary="Hand in a G-code file",
+    summary="Submit a G-code file",
 )
 async def create_job(
     request: Request,
@@ -153,7 +153,7 @@ async def create_job(
     return JobView.of(taken.job, taken.queue_position if waits else None)
 
 
-@router.get("/{job_id}", responses=responses(404), summary="Ask how a job stands")
+@router.get("/{job_id}", responses=responses(404), summary="Get a job")
 async def read_job(request: Request, job_id: JobId, caller: Watcher) -> JobView:
     """Return state, stage, progress and, once it is known, the time still needed."""
     job = await find(request, job_id, caller)
@@ -177,14 +177,16 @@ async def cancel_job(request: Request, job_id: JobId, caller: Submitter) -> JobV
         job = await find(request, job_id, caller)
         if job.state is not JobState.CANCELLED:
             raise Problem(
-                409, "It is over", f"The job is {job.state.value}; there is nothing to cancel."
+                409,
+                "Job already finished",
+                f"The job is {job.state.value}; there is nothing to cancel.",
             )
     await _changed(request, caller, "cancel", job_id)
     return JobView.of(job)
 
 
 @router.delete(
-    "/{job_id}", status_code=204, responses=responses(403, 404), summary="Cancel and delete"
+    "/{job_id}", status_code=204, responses=responses(403, 404), summary="Cancel and delete a job"
 )
 async def delete_job(request: Request, job_id: JobId, caller: Submitter) -> Response:
     """Stop the job if it runs, and delete its files."""

@@ -23,8 +23,8 @@ _NO_STORE = {"Cache-Control": "no-store"}
 router = APIRouter(prefix="/v1", tags=["keys"])
 
 
-class KeyWish(BaseModel):
-    """What a new key shall be."""
+class KeyCreate(BaseModel):
+    """Properties of a new API key."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -106,7 +106,7 @@ class AuditPage(BaseModel):
     next_before: int | None = Field(description="`before` of the next page; null: that was all.")
 
 
-@router.get("/keys", responses=responses(401, 403, 429), summary="List the keys")
+@router.get("/keys", responses=responses(401, 403, 429), summary="List API keys")
 def list_keys(request: Request, caller: Admin) -> list[KeyView]:
     """Return every key that was ever made, the oldest first; not the keys themselves."""
     del caller
@@ -117,20 +117,20 @@ def list_keys(request: Request, caller: Admin) -> list[KeyView]:
     "/keys",
     status_code=201,
     responses=responses(401, 403, 413, 422, 429),
-    summary="Make a key",
+    summary="Create an API key",
 )
-def create_key(request: Request, response: Response, wish: KeyWish, caller: Admin) -> NewKey:
+def create_key(request: Request, response: Response, asked: KeyCreate, caller: Admin) -> NewKey:
     """Make a key and show it, this once."""
-    days = wish.expires_in_days
+    days = asked.expires_in_days
     try:
         key, secret = _keys(request).create(
-            name=wish.name,
-            owner=wish.owner,
-            scopes=wish.scopes,
+            name=asked.name,
+            owner=asked.owner,
+            scopes=asked.scopes,
             expires_at=None if days is None else time.time() + days * _DAY_S,
         )
     except KeyRefused as error:
-        raise Problem(422, "No such key can be", str(error)) from None
+        raise Problem(422, "Invalid key", str(error)) from None
     record(
         request,
         caller,
@@ -148,7 +148,7 @@ def create_key(request: Request, response: Response, wish: KeyWish, caller: Admi
     "/keys/{key_id}",
     status_code=204,
     responses=responses(401, 403, 404, 429),
-    summary="Revoke a key",
+    summary="Revoke an API key",
 )
 def revoke_key(request: Request, key_id: str, caller: Admin) -> Response:
     """End a key at once and for good. It stays in the list."""
@@ -160,7 +160,10 @@ def revoke_key(request: Request, key_id: str, caller: Admin) -> Response:
 
 
 @router.get(
-    "/audit", tags=["audit"], responses=responses(401, 403, 422, 429), summary="Who did what"
+    "/audit",
+    tags=["audit"],
+    responses=responses(401, 403, 422, 429),
+    summary="List audit log entries",
 )
 def read_audit(
     request: Request,

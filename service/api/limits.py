@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from starlette.exceptions import HTTPException
 
-from stillpath.service.api.patience import PATIENCE, Patience
+from stillpath.service.api.body_timeout import BODY_TIMEOUT, BodyTimeout
 from stillpath.service.api.problems import Problem
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class Limits:
         # What is left, and when that was; a bucket that nobody remembers is full.
         self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
         # Only touched within the event loop.
-        self._uploading: dict[str, list[Patience | None]] = {}
+        self._uploading: dict[str, list[BodyTimeout | None]] = {}
 
     def take(self, who: str) -> None:
         """Count one request.
@@ -98,15 +98,15 @@ class Limits:
             )
 
     @contextmanager
-    def uploading(self, caller: Caller, patience: Patience | None = None) -> Iterator[None]:
-        """Hold one of the caller's places for uploads; within the event loop.
+    def uploading(self, caller: Caller, body: BodyTimeout | None = None) -> Iterator[None]:
+        """Hold one of the caller's slots for uploads; within the event loop.
 
         If all are taken, one whose sender has fallen silent is freed for this one.
 
         Parameters
         ----------
         caller : Caller
-        patience : Patience, optional
+        body : BodyTimeout, optional
             With the sender of this upload.
 
         Raises
@@ -114,25 +114,25 @@ class Limits:
         Problem
             429, if all are taken.
         """
-        places = self._uploading.setdefault(name_of(caller), [])
-        if len(places) >= self._uploads:
-            silent = max((one for one in places if one), key=lambda one: one.quiet_s, default=None)
-            if silent is None or not silent.yield_place():
+        slots = self._uploading.setdefault(name_of(caller), [])
+        if len(slots) >= self._uploads:
+            silent = max((one for one in slots if one), key=lambda one: one.quiet_s, default=None)
+            if silent is None or not silent.yield_slot():
                 raise Problem(
                     429,
                     "Too many uploads at once",
-                    f"{len(places)} uploads of yours are on their way, the limit. Wait for one to "
+                    f"{len(slots)} uploads of yours are on their way, the limit. Wait for one to "
                     "end.",
                     headers={"Retry-After": "5", "Connection": "close"},
                 )
-            places.remove(silent)
-        places.append(patience)
+            slots.remove(silent)
+        slots.append(body)
         try:
             yield
         finally:
-            if patience in places:
-                places.remove(patience)
-            if not places and self._uploading.get(name_of(caller)) is places:
+            if body in slots:
+                slots.remove(body)
+            if not slots and self._uploading.get(name_of(caller)) is slots:
                 del self._uploading[name_of(caller)]
 
 
@@ -168,11 +168,11 @@ def limited_receive(scope: Scope, receive: Receive) -> Receive:
     A route that streams its body sets `COUNTED` in the scope, and has a limit of size of its own.
     """
     size_bytes = 0
-    patience = scope[PATIENCE] = Patience(receive)
+    body = scope[BODY_TIMEOUT] = BodyTimeout(receive)
 
     async def received() -> Message:
         nonlocal size_bytes
-        message = await patience.receive()
+        message = await body.receive()
         if message["type"] == "http.request" and not scope.get(COUNTED):
             size_bytes += len(message.get("body", b""))
             if size_bytes > _LARGEST_DOCUMENT_BYTES:

@@ -7,7 +7,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, Question, answer_of, answered
+from stillpath.service.api.computing import WAITING, ComputeRequest, read_result, run_and_wait
 from stillpath.service.api.machines import Name, to_print_with
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.jobs.state import JobKind
@@ -37,11 +37,11 @@ async def read_live_filter(request: Request, name: Name, caller: Reader) -> Resp
     """
     machine = await run_in_threadpool(to_print_with, request, name)
     if machine.live_refusal is not None:
-        raise Problem(422, "It cannot print live", machine.live_refusal)
-    job = await answered(
+        raise Problem(422, "Live printing not available", machine.live_refusal)
+    job = await run_and_wait(
         request,
         caller,
-        Question(
+        ComputeRequest(
             kind=JobKind.LIVE,
             machine=name,
             document=machine,
@@ -50,7 +50,7 @@ async def read_live_filter(request: Request, name: Name, caller: Reader) -> Resp
             result_name=_NAME,
         ),
     )
-    document = await answer_of(request, job)
+    document = await read_result(request, job)
     headers = {"Content-Disposition": f'attachment; filename="{_NAME}"'}
     return Response(await run_in_threadpool(_text, document), 200, headers, "application/json")
 

@@ -73,7 +73,7 @@ class _Given:
         **responses(403, 409, 412, 413, 422, 428),
     },
     openapi_extra=_BODY,
-    summary="Make a machine of its printer's settings",
+    summary="Create or update a machine from printer settings",
 )
 async def put_settings(
     request: Request,
@@ -123,7 +123,7 @@ def _new(text: str, file: str, name: str, given: _Given) -> Machine:
     if not given.travel:
         raise Problem(
             422,
-            "The travel is missing",
+            "Travel required",
             "M503 does not say how far the axes reach: say travel=XxYxZ in mm, like 235x235x250.",
         )
     return marlin_settings.machine_from_m503(

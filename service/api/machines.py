@@ -150,7 +150,7 @@ def list_machines(request: Request, _: Reader) -> list[MachineSummary]:
     "/{name}",
     response_model=Machine,
     responses={200: _ETAG, 304: {"description": "Not Modified"}, **responses(404, 422)},
-    summary="Show one machine",
+    summary="Get a machine",
 )
 def show_machine(
     request: Request,
@@ -176,7 +176,7 @@ def show_machine(
         **responses(403, 409, 412, 413, 422, 428),
     },
     openapi_extra=_BODY,
-    summary="Add or change a machine",
+    summary="Create or update a machine",
 )
 async def put_machine(
     request: Request,
@@ -241,7 +241,7 @@ def list_revisions(
 
 
 @router.get(
-    "/{name}/revisions/{number}", responses=responses(404, 409, 422), summary="Show one revision"
+    "/{name}/revisions/{number}", responses=responses(404, 409, 422), summary="Get a revision"
 )
 def show_revision(request: Request, name: Name, number: Number, _: Reader) -> RevisionDocument:
     """Return a state of a machine with its document."""
@@ -294,7 +294,7 @@ def approve_revision(
 @router.post(
     "/{name}/revisions/{number}/rollback",
     responses={200: _ETAG, **responses(403, 404, 409, 412, 422)},
-    summary="Go back to a revision",
+    summary="Roll back to a revision",
 )
 def roll_back(
     request: Request,
@@ -382,7 +382,7 @@ def _check_own(name: str) -> None:
     if name in builtin_machines():
         raise Problem(
             409,
-            "Built in",
+            "Built-in machine",
             f"{name!r} is a built-in machine: it has no revisions and cannot be changed. PUT its "
             "document under another name.",
         )
@@ -412,4 +412,4 @@ def as_problems() -> Iterator[None]:
     except Conflict as error:
         raise _failed(str(error)) from None
     except ModelError as error:
-        raise Problem(422, "The machine cannot be used", str(error)) from None
+        raise Problem(422, "Machine not usable", str(error)) from None

@@ -41,7 +41,7 @@ router = APIRouter(tags=["health"])
         **responses(401, 403, 429),
     },
     openapi_extra={"security": [{"bearer": []}, {"key": []}, {}]},
-    summary="Figures for Prometheus",
+    summary="Metrics for Prometheus",
 )
 async def read_metrics(request: Request, _: Operator) -> Response:
     """Return counters and gauges as text; for a key with the scope admin, or this computer."""

@@ -14,6 +14,7 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, ValidationError
 from starlette.concurrency import run_in_threadpool
 
+from stillpath.models.complaints import complaint
 from stillpath.service.api.access import Reader, Uploader
 from stillpath.service.api.intake import Intake
 from stillpath.service.api.jobs import upload_body
@@ -88,7 +89,7 @@ class Stored(BaseModel):
 
 
 @router.get(
-    "/api/version", responses=responses(401, 403, 429), summary="Say what OctoPrint would say"
+    "/api/version", responses=responses(401, 403, 429), summary="OctoPrint-compatible version"
 )
 async def version(_: Reader) -> ApiVersion:
     """Answer a slicer's test of the connection."""
@@ -98,22 +99,19 @@ async def version(_: Reader) -> ApiVersion:
 @router.get(
     "/printers/{name}/api/version",
     responses=responses(401, 403, 404, 429),
-    summary="Say what OctoPrint would say",
+    summary="OctoPrint-compatible version",
 )
 async def version_of(request: Request, name: PrinterName, _: Reader) -> ApiVersion:
     """Answer a slicer's test of the connection."""
     if name not in request.app.state.printers:
-        # Only whether there is one: jobs ask for more.
-        names = await run_in_threadpool(request.app.state.machines.names)
-        if name not in names:
-            raise _no_such_printer(request, name, names)
+        await run_in_threadpool(_check_machine, request, name)
     return ApiVersion()
 
 
 _UPLOAD: dict[str, Any] = {
     "status_code": 201,
     "openapi_extra": upload_body(required_form=True),
-    "summary": "Hand in a file as to OctoPrint",
+    "summary": "OctoPrint-compatible upload",
 }
 _REFUSALS = 401, 403, 408, 413, 422, 429, 507
 
@@ -125,7 +123,7 @@ async def upload(request: Request, response: Response, caller: Uploader) -> Stor
     if len(printers) != 1:
         raise Problem(
             422,
-            "Which printer?",
+            "Printer required",
             f"There are {len(printers)} printers. Give the slicer an address that names one: "
             f"{request.base_url}printers/NAME, with a name of /v1/printers or of /v1/machines.",
         )
@@ -157,6 +155,8 @@ async def _taken(request: Request, response: Response, name: str, caller: Upload
 
 def _wanted(request: Request, name: str) -> JobQuery:
     printer = request.app.state.printers.get(name)
+    if printer is None:
+        _check_machine(request, name)
     given: dict[str, Any] = {"machine": name, "fresh": True}
     if printer is not None:
         chosen = printer.model_dump(include={"method", "tolerance_um", "budget_um"})
@@ -164,9 +164,22 @@ def _wanted(request: Request, name: str) -> JobQuery:
         given |= {key: value for key, value in chosen.items() if value is not None}
     try:
         return JobQuery.model_validate(given)
-    except ValidationError:
-        names = request.app.state.machines.names()
-        raise _no_such_printer(request, name, names) from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "options"
+        raise Problem(
+            422,
+            "Printer not usable",
+            f"What is set for {name!r:.80} does not do, {place}: {complaint(first, repeat=False)}. "
+            "Change it in the printers' file (STILLPATH_PRINTERS).",
+        ) from None
+
+
+def _check_machine(request: Request, name: str) -> None:
+    """Raise unless there is a machine of that name; jobs ask for more."""
+    names = request.app.state.machines.names()
+    if name not in names:
+        raise _no_such_printer(request, name, names)
 
 
 def _no_such_printer(request: Request, name: str, machines: Iterable[str]) -> Problem:

@@ -73,7 +73,7 @@ def check_printer(request: Request, name: Name, caller: Reader) -> PrinterCheck:
 @router.post(
     "/{name}/accept",
     responses=responses(401, 403, 404, 422, 424, 429),
-    summary="Take a printer's configuration as it is now",
+    summary="Accept the current printer configuration",
 )
 def accept_printer(request: Request, name: Name, caller: Admin) -> PrinterCheck:
     """Remember the configuration as it is now: from here on changes are counted."""
@@ -92,7 +92,7 @@ def _checked(request: Request, name: str, *, accept: bool) -> PrinterCheck:
     if printer.kind != "moonraker":
         raise Problem(
             422,
-            "Nothing to ask",
+            "Printer cannot be checked",
             f"{name} is an OctoPrint, which cannot tell Klipper's configuration. Only Moonraker "
             "printers can be checked.",
         )
@@ -100,7 +100,7 @@ def _checked(request: Request, name: str, *, accept: bool) -> PrinterCheck:
     try:
         return checker.check(printer, _machine(state.machines, printer), accept=accept)
     except PrinterUnknown as error:
-        raise Problem(424, "The printer cannot be asked", str(error)) from None
+        raise Problem(424, "Printer unavailable", str(error)) from None
 
 
 def _machine(machines: Resolver, printer: Printer) -> Machine:

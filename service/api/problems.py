@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 from collections.abc import Mapping
 from http import HTTPStatus
@@ -20,12 +19,16 @@ from stillpath.models.complaints import complaint
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.problems import PROBLEM_MEDIA_TYPE, problem
 from stillpath.service.storage.base import StorageError
-from stillpath.service.storage.disk import NoRoom
+from stillpath.service.storage.disk import DISK_FULL, NoRoom
 
-__all__ = ["Problem", "install", "problem_response", "responses"]
+__all__ = ["NO_KEY", "Problem", "install", "not_ready", "problem_response", "responses"]
+
+NO_KEY = (
+    "No key came with the request. Send one as 'Authorization: Bearer sp_...' or "
+    "'X-Api-Key: sp_...'; `stillpath keys create` makes one."
+)
 
 _METHODS = ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT")
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Problem(Exception):  # named as in RFC 9457
@@ -58,6 +61,11 @@ class Problem(Exception):  # named as in RFC 9457
         """Return the problem of a document, as jobs keep them."""
         known = {name: value for name, value in document.items() if name != "type"}
         return cls(known.pop("status"), known.pop("title"), known.pop("detail"), **known)
+
+
+def not_ready(part: str) -> str:
+    """Return the detail for a part of the service that does not answer."""
+    return f"{part}: see the log of the service"
 
 
 def problem_response(
@@ -93,17 +101,17 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(DatabaseAway)
     async def _no_database(request: Request, error: DatabaseAway) -> Response:
-        return _away(request, "The database does not answer", error)
+        return _away(request, "Database unavailable", "The database does not answer", error)
 
     @app.exception_handler(StorageError)
     async def _no_storage(request: Request, error: StorageError) -> Response:
-        if error.errno in _FULL:
+        if error.errno in DISK_FULL:
             return _full(request, error)
-        return _away(request, "The storage does not answer", error)
+        return _away(request, "Storage unavailable", "The storage does not answer", error)
 
     @app.exception_handler(OSError)
     async def _system(request: Request, error: OSError) -> Response:
-        if error.errno in _FULL:
+        if error.errno in DISK_FULL:
             return _full(request, error)
         raise error
 
@@ -115,7 +123,7 @@ def install(app: FastAPI) -> None:
     async def _invalid(_: Request, error: RequestValidationError) -> Response:
         found = [_field(entry) for entry in error.errors()]
         detail = "; ".join(f"{entry['name']}: {entry['message']}" for entry in found)
-        return problem_response(problem(422, "Bad parameter", detail, errors=found))
+        return problem_response(problem(422, "Invalid parameter", detail, errors=found))
 
     @app.exception_handler(Exception)
     async def _crash(request: Request, error: Exception) -> Response:
@@ -148,11 +156,11 @@ def _allowed(request: Request) -> str:
     )
 
 
-def _away(request: Request, title: str, error: Exception) -> Response:
+def _away(request: Request, title: str, what: str, error: Exception) -> Response:
     structlog.get_logger("api").error(
         title, method=request.method, path=request.url.path, reason=str(error)
     )
-    detail = f"{title}; try again in a while. The service's log says more."
+    detail = f"{what}; try again in a while. The service's log says more."
     return problem_response(problem(503, title, detail), {"Retry-After": "5"})
 
 
@@ -188,22 +196,22 @@ _EXAMPLES: dict[int, dict[str, Any]] = {
     document["status"]: document
     for document in (
         problem(400, "Bad Request", "There was an error parsing the body."),
-        problem(401, "No key", "No key came with the request. Send one as X-Api-Key."),
+        problem(401, "Unauthorized", NO_KEY),
         problem(403, "Not allowed", "This needs a key with scope 'admin'."),
         problem(404, "No such job", "There is no job 3f0c. Jobs are gone once they are deleted."),
         problem(408, "Request Timeout", "Within 30 s less than 1024 bytes of the body came."),
-        problem(409, "Not done yet", "The job is running. Ask again when its state is done."),
+        problem(409, "Job not finished", "The job is running. Ask again when its state is done."),
         problem(412, "Precondition failed", "Machine 'mine' is at \"3f6a\" (revision 4)."),
         problem(413, "File too large", "The upload is larger than 1073741824 bytes."),
         problem(416, "No such range", "The file has 120 bytes; bytes=500- lies outside."),
         problem(
             422,
-            "Bad parameter",
+            "Invalid parameter",
             "tolerance_um: must be at least 0.5 µm (given: '0.1')",
         ),
         problem(428, "Precondition required", "Machine 'mine' exists. Send its ETag as If-Match."),
         problem(429, "Too many requests", "More than 1200 requests in a minute. Wait 1 s."),
-        problem(503, "Not ready", "database: it does not answer"),
+        problem(503, "Not ready", not_ready("database")),
         problem(507, "No space left", "The disk of the service is full. Delete old jobs."),
     )
 }

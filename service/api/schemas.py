@@ -183,7 +183,7 @@ class JobQuery(BaseModel):
     webhook: Line | None = Field(
         default=None,
         max_length=2000,
-        description="Address that is told when the job is over; one of "
+        description="Address that is notified when the job ends; one of "
         "`STILLPATH_WEBHOOK_TARGETS`.",
     )
     printer: Line | None = Field(

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Query, Request
 from starlette.responses import Response
 
 from stillpath.service.api.access import Reader
-from stillpath.service.api.computing import WAITING, Question, answered
-from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.computing import WAITING, ComputeRequest, run_and_wait
+from stillpath.service.api.file_responses import MEDIA, stored
+from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
-from stillpath.service.api.stored import MEDIA, stored
 from stillpath.service.jobs.state import JobKind
 
 __all__ = ["router"]
@@ -60,12 +60,12 @@ async def read_trajectories(
     if not 0 < stop_s - start_s <= _LONGEST_S:
         raise Problem(
             422,
-            "Bad parameter",
+            "Invalid parameter",
             f"start_s {start_s:g} to stop_s {stop_s:g} must be a period of at most {_LONGEST_S:g} "
             "s; ask for longer ones in parts.",
         )
     job = await find_done(request, job_id, caller)
-    question = Question(
+    asked = ComputeRequest(
         kind=JobKind.TRAJECTORIES,
         machine=job.machine,
         revision=job.machine_revision,
@@ -79,7 +79,7 @@ async def read_trajectories(
         result_name=f"{Path(job.result_name).stem}.{format}",
         source_name=job.source_name,
     )
-    made = await answered(request, caller, question)
+    made = await run_and_wait(request, caller, asked)
     return await stored(
         request,
         request.app.state.storage,

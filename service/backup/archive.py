@@ -24,7 +24,7 @@ from typing import IO
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stillpath.pipeline.files import replacing
-from stillpath.service.exclusive import exclusive
+from stillpath.service.instance_lock import exclusive
 from stillpath.version import __version__
 
 __all__ = ["BackupError", "Manifest", "back_up", "restore"]

@@ -22,7 +22,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import NullPool
 
 from stillpath.service.database.migrations import LATEST
-from stillpath.service.private import private_file, private_folder
+from stillpath.service.permissions import private_file, private_folder
 
 if TYPE_CHECKING:
     from sqlalchemy import Table
@@ -47,8 +47,8 @@ __all__ = [
 _FILE = "stillpath.sqlite3"
 _BUSY_TIMEOUT_MS = 30_000
 _AGAIN_S = 0.02
-_LINE = threading.Lock()
-_WISHES: deque[_Wish] = deque()
+_WRITER = threading.Lock()
+_WRITE_QUEUE: deque[_PendingWrite] = deque()
 """Of those who wait for their turn in `write_together`."""
 # Taken by whoever changes the schema; a number that nobody else in the database uses.
 _MIGRATION_LOCK = 0x57111_0000
@@ -217,12 +217,12 @@ def writing(engine: Engine) -> Iterator[Connection]:
     ------
     DatabaseAway
     """
-    with _turn(engine), _plainly(engine), engine.begin() as connection:
+    with _write_lock(engine), _translate_errors(engine), engine.begin() as connection:
         yield connection
 
 
 def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
-    """Return what `work` returns, done in a transaction that others may share.
+    """Return what `work` returns, done in a transaction that others may share (group commit).
 
     SQLite lets one write after the other, and each waits for the disk. So whoever comes first does
     what all the others in line want as well, each undone by itself if it raises, and the disk is
@@ -236,18 +236,18 @@ def write_together(engine: Engine, work: Callable[[Connection], _T]) -> _T:
     if engine.dialect.name != "sqlite":
         with writing(engine) as connection:
             return work(connection)
-    mine = _Wish(engine, work)
-    _WISHES.append(mine)
+    mine = _PendingWrite(engine, work)
+    _WRITE_QUEUE.append(mine)
     try:
-        with _turn(engine):
+        with _write_lock(engine):
             if not mine.over.is_set():
-                _fulfil(engine)
+                _commit_group(engine)
     except DatabaseAway:
-        if _withdraw(mine):
+        if _dequeue(mine):
             raise
         mine.over.wait()  # somebody is at it: only then is known what came of it
     finally:
-        _withdraw(mine)
+        _dequeue(mine)
     if mine.error is not None:
         raise mine.error
     return cast("_T", mine.result)
@@ -261,7 +261,10 @@ def reading(engine: Engine) -> Iterator[Connection]:
     ------
     DatabaseAway
     """
-    with _plainly(engine), engine.execution_options(stillpath_reading=True).begin() as connection:
+    with (
+        _translate_errors(engine),
+        engine.execution_options(stillpath_reading=True).begin() as connection,
+    ):
         yield connection
 
 
@@ -278,7 +281,7 @@ def insert(connection: Connection, table: Table) -> Any:
 
 
 @dataclass(eq=False, slots=True)
-class _Wish:
+class _PendingWrite:
     """What a thread wants written, and what came of it."""
 
     engine: Engine
@@ -287,9 +290,9 @@ class _Wish:
     result: Any = None
     error: BaseException | None = None
 
-    def fulfil(self, connection: Connection) -> None:
+    def run(self, connection: Connection) -> None:
         try:
-            with _plainly(self.engine), connection.begin_nested():
+            with _translate_errors(self.engine), connection.begin_nested():
                 self.result = self.work(connection)
         except Exception as error:  # its owner's, not that of whose turn it is
             self.error = error
@@ -297,10 +300,10 @@ class _Wish:
                 raise  # SQLite has undone the others' as well
 
 
-def _withdraw(wish: _Wish) -> bool:
-    """Take a wish out of the line; False: somebody has taken it already."""
+def _dequeue(write: _PendingWrite) -> bool:
+    """Take a write out of the queue; False: somebody has taken it already."""
     try:
-        _WISHES.remove(wish)
+        _WRITE_QUEUE.remove(write)
     except ValueError:
         return False
     return True
@@ -312,31 +315,31 @@ def _is_open(connection: Connection) -> bool:
     return bool(driver.in_transaction)
 
 
-def _fulfil(engine: Engine) -> None:
+def _commit_group(engine: Engine) -> None:
     """Do what all in line want, in one transaction."""
     # Not those that their owners withdraw at this moment.
-    wishes = [wish for wish in _WISHES.copy() if wish.engine is engine and _withdraw(wish)]
+    pending = [write for write in _WRITE_QUEUE.copy() if write.engine is engine and _dequeue(write)]
     try:
-        with _plainly(engine), engine.begin() as connection:
-            for wish in wishes:
-                wish.fulfil(connection)
+        with _translate_errors(engine), engine.begin() as connection:
+            for write in pending:
+                write.run(connection)
     except BaseException as error:
-        for wish in wishes:
-            wish.error = error
+        for write in pending:
+            write.error = error
         if not isinstance(error, Exception):
             raise
     finally:
-        for wish in wishes:
-            wish.over.set()
+        for write in pending:
+            write.over.set()
 
 
 @contextmanager
-def _turn(engine: Engine) -> Iterator[None]:
+def _write_lock(engine: Engine) -> Iterator[None]:
     """Let the writers of this process wait in line: SQLite's own waiting starves some for long."""
     if engine.dialect.name != "sqlite":
         yield
         return
-    if not _LINE.acquire(timeout=_BUSY_TIMEOUT_MS / 1000):
+    if not _WRITER.acquire(timeout=_BUSY_TIMEOUT_MS / 1000):
         raise DatabaseAway(
             f"the database {_shown(engine)} is not free after {_BUSY_TIMEOUT_MS / 1000:g} s; "
             "see whether its disk still answers"
@@ -344,11 +347,11 @@ def _turn(engine: Engine) -> Iterator[None]:
     try:
         yield
     finally:
-        _LINE.release()
+        _WRITER.release()
 
 
 @contextmanager
-def _plainly(engine: Engine) -> Iterator[None]:
+def _translate_errors(engine: Engine) -> Iterator[None]:
     try:
         yield
     except (OperationalError, InterfaceError, PoolTimeout) as error:

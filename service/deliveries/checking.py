@@ -23,8 +23,8 @@ from stillpath.gcode.firmware.klipper.versions import ignores_shaper_frequencies
 from stillpath.models.errors import ModelError
 from stillpath.models.firmware import Klipper
 from stillpath.models.machine import Machine
+from stillpath.service.deliveries.http_requests import Unanswered, Unreached
 from stillpath.service.deliveries.moonraker import Asked, NotReady, ask
-from stillpath.service.deliveries.posting import Unanswered, Unreached
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import TargetRefused
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from stillpath.applications.machines.klipper_config import Option, PrinterConfig
-from stillpath.service.deliveries.posting import Unanswered, get
+from stillpath.service.deliveries.http_requests import Unanswered, get
 from stillpath.service.deliveries.printers import Printer
 from stillpath.service.deliveries.targets import read_url
 
@@ -82,7 +82,7 @@ def ask(printer: Printer) -> Asked:
     Raises
     ------
     NotReady
-    service.deliveries.posting.Unreached, service.deliveries.posting.Unanswered
+    service.deliveries.http_requests.Unreached, service.deliveries.http_requests.Unanswered
     service.deliveries.targets.TargetRefused
     """
     info = _result(printer, "/printer/info")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, f
 
 from stillpath.models.complaints import complaint
 from stillpath.pipeline.options import BudgetUm, MethodName
-from stillpath.service.deliveries.posting import Reply, post
+from stillpath.service.deliveries.http_requests import Reply, post
 from stillpath.service.deliveries.targets import TargetRefused, read_url
 
 __all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
@@ -124,7 +124,7 @@ def upload(
     Raises
     ------
     TargetRefused, Unreached, Unanswered
-        See `service.deliveries.posting.post`.
+        See `service.deliveries.http_requests.post`.
     """
     fields = {"print": "true" if start else "false"}
     if printer.kind == "moonraker":

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import structlog
@@ -18,7 +19,7 @@ from stillpath.models.store import load_machine
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.deliveries import rows
 from stillpath.service.deliveries.checking import Checker, PrinterUnknown
-from stillpath.service.deliveries.posting import Reply, Unanswered, Unreached
+from stillpath.service.deliveries.http_requests import Reply, Unanswered, Unreached
 from stillpath.service.deliveries.printers import Printer, printer_for, upload, what_started
 from stillpath.service.deliveries.rows import Delivery
 from stillpath.service.deliveries.targets import TargetRefused, check_webhook
@@ -244,13 +245,16 @@ class Sender:
         warnings, unsafe = self._looked_at(printer, job)
         late = time.time() - (job.finished_at or 0.0) > self._times.start_within_s
         starts = job.print_after and not unsafe and not late
-        with self._storage.local(f"{job.output}/result/{job.result_name}") as file:
+        copy = contextlib.ExitStack()
+        file = copy.enter_context(self._storage.local(f"{job.output}/result/{job.result_name}"))
+        with _once(starts, job), copy:
             reply = upload(printer, file, job.result_name, sha256=job.result_sha256, start=starts)
-        state, error = _judged(reply)
+            state, error = _judged(reply)
+            begun = what_started(printer, reply) if starts else None
         if starts and reply.status >= 500:  # perhaps of a proxy that lost patience
             return "failed", _unknown(error or "")
         if state == "done":
-            told = what_started(printer, reply) if starts else None
+            told = begun
             if job.print_after and unsafe:
                 told = "uploaded, but not started, because it may be unsafe"
             elif job.print_after and late:
@@ -288,6 +292,20 @@ class Sender:
                 return PinnedMachine.read(file, job.machine).machine
         except FileNotFoundError:  # a job of an earlier version
             return load_machine(job.machine)
+
+
+@contextlib.contextmanager
+def _once(starts: bool, job: Job) -> Iterator[None]:
+    """Where an upload starts a print, turn what nobody has foreseen into `Unanswered`."""
+    try:
+        yield
+    except (TargetRefused, Unreached, Unanswered):
+        raise
+    except Exception as error:
+        if not starts:
+            raise
+        structlog.get_logger("deliveries").error("delivery broke", job=job.id, exc_info=error)
+        raise Unanswered("the service broke while it sent; its log holds the details") from error
 
 
 def _judged(reply: Reply) -> tuple[str, str | None]:

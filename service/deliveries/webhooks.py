@@ -8,7 +8,7 @@ import json
 from datetime import UTC, datetime
 from typing import Any
 
-from stillpath.service.deliveries.posting import Reply, post
+from stillpath.service.deliveries.http_requests import Reply, post
 from stillpath.service.deliveries.targets import Target
 from stillpath.service.jobs.state import Job
 
@@ -89,7 +89,7 @@ def send_webhook(job: Job, target: Target, secret: str, *, delivery: int, now: f
     Raises
     ------
     TargetRefused, Unreached, Unanswered
-        See `service.deliveries.posting.post`.
+        See `service.deliveries.http_requests.post`.
     """
     body = body_of(job)
     headers = {

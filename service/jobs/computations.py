@@ -10,12 +10,12 @@ from stillpath.pipeline.progress import Progress, ProgressCallback, progress_to
 from stillpath.service.jobs.state import JobKind
 from stillpath.service.jobs.task import Task
 
-__all__ = ["answer"]
+__all__ = ["run_computation"]
 
 # What is imported in the functions takes a second, which the API need not wait for.
 
 
-def answer(task: Task, progress: ProgressCallback) -> dict[str, Any]:
+def run_computation(task: Task, progress: ProgressCallback) -> dict[str, Any]:
     """Write what the task asks for to its target; a `service.jobs.task.Runner`.
 
     Raises

@@ -6,25 +6,25 @@ import errno
 from typing import Any
 
 from stillpath.service.jobs.state import JobKind
+from stillpath.service.storage.disk import DISK_FULL
 
 __all__ = [
-    "DISK_FULL",
     "PROBLEM_MEDIA_TYPE",
     "input_gone",
     "never_fits",
     "problem",
     "problem_of",
+    "storage_away",
+    "storage_never_fits",
 ]
 
 PROBLEM_MEDIA_TYPE = "application/problem+json"
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Numbers of errors that say that a disk takes no more."""
 _REFUSED = {
-    JobKind.TRAJECTORIES: "No trajectories",
-    JobKind.IDENTIFICATION: "The machine cannot be used",
-    JobKind.DESIGN: "No such design",
-    JobKind.CONTROLLER: "No such controller",
-    JobKind.LIVE: "It cannot print live",
+    JobKind.TRAJECTORIES: "Trajectories not available",
+    JobKind.IDENTIFICATION: "Machine not usable",
+    JobKind.DESIGN: "Design not possible",
+    JobKind.CONTROLLER: "Controller not possible",
+    JobKind.LIVE: "Live printing not available",
 }
 """Titles, where what was asked cannot be computed."""
 
@@ -82,6 +82,13 @@ def problem_of(error: BaseException, kind: JobKind = JobKind.COMPENSATION) -> di
                 "The disk of the data directory or of the storage is full; free space there and "
                 "submit the job again.",
             )
+        case OSError(errno=errno.EFBIG):
+            return problem(
+                507,
+                "File too large",
+                "A file of the job became larger than the file system of the data directory or of "
+                "the storage allows. Cut the print into several files.",
+            )
         case _:
             return problem(
                 500,
@@ -103,4 +110,24 @@ def never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
         f"It had written {room_bytes >> 20} MiB when the disk was full; the disk of the worker has "
         f"{total_bytes >> 20} MiB in all, and some stay free (STILLPATH_DISK_RESERVE_BYTES). Cut "
         "the print into several files, or give the service a larger disk.",
+    )
+
+
+def storage_never_fits(room_bytes: int, total_bytes: int) -> dict[str, Any]:
+    """Return the problem of a job whose result is larger than the disk of the storage."""
+    return problem(
+        507,
+        "The job is larger than the disk",
+        f"Its result has {room_bytes >> 20} MiB, and the disk of the storage {total_bytes >> 20} "
+        "MiB in all (STILLPATH_STORAGE_URL). Cut the print into several files, or give the storage "
+        "a larger disk.",
+    )
+
+
+def storage_away(error: Exception) -> dict[str, Any]:
+    """Return the problem of a job whose files could not be fetched or put away, again and again."""
+    return problem(
+        503,
+        "Storage unavailable",
+        f"The storage does not answer: {error}. Submit the job again once it does.",
     )

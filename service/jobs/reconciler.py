@@ -38,6 +38,8 @@ _GIVE_BACK_S = 1.5
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 5.0
 _NO_ROOM_S = 30.0
 """How long a job whose files had no room is left alone: others may need less."""
+_ROUNDING_BYTES = 1 << 20
+"""Disks give room in blocks; names need some too."""
 _CLOCK_SET_S = 1.0
 """Between two looks, a clock that was set differs by more."""
 _OWN_GRACE_S, _GRACE_S = 60.0, 5.0
@@ -113,7 +115,7 @@ class Reconciler:
                 for job, _ in self._in_flight.values():
                     self._give_back(job.id, job.attempt + 1, "the service stopped", blame=False)
             self._store.release(_LEASE, self._holder)
-        self._in_flight.clear()
+        self._forget()
 
     def notify(self) -> None:
         """Look at once if a job could be started: there is a new one.
@@ -146,7 +148,7 @@ class Reconciler:
                     self._disk.give_up()  # jobs wait; what became of them can be written down
                 self.slots = 0
                 if isinstance(error, ClusterAway):
-                    self._in_flight.clear()
+                    self._forget()
                     self._cluster.disconnect()
                 self._stopping.wait(wait_s)
                 # From the next try on; it may be the first that works for a long time.
@@ -165,7 +167,7 @@ class Reconciler:
         if self._cluster.is_own and not self._took_over:
             self._take_over()
         if not self._cluster.is_connected:
-            self._in_flight.clear()
+            self._forget()
             self._cluster.connect()
             if self._stopping.is_set():
                 return  # it took its time; start no workers that must end at once
@@ -174,11 +176,16 @@ class Reconciler:
         self._renew()
         if not self._has_lease:
             self._free = 0
-            self._in_flight.clear()  # whoever has the lease hands them over again
+            self._forget()  # whoever has the lease hands them over again
             return
         self._find_silent()
         self._collect()
         self._hand_over()
+
+    def _forget(self) -> None:
+        """Forget what was handed over, and since when any of it is broken."""
+        self._in_flight.clear()
+        self._broken_since.clear()
 
     def _renew(self) -> None:
         """Take the lease, or renew it in good time."""
@@ -190,7 +197,7 @@ class Reconciler:
     def _take_over(self) -> None:
         """Give back what ran when the service before us ended; its workers ended with it.
 
-        Only with a database that no other service uses (`service.exclusive` keeps the folder);
+        Only with a database that no other service uses (`service.instance_lock` keeps the folder);
         otherwise silence tells.
         """
         if self._store.engine.dialect.name == "sqlite":
@@ -292,13 +299,21 @@ class Reconciler:
         attempt, until = self._no_room.get(job.id, (-1, 0.0))
         if attempt == job.attempt and until > now:
             return False
-        has_room = not self._cluster.is_own or self._disk.has_room_for(job.room_bytes or 0)
+        has_room = not self._cluster.is_own or self._has_room_for(job.room_bytes or 0)
         if attempt == job.attempt and has_room:
             return True
         if len(self._no_room) > _MOST_REMEMBERED:
             self._no_room.clear()
         self._no_room[job.id] = (job.attempt, now + _NO_ROOM_S)
         return False
+
+    def _has_room_for(self, more_bytes: int) -> bool:
+        """Return whether a job has room, on our disk and on that of the storage."""
+        room = None
+        with contextlib.suppress(StorageError):  # its workers find out
+            room = self._storage.room()
+        stored = room is None or room.free_bytes >= more_bytes + _ROUNDING_BYTES
+        return stored and self._disk.has_room_for(more_bytes)
 
     def _give_back(self, job_id: str, attempt: int, reason: str, *, blame: bool = True) -> None:
         event = Lost(attempt, time.time(), reason, self._settings.max_attempts, blame)
@@ -339,7 +354,7 @@ def _reason(future: Future) -> str:
     if future.status == "error":
         error = future.exception(timeout=5)
         if type(error).__name__ == "KilledWorker":
-            return "its process ended"
+            return "its process ended, for which memory is the usual reason"
         return f"{type(error).__name__}: {error}"
     if future.status == "finished":
         return "its worker left it"

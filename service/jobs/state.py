@@ -121,7 +121,7 @@ class Job:
     room_bytes : int or None
         Room on the disk that it needs at least, if there was too little once.
     webhook : str or None
-        Address that is told when the job is over.
+        Address that is notified when the job ends.
     printer, print_after : str or None, bool
         Printer that the result is uploaded to, and whether it then starts to print.
     """
@@ -238,7 +238,8 @@ class Failed:
 class Lost:
     """The worker died, or the service stopped, in the middle of the job.
 
-    `blame` says whether the job may be the reason: a service that was stopped is not.
+    `blame` says whether the job may be the reason: a service that was stopped is not. `problem` is
+    what the job fails with in the end, where more is known than that its worker is gone.
     """
 
     attempt: int
@@ -246,6 +247,7 @@ class Lost:
     reason: str
     max_attempts: int
     blame: bool = True
+    problem: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +326,7 @@ def advance(job: Job, event: Event) -> Job:
             lost = replace(job, losses=job.losses + 1)
             if lost.losses < event.max_attempts:
                 return _waiting(lost)
-            return _failed(lost, _lost_problem(lost, event), event.at)
+            return _failed(lost, event.problem or _lost_problem(lost, event), event.at)
 
 
 def _running(job: Job, event: Claimed) -> Job:
@@ -367,6 +369,5 @@ def _lost_problem(job: Job, event: Lost) -> dict[str, Any]:
         "type": "about:blank",
         "title": "The worker was lost",
         "status": 500,
-        "detail": f"The job took its worker down {tries}: {event.reason}. "
-        "Look into the service's log; memory is the usual reason.",
+        "detail": f"The job lost its worker {tries}: {event.reason}. The service's log says more.",
     }

@@ -46,10 +46,39 @@ _ADD, _ADD_AUDIT = tables.jobs.insert(), tables.audit.insert()
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """What one owner may have: jobs that are not over, and bytes of all jobs that are kept."""
+    """What one owner may have: unfinished jobs, and bytes of all jobs that are kept."""
 
     max_jobs: int
     max_bytes: int
+
+    def check(
+        self, owner: str, jobs: int, kept_bytes: int, upload_bytes: int | None = None
+    ) -> None:
+        """Refuse one job more.
+
+        Parameters
+        ----------
+        owner : str
+        jobs, kept_bytes : int
+            What the owner has; see `usage`.
+        upload_bytes : int, optional
+            Of the job's file; where that is not known yet, it has at least one.
+
+        Raises
+        ------
+        QuotaExceeded, SpaceExceeded
+        """
+        if jobs >= self.max_jobs:
+            raise QuotaExceeded(
+                f"{owner!r} has {jobs} unfinished jobs, the limit is {self.max_jobs}; wait for "
+                "some, or cancel them."
+            )
+        if kept_bytes + (1 if upload_bytes is None else upload_bytes) > self.max_bytes:
+            upload = "" if upload_bytes is None else f" and this upload has {upload_bytes}"
+            raise SpaceExceeded(
+                f"{owner!r} keeps {kept_bytes} bytes{upload}, the limit is {self.max_bytes}; "
+                "delete finished jobs."
+            )
 
 
 class QuotaExceeded(Exception):
@@ -85,7 +114,7 @@ def submit(
             _lead_to(connection, job.owner, idempotency[0], {"job_id": same.id})
         return same
     if limits is not None:
-        _check_quota(connection, job, limits)
+        limits.check(job.owner, *usage(connection, job.owner), job.source_bytes)
     connection.execute(_ADD, to_row(job))
     if audit_row is not None:
         connection.execute(_ADD_AUDIT, dict(audit_row))
@@ -151,17 +180,3 @@ def usage(connection: Connection, owner: str) -> tuple[int, int]:
     """Return how many jobs of an owner are not over, and the bytes of all that are kept."""
     jobs, size = connection.execute(_USAGE, {"owner": owner}).one()
     return int(jobs), int(size or 0)
-
-
-def _check_quota(connection: Connection, job: Job, limits: Quota) -> None:
-    jobs, size = usage(connection, job.owner)
-    if jobs >= limits.max_jobs:
-        raise QuotaExceeded(
-            f"{job.owner!r} has {jobs} jobs that are not over, the limit is {limits.max_jobs}; "
-            "wait for some or cancel them"
-        )
-    if size + job.source_bytes > limits.max_bytes:
-        raise SpaceExceeded(
-            f"{job.owner!r} keeps {size} bytes and this upload has {job.source_bytes}, the limit "
-            f"is {limits.max_bytes}; delete old jobs"
-        )

@@ -87,11 +87,11 @@ class Sweep:
 
     def _forget_expired(self) -> None:
         """Delete jobs that were over long ago, and idempotency keys."""
-        at, before = self._clock(), self._counted_at
-        now = self._expiry.passed(0.0 if before is None else at - before)
+        at, counted_at = self._clock(), self._counted_at
+        now = self._expiry.passed(0.0 if counted_at is None else at - counted_at)
         self._counted_at = at
-        before = now - self._settings.keep_days * _DAY_S
-        for job_id in self._expiry.old_jobs(before, max(before, now - _ANSWERS_KEPT_S)):
+        cutoff = now - self._settings.keep_days * _DAY_S
+        for job_id in self._expiry.old_jobs(cutoff, max(cutoff, now - _ANSWERS_KEPT_S)):
             # The row first: no job whose files are gone is ever shown.
             if self._store.forget(job_id):
                 self._storage.delete(f"{_JOBS}{job_id}/")

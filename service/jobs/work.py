@@ -6,7 +6,7 @@ from stillpath.service.jobs.cluster import Cluster
 from stillpath.service.jobs.reconciler import Reconciler
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage
 
@@ -27,7 +27,11 @@ class Work:
     """
 
     def __init__(
-        self, settings: Settings, store: JobStore, storage: Storage, runner: Runner = run_task
+        self,
+        settings: Settings,
+        store: JobStore,
+        storage: Storage,
+        runner: Runner = run_compensation,
     ) -> None:
         self._cluster = Cluster(settings, runner)
         self._reconciler = Reconciler(settings, store, storage, self._cluster)
@@ -52,6 +56,6 @@ class Work:
         return self._reconciler.slots
 
     @property
-    def is_ready(self) -> str | None:
+    def not_ready_reason(self) -> str | None:
         """Why jobs are not done at the moment; None if they are."""
         return self._reconciler.trouble

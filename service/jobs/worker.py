@@ -27,8 +27,14 @@ import structlog
 from stillpath.pipeline.progress import Cancelled, Progress
 from stillpath.service.database.engine import DatabaseAway, StoreError, open_database
 from stillpath.service.environment import prepare_environment
-from stillpath.service.jobs.computations import answer
-from stillpath.service.jobs.problems import DISK_FULL, input_gone, never_fits, problem_of
+from stillpath.service.jobs.computations import run_computation
+from stillpath.service.jobs.problems import (
+    input_gone,
+    never_fits,
+    problem_of,
+    storage_away,
+    storage_never_fits,
+)
 from stillpath.service.jobs.state import Event, Failed, Finished, Job, JobKind, Lost, NoRoom
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.task import Runner, Task
@@ -37,10 +43,10 @@ from stillpath.service.logs import configure_logging
 from stillpath.service.processes import limit_memory
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError
-from stillpath.service.storage.disk import Disk
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.disk import DISK_FULL, Disk
+from stillpath.service.storage.factory import open_storage
 
-__all__ = ["Workplace", "execute", "run_job", "run_task"]
+__all__ = ["Workplace", "execute", "run_compensation", "run_job"]
 
 _PATIENCE_S = 60.0
 """How long storage and database may be away before an attempt is given up."""
@@ -48,7 +54,6 @@ _LONGEST_PAUSE_S = 4.0
 _KEPT_BYTES = 256 << 20
 _MOST_KEPT_BYTES = 512 << 20
 """A process that is larger after a short job ends: what it keeps would count for the next one."""
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 _Given = TypeVar("_Given")
 
@@ -124,7 +129,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
     # The watch looks now and then; this holds in between. Freed memory that is kept counts here.
     limit_memory(limits.max_bytes + max(limits.max_bytes // 4, _KEPT_BYTES))
     if job.kind is not JobKind.COMPENSATION:
-        runner = answer
+        runner = run_computation
     disk = Disk(settings.data_dir, settings.disk_reserve_bytes)
     watch = Watch(
         store,
@@ -149,7 +154,7 @@ def execute(job_id: str, workplace: Workplace, runner: Runner) -> None:
         workplace.end(0)
 
 
-def run_task(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
+def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[str, Any]:
     """Compensate the task's file and write its report; see `Runner`."""
     from stillpath.pipeline.compensate import compensate_file
     from stillpath.pipeline.options import Options
@@ -191,10 +196,13 @@ def _attempt(
             try:
                 return _work(job, workplace, runner, watch, folder)
             except OSError as error:
-                if error.errno not in _NO_ROOM:
+                if error.errno not in DISK_FULL:
                     raise
                 structlog.get_logger("worker").warning("no room for the job", reason=str(error))
-                return _no_room(job, workplace)  # while it can be seen what it has written
+                # While it can be seen what it has written.
+                if isinstance(error, StorageError) and workplace.settings.storage_url is not None:
+                    return _no_room_in_storage(job, workplace)
+                return _no_room(job, workplace)
     except Cancelled:
         return None
     except MemoryError:
@@ -203,12 +211,18 @@ def _attempt(
     except _InputGone as error:
         return Failed(job.attempt, time.time(), input_gone(str(error)))
     except OSError as error:
-        if error.errno in _NO_ROOM:
+        if error.errno in DISK_FULL:
             return NoRoom(job.attempt, time.time())  # not even for its folder
         _log_crash()
         if isinstance(error, StorageError):
             # Perhaps it answers another worker, or later.
-            return Lost(job.attempt, time.time(), str(error), workplace.settings.max_attempts)
+            return Lost(
+                job.attempt,
+                time.time(),
+                str(error),
+                workplace.settings.max_attempts,
+                problem=storage_away(error),
+            )
         return Failed(job.attempt, time.time(), problem_of(error, job.kind))
     except Exception as error:
         found = problem_of(error, job.kind)
@@ -220,13 +234,33 @@ def _attempt(
 def _no_room(job: Job, workplace: Workplace) -> Event:
     """Return what becomes of a job that the disk has no room for, by what it has written."""
     disk = Disk(workplace.settings.data_dir, workplace.settings.disk_reserve_bytes)
+    written = _written_bytes(job, workplace)
+    if disk.fits_ever(written + job.source_bytes):
+        return NoRoom(job.attempt, time.time(), written)
+    return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
+
+
+def _no_room_in_storage(job: Job, workplace: Workplace) -> Event:
+    """Return what becomes of a job whose result the disk of the storage has no room for."""
+    needed = _written_bytes(job, workplace)
+    room = None
+    with contextlib.suppress(StorageError):
+        needed += sum(
+            stat.size_bytes for stat in workplace.storage.list(f"jobs/{job.id}/{job.attempt}/")
+        )
+        room = workplace.storage.room()
+    if room is not None and needed + job.source_bytes > room.total_bytes:
+        return Failed(job.attempt, time.time(), storage_never_fits(needed, room.total_bytes))
+    return NoRoom(job.attempt, time.time(), needed)
+
+
+def _written_bytes(job: Job, workplace: Workplace) -> int:
+    """Return how much lies in the attempt's folder."""
     written = 0
     with contextlib.suppress(OSError):  # files come and go meanwhile
         for path in _place(job, workplace).rglob("*"):
             written += path.stat().st_size
-    if disk.fits_ever(written + job.source_bytes):
-        return NoRoom(job.attempt, time.time(), written)
-    return Failed(job.attempt, time.time(), never_fits(written, disk.total_bytes()))
+    return written
 
 
 def _place(job: Job, workplace: Workplace) -> Path:
@@ -316,7 +350,7 @@ def _patiently(
         try:
             return action()
         except trouble as error:
-            full = isinstance(error, OSError) and error.errno in DISK_FULL
+            full = isinstance(error, OSError) and error.errno in (*DISK_FULL, errno.EFBIG)
             if full or time.monotonic() > deadline:
                 raise
             structlog.get_logger("worker").warning("trying again", error=str(error), in_s=wait_s)

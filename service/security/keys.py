@@ -17,7 +17,7 @@ from sqlalchemy.exc import IntegrityError
 
 from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import keys
-from stillpath.service.private import private_file
+from stillpath.service.permissions import private_file
 from stillpath.service.security.callers import Caller, Scope
 from stillpath.service.settings import Settings, is_loopback
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-__all__ = ["Stat", "Storage", "StorageError"]
+__all__ = ["Room", "Stat", "Storage", "StorageError"]
 
 
 class StorageError(OSError):
@@ -30,6 +30,19 @@ class Stat:
     key: str
     size_bytes: int
     modified_at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """How much the disk of a storage holds.
+
+    Attributes
+    ----------
+    free_bytes, total_bytes : int
+    """
+
+    free_bytes: int
+    total_bytes: int
 
 
 class Storage(Protocol):
@@ -82,6 +95,9 @@ class Storage(Protocol):
 
     def delete(self, prefix: str) -> None:
         """Delete the files, if any, whose key begins with `prefix`, which ends with ``/``."""
+
+    def room(self) -> Room | None:
+        """Return how much room its disk has; None if it has none that could be looked at."""
 
     def check(self) -> None:
         """Raise `StorageError` unless a file could be written now."""

@@ -10,9 +10,12 @@ from pathlib import Path
 
 import structlog
 
-from stillpath.service.private import private_folder
+from stillpath.service.permissions import private_folder
 
-__all__ = ["Disk", "NoRoom"]
+__all__ = ["DISK_FULL", "Disk", "NoRoom"]
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Numbers of errors that say that a disk takes no more."""
 
 _MIB = 1 << 20
 _BALLAST = "disk-reserve"
@@ -95,7 +98,7 @@ class Disk:
         return (
             f"the disk of the service has {max(left, 0) // _MIB} MiB left{size}; "
             f"{self._reserve_bytes // _MIB} MiB stay free for the jobs that were accepted "
-            "(STILLPATH_DISK_RESERVE_BYTES). Delete jobs that are over, or make room on it"
+            "(STILLPATH_DISK_RESERVE_BYTES). Delete finished jobs, or make room on it"
         )
 
     def check(self, more_bytes: int = 0) -> None:

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from stillpath.service.storage.base import Stat, StorageError
+from stillpath.service.storage.base import Room, Stat, StorageError
 from stillpath.service.storage.keys import check_key, check_prefix
 from stillpath.service.storage.leftovers import delete_leftovers
 
@@ -100,6 +100,12 @@ class LocalStorage:
         check_prefix(prefix)
         with _explained(), contextlib.suppress(FileNotFoundError, NotADirectoryError):
             shutil.rmtree(self._root / prefix)
+
+    def room(self) -> Room:
+        """Return how much room the folder's disk has; see `Storage.room`."""
+        with _explained():
+            usage = shutil.disk_usage(self._root)
+        return Room(usage.free, usage.total)
 
     def check(self) -> None:
         """Write a file of some kB and delete it; see `Storage.check`."""

@@ -135,6 +135,9 @@ class S3Storage:
             with self._explained(prefix), contextlib.suppress(FileNotFoundError):
                 obstore.delete(self._store, keys)
 
+    def room(self) -> None:
+        """Return None: a bucket does not say; see `Storage.room`."""
+
     def check(self) -> None:
         """Write an empty file and delete it; see `Storage.check`."""
         import obstore

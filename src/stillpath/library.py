@@ -114,7 +114,7 @@ def plan(
 
 
 def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> Machine:
-    """Build a machine model from measurements: raw logs or tables of Klipper's resonance test, and others.
+    """Build a machine model from measurements: raw logs, tables of Klipper's resonance test, others.
 
     Parameters
     ----------

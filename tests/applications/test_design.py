@@ -39,7 +39,7 @@ from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.reports.charts import Chart, Line, Mark, draw
 from stillpath.service.api import create_app
 from stillpath.service.api import designs as routes
-from stillpath.service.api.computing import Question
+from stillpath.service.api.computing import ComputeRequest
 from stillpath.service.settings import Settings
 from tests.service.runners import pretend
 
@@ -434,7 +434,7 @@ def client(
     tmp_path: Path, off: DesignReport, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[TestClient]:
     # What a job computes takes ten seconds; tests/service/api/test_computing.py has real ones.
-    async def pretended(_: Any, __: Any, asked: Question) -> Any:
+    async def pretended(_: Any, __: Any, asked: ComputeRequest) -> Any:
         given = asked.options
         settings = (given["axis"], given["basis"], given["robust"])
         pretended.calls.append((asked.document.name, *settings))
@@ -443,8 +443,8 @@ def client(
         return off.model_dump(mode="json")
 
     pretended.calls = []
-    monkeypatch.setattr(routes, "answered", pretended)
-    monkeypatch.setattr(routes, "answer_of", answer)
+    monkeypatch.setattr(routes, "run_and_wait", pretended)
+    monkeypatch.setattr(routes, "read_result", answer)
     app = create_app(Settings(data_dir=tmp_path), runner=pretend)
     with TestClient(app, base_url="http://localhost", raise_server_exceptions=False) as opened:
         opened.calls = pretended.calls

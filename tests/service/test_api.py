@@ -180,6 +180,7 @@ def test_a_dying_worker_is_replaced_and_its_job_tried_once_more(client: TestClie
     assert job["state"] == "done"
     job = until(client, client.post(JOBS, content=b"die").headers["location"], over)
     assert job["error"]["title"] == "The worker was lost"
+    assert "memory is the usual reason" in job["error"]["detail"]
     assert client.get("/readyz").status_code == 200
     job = until(client, client.post(JOBS, content=b"G1 X1").headers["location"], over)
     assert job["state"] == "done"
@@ -204,7 +205,7 @@ def test_cancel(client: TestClient):
     for job in (waiting, where, where):  # a second time changes nothing
         answer = client.post(f"{job}/cancel")
         assert (answer.status_code, answer.json()["state"]) == (200, "cancelled")
-    assert_problem(client.get(f"{where}/result"), 409, "hand the file in again")
+    assert_problem(client.get(f"{where}/result"), 409, "submit the file again")
     # Whoever hands the same file in again gets a new job.
     again = client.post(JOBS, content=b"G1 X5")
     assert again.status_code == 202

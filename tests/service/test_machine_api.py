@@ -19,7 +19,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.store import builtin_machines
 from stillpath.service.api import create_app
 from stillpath.service.jobs.task import Task
-from stillpath.service.jobs.worker import run_task
+from stillpath.service.jobs.worker import run_compensation
 from stillpath.service.settings import Settings
 from tests.applications.test_machine_m503 import M503
 from tests.cli.test_machine_cli import CONFIG
@@ -249,7 +249,7 @@ def test_the_age_of_a_measurement_reaches_the_report(tmp_path: Path):
     task.source.write_text("G28\nG1 X50 Y50 F6000\nG1 X60 Y50 E1\nG1 X60 Y70 E2\n")
     Resolver(store).for_job("mine").write(task.machine_file)
     store.delete("mine")
-    run_task(task, lambda progress: None)
+    run_compensation(task, lambda progress: None)
     warnings = json.loads((task.report / "report.json").read_text())["warnings"]
     assert any("axis x of mine: measured on 2020-01-31" in warning for warning in warnings)
     assert any("axis y of mine: its measurement has no date" in warning for warning in warnings)

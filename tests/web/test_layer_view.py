@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, Route, expect
 
+from tests.web.served import GEAR, Service
 from tests.web.visitor import Visitor
 
 LAYERS, POINTS = 3000, 100_000
@@ -216,6 +217,27 @@ def test_a_long_print_is_fetched_as_far_as_it_is_looked_at(visitor: Visitor, gea
     )
     page.get_by_text("All layers as a table").click()
     assert page.locator(".layers tbody tr").count() <= 100  # the rest when it is asked for
+
+
+def test_a_computation_that_was_cancelled_is_told(
+    visitor: Visitor, service: Service, gear: dict[str, Any]
+):
+    cancelled = service.submit(b"; cancelled\n" + GEAR.read_bytes() * 4, "long.gcode")
+    job = service.api.get(f"/v1/jobs/{cancelled}").json()
+    service.api.post(f"/v1/jobs/{cancelled}/cancel")
+    asked: list[str] = []
+
+    def answer(route: Route) -> None:
+        asked.append(route.request.url)
+        route.fulfill(status=202, json=job)
+
+    page = opened(visitor, gear)
+    page.route("**/trajectories?*", answer)
+    visitor.expected = {202}
+    page.get_by_role("button", name="CSV").click()
+    page.get_by_role("button", name="Compute and download").click()
+    expect(page.get_by_role("alert")).to_contain_text("Job cancelled")
+    assert len(asked) == 1
 
 
 def test_trajectories_are_computed_when_asked_for(visitor: Visitor, gear: dict[str, Any]):

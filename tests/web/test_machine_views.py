@@ -70,6 +70,30 @@ def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tm
     visitor.shoot(page, "machine-identified")
 
 
+def test_a_fit_is_kept_under_the_name_it_was_looked_at(
+    visitor: Visitor, service: Service, tmp_path: Path
+):
+    recording = quick_raw()
+    file = tmp_path / recording.name
+    file.write_bytes(recording.content)
+    page = visitor.open("#/machines/ender3")
+    page.locator("input[type=file]").set_input_files(file)
+    page.get_by_label("Name of your machine").fill("looked-at")
+    page.get_by_text("How the test was run").click()
+    for name, value in QUICK_QUERY.items():
+        page.locator(f"#test-{name}").fill(str(value))
+    page.get_by_role("button", name="Look at the fit").click()
+    keep = page.get_by_role("button", name="Keep as looked-at")
+    expect(keep).to_be_visible()
+    page.get_by_label("Name of your machine").fill("another")
+    page.locator("#test-max_freq").fill("7")
+    keep.click()
+    expect(page.get_by_role("heading", name="Measured and fitted")).to_be_visible()
+    assert page.url.endswith("#/machines/looked-at")
+    assert service.api.get("/v1/machines/looked-at").status_code == 200
+    assert service.api.get("/v1/machines/another").status_code == 404
+
+
 def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "raw_data_x_broken.csv"
     file.write_text("#time,accel_x,accel_y,accel_z\n0,1,2\n")

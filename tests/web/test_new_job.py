@@ -24,6 +24,11 @@ _SECTIONS = (
     "Reverted to the sliced lines",
 )
 KEY = "sp_" + "0123456789abcdef" * 2
+NO_STORE = """
+Object.defineProperty(window, "sessionStorage", {
+  get() { throw new DOMException("The operation is insecure.", "SecurityError"); },
+});
+"""
 
 
 def choose_machine(page: Page, typed: str) -> None:
@@ -215,13 +220,24 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
 
 
+def test_a_key_does_where_the_browser_stores_nothing(guarded: Service, visitor: Visitor):
+    visitor.expected = {401}
+    page = visitor.open(at=guarded.url, script=NO_STORE)
+    page.get_by_label("Key", exact=True).fill(KEY)
+    page.get_by_role("button", name="Use this key").click()
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    expect(page.get_by_role("combobox", name="Machine")).to_be_enabled()
+    page.get_by_role("button", name="Forget key").click()
+    expect(page.get_by_role("dialog")).to_contain_text("asks for a key")
+
+
 @pytest.mark.parametrize(
     ("job", "said"),
     [
         ({"eta_s": 42.0}, "45 s left"),
         ({"stage": STAGE, "eta_s": None}, "Time left is not known yet"),
-        ({"attempt": 2, "losses": 0}, "begun anew, because the service was restarted"),
-        ({"attempt": 3, "losses": 1}, "begun anew, because its worker was lost"),
+        ({"attempt": 2, "losses": 0}, "restarted, because the service was restarted"),
+        ({"attempt": 3, "losses": 1}, "restarted, because its worker was lost"),
     ],
 )
 def test_a_job_says_how_it_is_with_it(visitor: Visitor, job: dict[str, Any], said: str):

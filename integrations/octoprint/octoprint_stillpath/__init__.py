@@ -104,10 +104,14 @@ class StillpathPlugin(
 
     def _uploaded(self, path: str) -> None:
         """Take a file, unless it is one that is left alone in silence."""
+        source = self._host.disk_path(path)
+        # OctoPrint tells of a file some time after it came: it may have been asked for meanwhile.
+        version = _version(source)
+        if any(entry.path == path and entry.version == version for entry in self._ledger.open()):
+            return
         self._give_up(path)
         if not self._settings.get_boolean(["automatic"]) or not is_taken(path) or is_result(path):
             return
-        source = self._host.disk_path(path)
         if source is not None and not is_stamped(source):
             self._take(path)
 
@@ -116,6 +120,7 @@ class StillpathPlugin(
         settings = {name: self._settings.get([name]) for name in DEFAULTS}
         profile = str(self._printer_profile_manager.get_current_or_default().get("name") or "")
         entry = Entry(path, "", {}, where=str(settings.get("where")))
+        entry.version = _version(self._host.disk_path(path))
         try:
             entry.server = str(settings.get("server") or "").strip()
             rows = settings.get("machines") or []
@@ -277,10 +282,19 @@ class StillpathPlugin(
 def _view(entry: Entry) -> dict[str, Any]:
     """Return an entry as pages show it."""
     shown = asdict(entry)
-    for name in ("server", "is_ours", "tries"):
+    for name in ("server", "is_ours", "tries", "version"):
         del shown[name]
     shown["is_over"] = entry.is_over
     return shown
+
+
+def _version(source: Path | None) -> list[int]:
+    """Return what tells one upload of a name from the next."""
+    with contextlib.suppress(OSError):  # deleted meanwhile
+        if source is not None:
+            about = source.stat()
+            return [about.st_size, about.st_mtime_ns]
+    return []
 
 
 def _require(permission: Any) -> None:

@@ -52,6 +52,8 @@ class Entry:
         Of this entry; no other text may name it in an address.
     tries : int
         How often it was sent; every time is another request for the server.
+    version : list of int
+        Size and time of change of the original when it was taken; empty: not known.
     """
 
     path: str
@@ -70,6 +72,7 @@ class Entry:
     result: str = ""
     has_report: bool = False
     tries: int = 0
+    version: list[int] = field(default_factory=list)
     at: float = field(default_factory=time.time)
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
 

@@ -42,8 +42,8 @@ export function progressPanel() {
 /** Why a job that was started before began anew. @param {any} job */
 function begunAnew(job) {
   return job.losses
-    ? `begun anew, because its worker was lost${job.losses > 1 ? ` ${job.losses} times` : ""}`
-    : "begun anew, because the service was restarted";
+    ? `restarted, because its worker was lost${job.losses > 1 ? ` ${job.losses} times` : ""}`
+    : "restarted, because the service was restarted";
 }
 
 /** @param {string} text */

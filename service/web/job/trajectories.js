@@ -24,7 +24,7 @@ export function trajectories(job, signal) {
   const form = h("form", { onsubmit: async (/** @type {Event} */ event) => {
     event.preventDefault();
     send.disabled = true;
-    fill(status, h("p.row", null, h("progress", { "aria-label": "Computing" }), "Computing; this takes as long as the job did up to there …"));
+    fill(status, h("p.row", null, h("progress", { "aria-label": "Computing" }), "Computing; this takes as long as compensating the file up to there …"));
     try {
       const query = { format: format.value, start_s: start.value, stop_s: String(Number(start.value) + Number(length.value)) };
       save(await (await computed(where, { query, signal })).blob(), `${stem}.${start.value}s.${format.value}`);

@@ -1,7 +1,7 @@
 /** Requests to the service: the key goes along, problems are thrown. */
 
 import { askForKey, keyHeaders, storedKey } from "./keys.js";
-import { problemOf, unreachable } from "./problem.js";
+import { ProblemError, problemOf, unreachable } from "./problem.js";
 
 const LOOK_MS = 1000;
 
@@ -63,6 +63,7 @@ export async function computed(path, asking = {}, onProgress = () => {}) {
       job = await getJson(job.links.self, { signal });
     }
     if (job.state === "failed") throw problemOf(job.error.status, JSON.stringify(job.error));
+    if (job.state === "cancelled") throw new ProblemError({ title: "Job cancelled", detail: "Somebody cancelled it. Ask again for the result.", status: 409 });
   }
 }
 

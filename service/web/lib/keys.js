@@ -5,13 +5,15 @@ import { h } from "./dom.js";
 const STORED = "stillpath.key";
 /** @type {Promise<boolean> | null} */
 let asking = null;
+/** @type {string | null} Kept here where the browser lets the tab store nothing. */
+let unstored = null;
 
 /** @returns {string | null} */
 export function storedKey() {
   try {
-    return sessionStorage.getItem(STORED);
+    return sessionStorage.getItem(STORED) ?? unstored;
   } catch {
-    return null;
+    return unstored;
   }
 }
 
@@ -23,7 +25,11 @@ export function keyHeaders() {
 
 /** Forget the key and start anew. */
 export function forgetKey() {
-  sessionStorage.removeItem(STORED);
+  try {
+    sessionStorage.removeItem(STORED);
+  } catch {
+    // It is nowhere but in this page, which ends now.
+  }
   location.reload();
 }
 
@@ -35,7 +41,7 @@ export function forgetKey() {
  */
 export function askForKey(reason) {
   // Without one before, nothing is wrong yet.
-  asking ??= ask(storedKey() === null ? "Enter one to hand in files and to see your own jobs." : reason).finally(() => {
+  asking ??= ask(storedKey() === null ? "Enter one to submit files and to see your own jobs." : reason).finally(() => {
     asking = null;
   });
   return asking;
@@ -64,7 +70,7 @@ function ask(reason) {
     dialog.addEventListener("close", () => {
       const key = field.value.trim();
       const given = dialog.returnValue === "given" && key !== "";
-      if (given) sessionStorage.setItem(STORED, key);
+      if (given) store(key);
       showForget();
       dialog.remove();
       resolve(given);
@@ -72,6 +78,16 @@ function ask(reason) {
     document.body.append(dialog);
     dialog.showModal();
   });
+}
+
+/** @param {string} key */
+function store(key) {
+  unstored = key;
+  try {
+    sessionStorage.setItem(STORED, key);
+  } catch {
+    // Then it lasts until the page is left.
+  }
 }
 
 /** Show the button that forgets the key while there is one. */

@@ -16,7 +16,7 @@ export function isOver(job) {
 }
 
 /**
- * Call back with every new state of a job until it is over.
+ * Call back with every new state of a job until it ends.
  *
  * @param {string} id
  * @param {(job: any) => void} onJob

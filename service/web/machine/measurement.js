@@ -6,13 +6,13 @@ import { fill, h } from "../lib/dom.js";
 import { counted } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
+import { NAME } from "./name.js";
 import { fitPlots } from "./plots.js";
 
 const TEST = [
   ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "133.3"], ["hz_per_sec", "Hz per second", "1"],
   ["accel_per_hz", "Acceleration per Hz, mm/s", "60"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400"],
 ];
-const NAME = "[a-z0-9][a-z0-9_\\-]{0,63}";
 
 /**
  * @param {{machines: any[], base: string | null, own?: boolean, signal: AbortSignal}} about `base`:
@@ -24,13 +24,13 @@ export function measurementPanel({ machines, base, own = false, signal }) {
   let files = [];
   const result = h("div", { "aria-live": "polite" });
   const look = h("button.main", { type: "submit", disabled: true }, "Look at the fit");
-  const name = h("input", { type: "text", id: "new-name", required: !own, pattern: NAME, maxlength: "60", autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
+  const name = h("input", { type: "text", id: "new-name", required: !own, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "new-name-hint" });
   const start = h("select", { id: "base", required: true }, h("option", { value: "" }, "Choose the most alike"), machines.filter((m) => m.problem === null).map((m) => h("option", { value: m.name, selected: m.name === base }, m.title)));
   const author = h("input", { type: "text", id: "measured-by", maxlength: "100", autocomplete: "name" });
   const test = testOptions();
   const form = h("form.card", { onsubmit: (/** @type {Event} */ event) => {
     event.preventDefault();
-    send(true);
+    send(chosen(), true);
   } },
     dropZone({ label: "Drop measurements here, or choose them", hint: "Klipper's raw_data_*.csv or resonances_*.csv, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.npz,.gz,text/*", multiple: true,
       onChoose: (chosen) => {
@@ -45,16 +45,23 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     test.element,
     h("div.actions", null, look), result);
 
-  async function send(/** @type {boolean} */ trial) {
+  /** What is asked for now; the fit that is looked at is kept as it was asked for. */
+  function chosen() {
     const target = own ? /** @type {string} */ (base) : name.value;
+    return { target, files: [...files], options: { base: own ? "" : base ?? start.value, ...test.read() } };
+  }
+
+  /** @param {ReturnType<typeof chosen>} asked @param {boolean} trial */
+  async function send(asked, trial) {
+    const { target, options } = asked;
     const body = new FormData();
-    for (const file of files) body.append("file", file, file.name);
+    for (const file of asked.files) body.append("file", file, file.name);
     look.disabled = true;
     const said = h("span", null, "Identifying; this takes some ten seconds …");
     fill(result, h("p.row", null, h("progress", { "aria-label": "Identifying" }), said));
     try {
       const path = address(`/v1/machines/${encodeURIComponent(target)}/measurements`, {
-        trial: trial ? "true" : "", base: own ? "" : base ?? start.value, author: author.value.trim(), ...test.read() });
+        trial: trial ? "true" : "", author: author.value.trim(), ...options });
       const found = await (await computed(path, { method: "POST", body, signal }, (job) => fill(said, `Identifying: ${job.stage} …`))).json();
       if (!trial) {
         announce(`Revision ${found.revision.number} of ${target} is kept.`);
@@ -63,8 +70,8 @@ export function measurementPanel({ machines, base, own = false, signal }) {
         else location.hash = here;
         return;
       }
-      const keep = h("button.main", { type: "button", onclick: () => send(false) }, own ? "Keep as the next revision" : `Keep as ${target}`);
-      fill(result, h("h3", { tabindex: "-1" }, "The fit"), h("p.hint", null, `${counted(files.length, "file")}. Nothing is stored yet.`),
+      const keep = h("button.main", { type: "button", onclick: () => send(asked, false) }, own ? "Keep as the next revision" : `Keep as ${target}`);
+      fill(result, h("h3", { tabindex: "-1" }, "The fit"), h("p.hint", null, `${counted(asked.files.length, "file")}. Nothing is stored yet.`),
         h("div.pair", null, found.report.axes.map((/** @type {any} */ axis) => fitPlots(axis, signal))),
         h("div.actions", null, keep));
       result.querySelector("h3")?.focus();

@@ -5,8 +5,8 @@ import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
 import { problemPanel } from "../lib/problem.js";
 import { dropZone } from "../parts/drop-zone.js";
+import { NAME } from "./name.js";
 
-const NAME = "[a-z0-9][a-z0-9_\\-]{0,63}";
 const TRAVEL = "\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*[xX]\\s*[0-9.]+\\s*";
 const M503 = /^.*\bM(92|201|203|204|205)\s+[A-Z]/m;
 
@@ -20,7 +20,7 @@ export function settingsPanel({ machine, signal }) {
   let file = "";
   const status = h("div", { "aria-live": "polite" });
   const keep = h("button.main", { type: "submit", disabled: true }, machine ? "Keep as the next revision" : "Make the machine");
-  const name = h("input", { type: "text", id: "settings-name", required: true, pattern: NAME, maxlength: "60", autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
+  const name = h("input", { type: "text", id: "settings-name", required: true, ...NAME, autocomplete: "off", spellcheck: "false", "aria-describedby": "settings-name-hint" });
   const travel = h("input", { type: "text", id: "travel", pattern: TRAVEL, placeholder: "235x235x250", "aria-describedby": "travel-hint" });
   const kinematics = h("select", { id: "kinematics" }, [["cartesian", "Cartesian"], ["corexy", "CoreXY"]].map(([value, words]) => h("option", { value }, words)));
   const [fx, fy] = ["x", "y"].map((axis) => h("input", { type: "number", id: `f${axis}`, min: "1", max: "1000", step: "any", placeholder: "as the file says" }));

@@ -56,7 +56,7 @@ export async function show({ main, signal, setTitle, params: [id] }) {
 
   function cancelButton(/** @type {any} */ job) {
     return h("button", { type: "button", onclick: () => act(async () => {
-      if (!await confirmed({ title: "Cancel this job?", text: `${job.source_name} is not finished. It can be handed in again.`, yes: "Cancel the job", no: "Let it run" })) return;
+      if (!await confirmed({ title: "Cancel this job?", text: `${job.source_name} is not finished. It can be submitted again.`, yes: "Cancel the job", no: "Let it run" })) return;
       draw(await (await request(`/v1/jobs/${job.id}/cancel`, { method: "POST", signal })).json());
     }) }, "Cancel");
   }
@@ -100,5 +100,5 @@ function subtitle(job) {
 }
 
 function again() {
-  return h("a.button", { href: "#/" }, "Hand in another file");
+  return h("a.button", { href: "#/" }, "Submit another file");
 }

@@ -78,7 +78,7 @@ export async function show({ main, signal, setTitle }) {
   }
 
   async function cancel(/** @type {any} */ job) {
-    if (!await confirmed({ title: "Cancel this job?", text: `${job.source_name} is not finished. It can be handed in again.`, yes: "Cancel the job", no: "Let it run" })) return;
+    if (!await confirmed({ title: "Cancel this job?", text: `${job.source_name} is not finished. It can be submitted again.`, yes: "Cancel the job", no: "Let it run" })) return;
     await change(() => request(`/v1/jobs/${job.id}/cancel`, { method: "POST", signal }), `${job.source_name} is cancelled.`);
   }
 

@@ -1,4 +1,4 @@
-/** Hand in a file: drop it, name the machine, send it. */
+/** Submit a file: drop it, name the machine, send it. */
 
 import { getJson, isAbort, upload } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
@@ -24,7 +24,7 @@ export async function show({ main, signal, setTitle }) {
   setTitle("New job");
   const heading = [
     h("h1", null, "New job"),
-    h("p.lead", null, "Hand in a sliced file. You get one back that keeps the nozzle on its path, with a report of what was measured on it."),
+    h("p.lead", null, "Submit a sliced file. You get one back that keeps the nozzle on its path, with a report of what was measured on it."),
   ];
   // As narrow as it will be with the form, so that nothing jumps when that comes.
   fill(main, h("div.narrow", null, heading));
@@ -112,7 +112,7 @@ export async function show({ main, signal, setTitle }) {
 /** What can be told of a file without sending it. @param {File} file @returns {{title: string, detail: string} | null} */
 function complaint(file) {
   if (file.size === 0) return { title: "The file is empty", detail: `${file.name} has no content. Slice or copy it again.` };
-  if (MODELS.test(file.name)) return { title: "The file is not sliced", detail: `${file.name} is a model. Slice it first, and hand in the G-code.` };
+  if (MODELS.test(file.name)) return { title: "The file is not sliced", detail: `${file.name} is a model. Slice it first, and submit the G-code.` };
   return null;
 }
 

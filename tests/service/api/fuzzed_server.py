@@ -22,7 +22,7 @@ if __name__ == "__main__":
 
     design = design_report(load_machine("ender3"), "x").model_dump(mode="json")
     with (
-        mock.patch.object(designs, "answered", mock.AsyncMock(return_value=None)),
-        mock.patch.object(designs, "answer_of", mock.AsyncMock(return_value=design)),
+        mock.patch.object(designs, "run_and_wait", mock.AsyncMock(return_value=None)),
+        mock.patch.object(designs, "read_result", mock.AsyncMock(return_value=design)),
     ):
         serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=light)

@@ -10,6 +10,7 @@ import socketserver
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -219,6 +220,35 @@ def test_it_asks_where_events_do_not_come_through():
 
     with pretending(answer) as address, Client(address) as client:
         assert client.wait("a" * 32).state == "done"
+
+
+def test_a_job_that_only_waits_is_given_up_in_time(monkeypatch: pytest.MonkeyPatch):
+    """Comments keep the stream of events alive; they must not keep the caller."""
+    monkeypatch.setattr("stillpath.service.connection._SILENCE_S", 0.1)
+    whole: list[bool] = []
+
+    def answer(handler: Handler) -> None:
+        if not handler.path.endswith("/events"):
+            handler.give(200, job_document(state="queued"))
+            return
+        handler.send_response(200)
+        handler.send_header("Content-Type", "text/event-stream")
+        handler.end_headers()
+        whole.append(False)
+        for _ in range(100):
+            handler.wfile.write(b": ping\n\n")
+            handler.wfile.flush()
+            time.sleep(0.03)
+        whole[-1] = True
+
+    with (
+        pretending(answer) as address,
+        Client(address) as client,
+        pytest.raises(ClientError, match="still queued; given up"),
+    ):
+        client.wait("5f2c", timeout_s=1.0)
+    assert whole
+    assert not any(whole)
 
 
 def test_strangers_and_redirections():

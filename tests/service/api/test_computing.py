@@ -86,7 +86,7 @@ def test_what_is_refused_is_a_failed_job(client: TestClient) -> None:
     assert_problem(answer, 422, "")
     (failed,) = [job for job in jobs(client, "controller") if job["state"] == "failed"]
     assert failed["error"] == answer.json()
-    assert failed["error"]["title"] == "No such controller"
+    assert failed["error"]["title"] == "Controller not possible"
 
 
 def test_cancelled_it_ends_and_its_process_is_free(client: TestClient) -> None:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,24 +11,17 @@ import httpx2
 import pytest
 
 from stillpath.service.storage.disk import Disk, NoRoom
+from tests.service.small_disk import small_disk
 from tests.service.test_server import PRETEND, server, until
 
 MIB = 1 << 20
 SIZE_MIB, RESERVE_MIB = 60, 16
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system in memory, which takes root."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MIB}m", "none", str(folder)]
-    if sys.platform != "linux" or os.geteuid() != 0 or subprocess.run(command).returncode != 0:
-        pytest.skip("no small disk: to mount one takes root")
-    try:
+@pytest.fixture(name="small_disk")
+def mounted(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", SIZE_MIB) as folder:
         yield folder
-    finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def fill(file: Path) -> None:

@@ -49,8 +49,16 @@ def test_a_file_for_a_machine(client: TestClient):
 
 def test_what_is_wrong(client: TestClient, tmp_path: Path):
     sent = FORM | {"file": ("gear.gcode", b"G1 X2\n")}
-    assert_problem(client.post("/printers/nope/api/files/local", files=sent), 422, "nope")
+    assert_problem(client.post("/printers/nope/api/files/local", files=sent), 404, "nope", "left")
     assert_problem(client.post("/printers/left/api/files/local", files=FORM), 422, "file name")
     assert_problem(client.post("/printers/a%0ab/api/files/local", files=sent), 404)
-    with opened(tmp_path) as alone:
+    odd = tmp_path / "printers.toml"
+    odd.write_text(
+        '[printer.odd]\nkind = "octoprint"\nurl = "http://127.0.0.1:9"\nmachine = "ender3"\n'
+        'method = "live"\nbudget_um = 12\n'
+    )
+    with opened(tmp_path / "odd", printers=odd) as found:
+        refused = found.post("/printers/odd/api/files/local", files=sent)
+        assert_problem(refused, 422, "odd", "method live", "STILLPATH_PRINTERS")
+    with opened(tmp_path / "alone") as alone:
         assert_problem(alone.post("/api/files/local", files=sent), 422, "/printers/NAME")

@@ -12,8 +12,8 @@ import pytest
 from starlette.exceptions import HTTPException
 from starlette.types import Message
 
+from stillpath.service.api.body_timeout import LEAST_BYTES, BodyTimeout
 from stillpath.service.api.limits import Limits
-from stillpath.service.api.patience import LEAST_BYTES, Patience
 from stillpath.service.api.problems import Problem
 from tests.service.security.test_limits import caller
 from tests.service.test_server import PRETEND, finished, server, until
@@ -35,10 +35,10 @@ class Sender:
         return {"type": "http.request", "body": b"x" * size, "more_body": more}
 
 
-async def whole(patience: Patience) -> int:
+async def whole(body: BodyTimeout) -> int:
     size = 0
     while True:
-        message = await patience.receive()
+        message = await body.receive()
         size += len(message["body"])
         if not message["more_body"]:
             return size
@@ -46,9 +46,9 @@ async def whole(patience: Patience) -> int:
 
 def test_silence_ends_a_body() -> None:
     async def ask() -> None:
-        patience = Patience(Sender((0, LEAST_BYTES)).receive, quiet_s=0.1)
+        body = BodyTimeout(Sender((0, LEAST_BYTES)).receive, quiet_s=0.1)
         with pytest.raises(HTTPException, match=r"Within 0\.1 s less than 1024 bytes") as caught:
-            await whole(patience)
+            await whole(body)
         assert caught.value.status_code == 408
 
     asyncio.run(ask())
@@ -57,7 +57,7 @@ def test_silence_ends_a_body() -> None:
 def test_a_byte_now_and_then_is_silence_too() -> None:
     async def ask() -> None:
         with pytest.raises(HTTPException):
-            await whole(Patience(Sender(*[(0.05, 1)] * 40).receive, quiet_s=0.2))
+            await whole(BodyTimeout(Sender(*[(0.05, 1)] * 40).receive, quiet_s=0.2))
 
     asyncio.run(ask())
 
@@ -65,32 +65,32 @@ def test_a_byte_now_and_then_is_silence_too() -> None:
 def test_slow_but_steady_is_fine() -> None:
     async def ask() -> None:
         slow = Sender(*[(0.05, LEAST_BYTES)] * 8, more=False)
-        assert await whole(Patience(slow.receive, quiet_s=0.3)) == 8 * LEAST_BYTES
+        assert await whole(BodyTimeout(slow.receive, quiet_s=0.3)) == 8 * LEAST_BYTES
 
     asyncio.run(ask())
 
 
 def test_what_the_service_takes_itself_is_not_the_sender_s() -> None:
     async def ask() -> None:
-        patience = Patience(Sender(*[(0, 10)] * 8, more=False).receive, quiet_s=0.1)
+        body = BodyTimeout(Sender(*[(0, 10)] * 8, more=False).receive, quiet_s=0.1)
         for _ in range(8):
-            await patience.receive()
+            await body.receive()
             await asyncio.sleep(0.05)  # the disk is slow
 
     asyncio.run(ask())
 
 
 def test_who_has_been_silent_for_long_yields_his_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stillpath.service.api.patience._YIELDS_AFTER_S", 0.1)
+    monkeypatch.setattr("stillpath.service.api.body_timeout._YIELDS_AFTER_S", 0.1)
 
     async def ask() -> None:
         limits, ended = Limits(100, uploads=2), []
 
         async def upload(*chunks: tuple[float, int], more: bool = True) -> None:
-            patience = Patience(Sender(*chunks, more=more).receive, quiet_s=5)
+            body = BodyTimeout(Sender(*chunks, more=more).receive, quiet_s=5)
             try:
-                with limits.uploading(caller("k"), patience):
-                    await whole(patience)
+                with limits.uploading(caller("k"), body):
+                    await whole(body)
             except HTTPException as error:
                 ended.append(error.detail)
 

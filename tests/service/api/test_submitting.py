@@ -89,7 +89,13 @@ def test_quotas(tmp_path: Path):
         assert_problem(refused, 429, "the limit is 1", "cancel")
         assert refused.headers["retry-after"].isdecimal()
         client.post(f"{where}/cancel")
-        assert post(client, b"G1 X1").status_code == 202
+        key = {"Idempotency-Key": "k-1"}
+        first = post(client, b"slow 2", **key)
+        assert first.status_code == 202
+        again = post(client, b"slow 2", **key)  # its answer was lost on the way
+        assert (again.status_code, again.json()["id"]) == (200, first.json()["id"])
+        assert_problem(post(client, b"slow 3", **key), 422, "k-1")
+        assert_problem(post(client, b"slow 3", **{"Idempotency-Key": "k-2"}), 429, "the limit is 1")
     with opened(tmp_path / "small", max_bytes_per_owner=100) as client:
         assert_problem(post(client, b"x" * 101), 507, "100", "delete")
         assert post(client, b"x" * 60).status_code == 202

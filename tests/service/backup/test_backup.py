@@ -17,7 +17,7 @@ from stillpath.service.backup import archive
 from stillpath.service.backup.archive import BackupError, back_up, restore
 from stillpath.service.database.engine import open_database
 from stillpath.service.deliveries.rows import deliveries_of
-from stillpath.service.exclusive import exclusive
+from stillpath.service.instance_lock import exclusive
 from stillpath.service.jobs.state import JobState
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings

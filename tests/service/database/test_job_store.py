@@ -183,7 +183,7 @@ def test_a_quota_of_jobs(store: JobStore):
     limits = Quota(max_jobs=2, max_bytes=10**9)
     first = store.add(make_job(), limits=limits)
     store.add(make_job(), limits=limits)
-    with pytest.raises(QuotaExceeded, match=r"'anna' has 2 jobs .* limit is 2"):
+    with pytest.raises(QuotaExceeded, match=r"'anna' has 2 unfinished jobs, the limit is 2"):
         store.add(make_job(), idempotency=("key", "print"), limits=limits)
     # What was refused has left nothing behind.
     assert store.submitted("anna", "key") is None

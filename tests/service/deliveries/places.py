@@ -17,7 +17,7 @@ from stillpath.service.deliveries.sender import Sender, SendingTimes
 from stillpath.service.jobs.state import Claimed, Failed, Finished, Job
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.settings import Settings
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.factory import open_storage
 from tests.service.database.examples import make_job
 from tests.service.deliveries.listeners import until
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from stillpath.service.deliveries import sender
+from stillpath.service.deliveries.http_requests import Reply
 from stillpath.service.deliveries.printers import PrinterFileError, load_printers, printer_for
 from stillpath.service.deliveries.targets import TargetRefused
 from tests.service.deliveries.listeners import Listener, Seen, moonraker, octoprint, until, uploads
@@ -156,6 +158,34 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
             delivery = place.settled(job)
     assert (delivery.state, len(uploads(server))) == ("failed", 1)
     assert "may have been started" in (delivery.error or "")
+
+
+@pytest.mark.parametrize("prints", [False, True])
+def test_a_sender_that_breaks_starts_no_second_print(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prints: bool
+):
+    """The printer has the file; then something happens that nobody has foreseen."""
+    judge, replies = sender._judged, []
+
+    def breaks_once(reply: Reply) -> tuple[str, str | None]:
+        replies.append(reply)
+        if len(replies) == 1:
+            raise RuntimeError("unforeseen")
+        return judge(reply)
+
+    monkeypatch.setattr(sender, "_judged", breaks_once)
+    with (
+        Listener() as server,
+        at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m", print_after=prints)
+        with place.sending():
+            delivery = place.settled(job)
+    if prints:
+        assert (delivery.state, len(uploads(server))) == ("failed", 1)
+        assert "may have been started" in (delivery.error or "")
+    else:
+        assert (delivery.state, len(uploads(server))) == ("done", 2)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from stillpath.service.jobs.state import Cancelled, Job, JobState
 from stillpath.service.jobs.store import JobStore
 from stillpath.service.jobs.sweep import sweep_files
 from stillpath.service.settings import Settings
-from stillpath.service.storage.opened import open_storage
+from stillpath.service.storage.factory import open_storage
 from tests.service.database.examples import make_job
 
 __all__ = ["ROOT", "Process", "Site", "until"]

@@ -220,7 +220,9 @@ def test_a_storage_that_stays_away_is_the_reason_in_the_end(
     assert Bench(site).run(job_id, storage=broken).state is JobState.QUEUED
     job = Bench(site).run(job_id, storage=broken)
     assert job.state is JobState.FAILED
+    assert (job.problem["status"], job.problem["title"]) == (503, "Storage unavailable")
     assert "away" in job.problem["detail"]
+    assert "memory" not in job.problem["detail"]
 
 
 def test_a_job_without_room_waits_in_the_queue(site: Site):

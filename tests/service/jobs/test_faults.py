@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -18,6 +17,7 @@ import pytest
 from stillpath.service.database.engine import DatabaseAway
 from stillpath.service.jobs.state import JobState
 from tests.service.jobs.site import ROOT, Process, Site, until
+from tests.service.small_disk import small_disk
 
 pytestmark = [
     pytest.mark.slow,
@@ -139,16 +139,8 @@ def test_silence_is_a_loss(site: Site):
     site.check_files()
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounts a small disk")
 def test_a_job_larger_than_the_disk_fails_and_others_go_on(tmp_path: Path):
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(disk)], check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip("may not mount")
-    try:
+    with small_disk(tmp_path / "disk", 24) as disk:
         site = Site(disk / "data", disk_reserve_bytes=str(4 << 20))
         try:
             with site.work():
@@ -162,8 +154,6 @@ def test_a_job_larger_than_the_disk_fails_and_others_go_on(tmp_path: Path):
             site.check_files()
         finally:
             site.close()
-    finally:
-        subprocess.run(["umount", "--lazy", str(disk)], check=True)
 
 
 def test_ends_at_random_moments_leave_every_job_done_once(site: Site):

@@ -11,7 +11,7 @@ if __name__ == "__main__":
     from stillpath.service.jobs.work import Work
     from stillpath.service.logs import configure_logging
     from stillpath.service.settings import Settings
-    from stillpath.service.storage.opened import open_storage
+    from stillpath.service.storage.factory import open_storage
     from tests.service import runners
 
     prepare_environment()

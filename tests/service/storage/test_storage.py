@@ -20,8 +20,8 @@ from hypothesis.stateful import (
 
 from stillpath.service.settings import Settings
 from stillpath.service.storage import Storage, StorageError
+from stillpath.service.storage.factory import open_storage
 from stillpath.service.storage.local import LocalStorage
-from stillpath.service.storage.opened import open_storage
 from stillpath.service.storage.s3 import S3Storage
 from tests.service.storage.s3_server import BUCKET, CREDENTIALS, Cable, free_port, s3_server
 

@@ -1,4 +1,4 @@
-"""Timeouts for request bodies that stall: senders cannot hold places, or others up."""
+"""Timeouts for request bodies that stall: senders cannot hold upload slots, or others up."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from starlette.exceptions import HTTPException
 if TYPE_CHECKING:
     from starlette.types import Message, Receive, Scope
 
-__all__ = ["LEAST_BYTES", "PATIENCE", "QUIET_S", "Patience", "patience_of"]
+__all__ = ["BODY_TIMEOUT", "LEAST_BYTES", "QUIET_S", "BodyTimeout", "body_timeout_of"]
 
-PATIENCE = "stillpath.patience"
-"""Key of the ASGI scope: the `Patience` with the sender of the body."""
+BODY_TIMEOUT = "stillpath.body_timeout"
+"""Key of the ASGI scope: the `BodyTimeout` of the request."""
 
 QUIET_S = 30.0
 LEAST_BYTES = 1024
-"""So many must come in that time: else a byte now and then would do to hold a place."""
+"""So many must come in that time: else a byte now and then would do to hold a slot."""
 _YIELDS_AFTER_S = 5.0
 
 
-class Patience:
+class BodyTimeout:
     """Waits for the body of one request.
 
     Parameters
@@ -43,14 +43,14 @@ class Patience:
         self._whole = False
 
     async def receive(self) -> Message:
-        """Return the next message, whose sender may not take longer than he is allowed to.
+        """Return the next message, whose sender may not take longer than it is allowed to.
 
         Raises
         ------
         HTTPException
-            408, if he does.
+            408, if it does.
         """
-        if self._whole:  # what comes now is that he hangs up
+        if self._whole:  # what comes now is that the sender hangs up
             return await self._receive()
         self._since = asyncio.get_running_loop().time()
         try:
@@ -69,12 +69,12 @@ class Patience:
 
     @property
     def quiet_s(self) -> float:
-        """How long the sender has been waited for; 0 if he is not waited for at the moment."""
+        """How long the sender has been waited for; 0 if nobody is waited for at the moment."""
         if self._waiting is None:
             return 0.0
         return self._waited_s + asyncio.get_running_loop().time() - self._since
 
-    def yield_place(self) -> bool:
+    def yield_slot(self) -> bool:
         """End the request if its sender has been quiet for some seconds: somebody else is there."""
         waiting = self._waiting
         if waiting is None or waiting.expired() or self.quiet_s < _YIELDS_AFTER_S:
@@ -87,7 +87,7 @@ class Patience:
         if self._has_yielded:
             why = (
                 f"For {_YIELDS_AFTER_S:g} s or longer less than {LEAST_BYTES} bytes of this upload "
-                "came, and its place was given to another one. "
+                "came, and its slot was given to another one. "
             )
         else:
             why = (
@@ -99,7 +99,7 @@ class Patience:
         )
 
 
-def patience_of(scope: Scope) -> Patience | None:
-    """Return the patience with the sender of a request, if its body passes one."""
-    found = scope.get(PATIENCE)
-    return found if isinstance(found, Patience) else None
+def body_timeout_of(scope: Scope) -> BodyTimeout | None:
+    """Return the timeout that the body of a request passes, if any."""
+    found = scope.get(BODY_TIMEOUT)
+    return found if isinstance(found, BodyTimeout) else None

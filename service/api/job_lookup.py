@@ -54,17 +54,17 @@ async def find_done(
             return job
         case JobState.FAILED:
             why = (job.problem or {}).get("detail", "the reason is unknown")
-            raise Problem(409, "The job failed", f"There is no result: {why}", error=job.problem)
+            raise Problem(409, "Job failed", f"There is no result: {why}", error=job.problem)
         case JobState.CANCELLED:
             raise Problem(
                 409,
-                "The job was cancelled",
-                "The job was cancelled, so there is no result; hand the file in again.",
+                "Job cancelled",
+                "The job was cancelled, so there is no result; submit the file again.",
             )
         case _:
             raise Problem(
                 409,
-                "Not done yet",
+                "Job not finished",
                 f"The job is {job.state.value}. Ask /v1/jobs/{job_id} until its state is done, or "
                 f"watch /v1/jobs/{job_id}/events.",
             )

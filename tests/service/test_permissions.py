@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from stillpath.service.database.engine import open_database
-from stillpath.service.exclusive import exclusive
-from stillpath.service.private import private_file, private_folder
+from stillpath.service.instance_lock import exclusive
+from stillpath.service.permissions import private_file, private_folder
 from stillpath.service.settings import Settings
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="modes of POSIX")

@@ -14,10 +14,10 @@ from starlette.responses import Response
 
 from stillpath.gcode.containers.sniff import Kind, kind_of
 from stillpath.service.api.access import Reader
-from stillpath.service.api.finding import JobId, find_done
+from stillpath.service.api.file_responses import HEADERS, MEDIA, RANGES, stored
+from stillpath.service.api.job_lookup import JobId, find_done
 from stillpath.service.api.problems import Problem, responses
 from stillpath.service.api.schemas import LayerIndex
-from stillpath.service.api.stored import HEADERS, MEDIA, RANGES, stored
 from stillpath.service.jobs.state import Job, JobKind
 from stillpath.service.storage.base import Storage
 
@@ -88,7 +88,7 @@ def _file(kinds: tuple[str, ...], description: str, *more: int) -> dict[int | st
 )
 @router.head("/result", include_in_schema=False)
 async def read_result(request: Request, job_id: JobId, caller: Reader) -> Response:
-    """Stream the written file: of the kind that was handed in. Obeys `Range`.
+    """Stream the written file: of the kind that was submitted. Obeys `Range`.
 
     Of jobs that compute something else, the answer.
     """

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from stillpath.service.private import private_folder
+from stillpath.service.permissions import private_folder
 
 __all__ = ["exclusive"]
 

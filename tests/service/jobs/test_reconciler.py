@@ -1,0 +1,129 @@
+"""One look after the other, with workers that do what the test says."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stillpath.service.jobs import reconciler
+from stillpath.service.jobs.reconciler import Reconciler
+from stillpath.service.jobs.state import WAITING_FOR_ROOM, Claimed, Job, JobState, Lost
+from stillpath.service.jobs.worker import Workplace, execute
+from tests.service.jobs.site import Site
+from tests.service.runners import light
+from tests.service.small_disk import small_disk
+
+_MIB = 1 << 20
+
+
+@dataclass
+class Handed:
+    """What Dask promises of a job: it ended with its process once `broken`."""
+
+    broken: bool = False
+    status: str = "error"
+
+    def done(self) -> bool:
+        return self.broken
+
+    def exception(self, timeout: float) -> Exception:
+        return type("KilledWorker", (Exception,), {})()
+
+
+@dataclass
+class Workers:
+    """A cluster with one place; jobs that are handed over lie there."""
+
+    is_connected: bool = True
+    is_own: bool = True
+    handed: list[Handed] = field(default_factory=list)
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def slots(self) -> int:
+        return 1
+
+    def submit(self, job: Job, when_done: Callable[[], object]) -> Handed:
+        self.handed.append(Handed())
+        return self.handed[-1]
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    site = Site(tmp_path / "data")
+    yield site
+    site.close()
+
+
+def looking(site: Site, workers: Workers) -> Reconciler:
+    made: Any = workers
+    return Reconciler(site.settings, site.store, site.storage, made)
+
+
+def test_every_attempt_has_its_moment_of_grace(site: Site, monkeypatch: pytest.MonkeyPatch):
+    """A worker that closes gives its job back itself, in this attempt as in an earlier one."""
+    monkeypatch.setattr(reconciler, "_GIVE_BACK_S", 0.3)
+    workers = Workers(is_own=False)
+    look = looking(site, workers)
+    job_id = site.submit("G1")
+    look._tick()
+    site.store.apply(job_id, Claimed(time.time(), "w"))
+    workers.handed[0].broken = True
+    look._tick()  # it is seen to be broken
+    site.store.apply(job_id, Lost(1, time.time(), "the worker was stopped", 2, blame=False))
+    workers.is_connected = False
+    look._tick()  # another scheduler: all is handed over anew
+    assert len(workers.handed) == 2
+    site.store.apply(job_id, Claimed(time.time(), "w"))
+    time.sleep(0.4)
+    workers.handed[1].broken = True
+    look._tick()
+    job = site.get(job_id)
+    assert (job.state, job.attempt, job.losses) == (JobState.RUNNING, 2, 0)
+    time.sleep(0.4)
+    look._tick()
+    assert site.get(job_id).losses == 1
+
+
+def test_a_job_waits_until_the_disk_of_the_storage_has_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reconciler, "_NO_ROOM_S", 0.0)
+    with small_disk(tmp_path / "disk", 12) as disk:
+        site = Site(tmp_path / "data", storage_url=(disk / "store").as_uri())
+        place = Workplace(site.settings, site.store, site.storage, site.data_dir / "scratch")
+        other = disk / "other"
+        other.write_bytes(b"x" * (8 * _MIB))
+        job_id = site.submit("long 6")
+        execute(job_id, place, light)
+        job = site.get(job_id)
+        assert (job.state, job.stage, job.losses) == (JobState.QUEUED, WAITING_FOR_ROOM, 0)
+        assert (job.room_bytes or 0) > 6 * _MIB
+        workers = Workers()
+        look = looking(site, workers)
+        for _ in range(3):
+            look._tick()
+        assert not workers.handed  # it would be computed again, and find no room again
+        other.unlink()
+        for _ in range(3):
+            look._tick()
+        assert len(workers.handed) == 1
+        execute(job_id, place, light)
+        assert site.get(job_id).state is JobState.DONE
+        large = site.submit("long 13")
+        execute(large, place, light)
+        job = site.get(large)
+        assert job.state is JobState.FAILED
+        assert job.problem is not None
+        assert (job.problem["status"], job.problem["title"]) == (
+            507,
+            "The job is larger than the disk",
+        )
+        assert "STILLPATH_STORAGE_URL" in job.problem["detail"]
+        site.close()
