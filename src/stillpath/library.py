@@ -114,7 +114,7 @@ def plan(
 
 
 def identify(files: Iterable[str | Path], base: Machine | str, *, name: str) -> Machine:
-    """Build a machine model from measurements: raw logs, tables of Klipper's resonance test, others.
+    """Build a machine model from measurements: raw logs, resonance tables, and others.
 
     Parameters
     ----------
