@@ -79,10 +79,11 @@ def test_no_break_asks_for_more_than_the_motors_bear(
     assert worst <= times * machine.command.speed_step_mm_s, worst
 
 
+@pytest.mark.parametrize("factor", [1.0, 2.0])
 @pytest.mark.parametrize("kind", ["klipper", "reprapfirmware"])
-def test_nor_of_a_motor_of_a_corexy(kind: str) -> None:
+def test_nor_of_a_motor_of_a_corexy(kind: str, factor: float) -> None:
     machine = ender3_with(kind).model_copy(update={"kinematics": "corexy"})
-    moves, limits = written(*compensated(HEAD + BODY, machine), 1.0)
+    moves, limits = written(*compensated(HEAD + BODY, machine), factor)
     stream = np.flatnonzero(moves.limits_id == 0)
     parts = [slice(max(k - _AROUND, 0), k) for k in stream[5::7]]
     parts += [slice(k, k + _AROUND) for k in stream[5::7]]

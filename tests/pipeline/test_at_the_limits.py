@@ -94,11 +94,11 @@ def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
     assert any("climb faster than Z can follow" in warning for warning in result.warnings)
 
 
-@pytest.mark.parametrize(("steps_per_mm", "told"), [(25.0, True), (400.0, False)])
+@pytest.mark.parametrize(("steps_per_mm", "told"), [(32.0, True), (400.0, False)])
 def test_where_the_shaper_would_serve_better_it_is_said(
     steps_per_mm: float, told: bool, tmp_path: Path
 ) -> None:
-    """Vertices on steps of .04 mm shake the printer more than the sliced file: that stays."""
+    """Vertices on steps of .03 mm shake the printer more than the sliced file: that stays."""
     drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
     own = RepRapFirmware(x=drive, y=drive, home_mm=(0.0, 0.0, 0.0))
     machine = load_machine("annex-k3").model_copy(update={"firmware": own})

@@ -40,7 +40,9 @@ class RepRapAdapter:
     def __init__(self, machine: Machine, firmware: RepRapFirmware) -> None:
         self._machine = machine
         self._firmware = firmware
-        self._stream = stream_limits(firmware, machine.command, machine.mesh_slope)
+        self._stream = stream_limits(
+            firmware, machine.command, machine.mesh_slope, corexy=machine.kinematics == "corexy"
+        )
         x, y, z, _ = (1.0 / drive.steps_per_mm for drive in firmware.drives)
         if machine.kinematics == "corexy":
             x = y = 0.5 * (x + y)

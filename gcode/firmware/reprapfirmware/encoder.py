@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
-from stillpath.gcode.firmware.base import corner_step_mm_s
 from stillpath.gcode.firmware.encoding import (
     Encoded,
     as_moves,
@@ -44,6 +43,8 @@ STEEPEST = 0.01
 """Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 60_000.0
 """The filament carries pressure advance, and must not be what limits X and Y."""
+_CORNER, _RAMP = 0.47, 0.375
+"""Of the motors' step of speed: what a corner may make, and the ramp of a ms on a CoreXY."""
 LEAST_SPEED_MM_S = 0.01
 """The least that the firmware can be set to; slower moves are hurried."""
 _E_JERK_SHARE = 2.0
@@ -65,27 +66,34 @@ not stand out by a tenth is cut off, which costs up to a tenth of the segment's 
 
 
 def stream_limits(
-    firmware: RepRapFirmware, command: CommandLimits, mesh_slope: float = 0.0
+    firmware: RepRapFirmware,
+    command: CommandLimits,
+    mesh_slope: float = 0.0,
+    *,
+    corexy: bool = False,
 ) -> RepRapLimits:
     """Return what the stream runs under.
 
-    X and Y keep what the motors bear, so that the stream may break off anywhere. What Z and the
-    extruder may do by themselves stays, because a rest's own move runs on into the stream. Z
-    follows a bed mesh, though, and is asked for the slope times what X and Y do.
+    X and Y keep what the motors bear, so that the stream may break off anywhere, at M220 200 % too,
+    where two corners may come within a ms. What Z and the extruder may do by themselves stays,
+    because a rest's own move runs on into the stream. Z follows a bed mesh, though, and is asked
+    for the slope times what X and Y do.
     """
     own = RepRapLimits.of(firmware, 0.0)
     x, y = command.of("x"), command.of("y")
-    accel = max(x.accel_mm_s2, y.accel_mm_s2)
-    # It limits the step of each axis.
-    jerks = [round(corner_step_mm_s(one) / math.sqrt(2.0), 2) for one in (x, y)]
+    # Jerk limits the step of each axis; a motor of a CoreXY makes those of both, and its ramp.
+    ramp, axes = (_RAMP, 2.0) if corexy else (math.inf, math.sqrt(2.0))
+    accels = [min(one.accel_mm_s2, ramp * one.speed_step_mm_s / 1e-3) for one in (x, y)]
+    accel = max(accels)
+    jerks = [round(_CORNER * one.speed_step_mm_s / axes, 2) for one in (x, y)]
     extruder = _E_JERK_SHARE * own.jerk_e_mm_s
     slope = mesh_slope + STEEPEST
     climb = max(own.jerk_z_mm_s, _DIAGONAL * slope * max(jerks))
     return replace(
         own,
         # A CoreXY's motors are held to it as well.
-        accel_x_mm_s2=x.accel_mm_s2,
-        accel_y_mm_s2=y.accel_mm_s2,
+        accel_x_mm_s2=accels[0],
+        accel_y_mm_s2=accels[1],
         accel_z_mm_s2=max(own.accel_z_mm_s2, slope * accel),
         accel_e_mm_s2=max(own.accel_e_mm_s2, STREAM_E_ACCEL_MM_S2),
         speed_x_mm_s=_DIAGONAL * x.velocity_mm_s,
