@@ -1,10 +1,12 @@
 """The real server, to be asked thousands of things: `python fuzzed_server.py DATA_DIR`.
 
-Jobs are pretended, and one real design, which takes seconds of computing, is the answer to every
-question for one.
+Jobs are pretended. One real design and one real filter for live printing, which take seconds of
+computing, are the answers to every question for one.
 """
 
 import sys
+import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from unittest import mock
 
@@ -14,15 +16,20 @@ if __name__ == "__main__":
     prepare_environment()
 
     from stillpath.applications.design.design import design_report
+    from stillpath.applications.live.export import write_export
     from stillpath.models.store import load_machine
-    from stillpath.service.api import designs
+    from stillpath.service.api import designs, live
     from stillpath.service.server import serve_forever
     from stillpath.service.settings import Settings
     from tests.service.runners import light
 
-    design = design_report(load_machine("ender3"), "x").model_dump(mode="json")
-    with (
-        mock.patch.object(designs, "run_and_wait", mock.AsyncMock(return_value=None)),
-        mock.patch.object(designs, "read_result", mock.AsyncMock(return_value=design)),
-    ):
+    machine = load_machine("ender3")
+    with tempfile.TemporaryDirectory() as folder:
+        export = write_export(machine, Path(folder) / "stillpath.json")
+    design = design_report(machine, "x").model_dump(mode="json")
+    with ExitStack() as stack:
+        for route, answer in ((designs, design), (live, export)):
+            for name, returned in (("run_and_wait", None), ("read_result", answer)):
+                pretended = mock.AsyncMock(return_value=returned)
+                stack.enter_context(mock.patch.object(route, name, pretended))
         serve_forever(Settings(data_dir=Path(sys.argv[1])), "127.0.0.1", 0, runner=light)
