@@ -142,8 +142,8 @@ class CompensationOptions:
         float | None,
         typer.Option(
             metavar="MB",
-            help="The most that the written G-code may have: compensate less, down to the walls, "
-            "until it fits.",
+            help="The most that the written G-code may have: compensate what is visible, then less "
+            "exactly (tolerances of 8 and 16), then walls alone, until it fits.",
         ),
     ] = None
     budget_um: BudgetOption = None

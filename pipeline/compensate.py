@@ -23,7 +23,7 @@ from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result
-from stillpath.pipeline.selection import TooLarge, narrower
+from stillpath.pipeline.selection import TooLarge, smaller
 from stillpath.pipeline.simulate import plan_file, simulate_file
 
 __all__ = ["compensate_file", "plan_file", "simulate_file"]
@@ -146,11 +146,11 @@ def _final_job(
 
 
 def _fitting(options: Options, name: str) -> Options:
-    """Return options with which less is compensated than with those that made a file too large."""
-    less = narrower(options)
+    """Return options for a smaller file than those that made one too large."""
+    less = smaller(options)
     if less is None:
         raise GcodeError(
             f"{name} exceeds max_mb {options.max_mb:g} even if only its outer walls are "
-            "compensated: allow more, or choose a larger tolerance_um"
+            f"compensated, with a tolerance of {options.tolerance_um:g} um: allow more"
         )
     return less

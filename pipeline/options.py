@@ -79,7 +79,7 @@ class Options(BaseModel):
     that allows (None: it keeps its speeds).
     `where` says which features are compensated (`pipeline.selection`); the others leave as
     sliced, and the file is smaller. `max_mb` is the most that the G-code may have, in millions of
-    bytes: fewer features are compensated, as few as the walls, until it fits.
+    bytes: fewer features are compensated, and less exactly, until it fits.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

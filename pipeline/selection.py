@@ -15,11 +15,13 @@ from stillpath.pipeline.options import Options, Where
 from stillpath.pipeline.result import GroupFigures
 from stillpath.pipeline.verbatim import feeding
 
-__all__ = ["Selection", "TooLarge", "narrower"]
+__all__ = ["Selection", "TooLarge", "smaller"]
 
 _WALLS = frozenset({Feature.OUTER_WALL, Feature.OVERHANG_WALL, Feature.THIN_WALL})
 _VISIBLE = _WALLS | {Feature.TOP_SURFACE, Feature.SKIN, Feature.IRONING, Feature.BOTTOM_SURFACE}
 _CHOSEN = {"visible": _VISIBLE, "walls": _WALLS}
+_TOLERANCES_UM = (8.0, 16.0)
+"""Tried in turn where a file is too large; beyond, vertices are bound by other things."""
 _WORTH_S = 0.5
 """Less than this is not worth the lines that end a stream and begin the next one."""
 
@@ -28,11 +30,18 @@ class TooLarge(Exception):
     """The file being written exceeds `Options.max_mb`."""
 
 
-def narrower(options: Options) -> Options | None:
-    """Return options that compensate less, or None for those that compensate walls alone."""
-    following: dict[Where, Where] = {"all": "visible", "visible": "walls"}
-    where = following.get(options.where)
-    return options.model_copy(update={"where": where}) if where is not None else None
+def smaller(options: Options) -> Options | None:
+    """Return options that write a smaller file, or None where there are none.
+
+    What costs least goes first (docs/benchmarks.md, "Compensated where it shows"): what nobody
+    sees, then exactness, then surfaces.
+    """
+    if options.where == "all":
+        return options.model_copy(update={"where": "visible"})
+    for tolerance_um in _TOLERANCES_UM:
+        if tolerance_um > options.tolerance_um:
+            return options.model_copy(update={"tolerance_um": tolerance_um})
+    return options.model_copy(update={"where": "walls"}) if options.where == "visible" else None
 
 
 class Selection:

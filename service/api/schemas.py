@@ -137,8 +137,9 @@ class JobQuery(BaseModel):
     )
     max_mb: MaxMb | None = Field(
         default=None,
-        description="The most that the G-code may have, in millions of bytes: less is compensated, "
-        "down to outer walls alone, until it fits.",
+        description="The most that the G-code may have, in millions of bytes: what is visible is "
+        "compensated, then less exactly (tolerances of 8 and 16 um), then outer walls alone, until "
+        "it fits.",
     )
     budget_um: BudgetUm | None = Field(
         default=None,

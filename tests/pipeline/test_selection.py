@@ -95,9 +95,16 @@ def test_a_file_that_must_not_be_large(gear: Path, tmp_path: Path) -> None:
         for where in ("all", "visible", "walls")
     ]
     assert sizes[0] > sizes[1] > sizes[2]
-    for limit_mb, where in ((10.0, "all"), (1e-6 * sizes[1] + 1e-3, "visible")):
+    for limit_mb, where, tolerance_um in (
+        (10.0, "all", 2),
+        (1e-6 * sizes[1] + 1e-3, "visible", 2),
+        (1e-6 * sizes[1] - 1e-3, "visible", 8),  # surfaces shake before they are left out
+    ):
         found = run(gear, target, machine, max_mb=limit_mb)
+        chosen = f"max_mb={limit_mb:g}: written with where={where} and tolerance_um={tolerance_um}"
+        assert chosen in found.notes
         assert found.settings.get("where", "all") == where
+        assert found.settings["tolerance_um"] == tolerance_um
         assert found.written_bytes == target.stat().st_size <= 1e6 * limit_mb
     target.write_bytes(b"precious")
     with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.2"):

@@ -134,7 +134,7 @@ function moreOptions() {
     field("along", "Weight along the path", along, "0.01 to 1; less takes longer."),
     field("budget", "Speed budget, µm", budget, "Contour error (rms) that every feature may have; the print becomes as fast as that allows."),
     field("where", "Compensate", where, "The rest stays as sliced, and the file is smaller."),
-    field("max-mb", "Largest file, MB", most, "Compensates less, down to the outer walls, until the G-code fits."),
+    field("max-mb", "Largest file, MB", most, "Compensates what is visible, then less exactly, then outer walls only, until the G-code fits."),
     field("times", "The slicer's times", times)];
   const element = h("details.more", null, h("summary", null, "More options"),
     h("div.fields", null, ofWritten,
