@@ -27,10 +27,11 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.file_motion import FileMotion
 from stillpath.pipeline.live_design import DT_S, live_filter
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
-from stillpath.pipeline.simulate import simulate_file
+from stillpath.pipeline.simulate import simulate_motion
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.response import response
 from tests.integrations.interrupted import homed
@@ -145,7 +146,8 @@ def _motion(
     source = folder / "in.gcode"
     source.write_text(text, encoding="utf-8")
     taps = np.array([export["axes"][axis]["taps"] for axis in ("x", "y")])
-    live = _contours(simulate_file(source, machine, live=live_filter(machine, taps)))
+    motion = FileMotion(source, None, machine, None, DT_S, None)
+    live = _contours(simulate_motion(motion, live=live_filter(machine, taps)))
     as_file = _contours(compensate_file(source, folder / "out.gcode", machine, Options()))
     ours, found = live["after"], _contour_um(prints, machine)
     yield file, "contour as sliced, predicted, um rms", live["before"], live["before"], None

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).resolve().parents[1]
-ROOMS = (
+LAYERS = (
     "applications",
     "benchmarks",
     "cli",
@@ -32,8 +32,8 @@ ALONE = ("integrations",)
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def sources(room: str) -> Iterator[tuple[str, str]]:
-    for path in sorted((HERE / room).rglob("*.py")):
+def sources(layer: str) -> Iterator[tuple[str, str]]:
+    for path in sorted((HERE / layer).rglob("*.py")):
         if not path.stem.endswith("_kernels"):
             yield path.relative_to(HERE).as_posix(), path.read_text("utf-8")
 
@@ -53,22 +53,22 @@ def parameters(function: Function) -> int:
     return len([name for name in names if name not in ("self", "cls")])
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_functions_are_short(room: str) -> None:
+@pytest.mark.parametrize("layer", LAYERS)
+def test_functions_are_short(layer: str) -> None:
     found = [
         f"{path}:{one.lineno} {one.name}: {one.end_lineno - one.lineno + 1} lines"
-        for path, text in sources(room)
+        for path, text in sources(layer)
         for one in functions(text)
         if one.end_lineno is not None and one.end_lineno - one.lineno + 1 > MOST_LINES
     ]
     assert found == [], f"more than {MOST_LINES} lines, from def to end: find the natural part"
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_functions_take_few_parameters(room: str) -> None:
+@pytest.mark.parametrize("layer", LAYERS)
+def test_functions_take_few_parameters(layer: str) -> None:
     found = [
         f"{path}:{one.lineno} {one.name}: {parameters(one)} parameters"
-        for path, text in sources(room)
+        for path, text in sources(layer)
         for one in functions(text)
         if parameters(one) > MOST_PARAMETERS
         and not (path.startswith(INTERFACES) and not one.name.startswith("_"))
@@ -76,7 +76,7 @@ def test_functions_take_few_parameters(room: str) -> None:
     assert found == [], f"more than {MOST_PARAMETERS} parameters: what belongs together is a record"
 
 
-@pytest.mark.parametrize("room", [room for room in ROOMS if room not in ALONE])
-def test_modules_hold_one_idea(room: str) -> None:
-    lines = {path: len(text.splitlines()) for path, text in sources(room)}
+@pytest.mark.parametrize("layer", [layer for layer in LAYERS if layer not in ALONE])
+def test_modules_hold_one_idea(layer: str) -> None:
+    lines = {path: len(text.splitlines()) for path, text in sources(layer)}
     assert {path: n for path, n in lines.items() if n > MOST_MODULE_LINES} == {}

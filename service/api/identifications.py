@@ -133,12 +133,8 @@ async def post_measurements(
     file that cannot be used is named with its reason, and nothing is stored.
     """
     machines: Resolver = request.app.state.machines
-    if not trial and not caller.may(Scope.ADMIN):
-        raise Problem(
-            403,
-            "Not allowed",
-            "Changing a machine requires a key with the `admin` scope; a trial does not.",
-        )
+    if not trial:
+        _check_may_store(caller)
     with as_problems():
         start, expected = await run_in_threadpool(_start, machines, name, base)
     given = {
@@ -210,6 +206,15 @@ def _kept(request: Request, name: str) -> IdentificationReport:
             f"measurements to /v1/machines/{name}/measurements.",
         )
     return found
+
+
+def _check_may_store(caller: Caller) -> None:
+    if not caller.may(Scope.ADMIN):
+        raise Problem(
+            403,
+            "Not allowed",
+            "Changing a machine requires a key with the `admin` scope; a trial does not.",
+        )
 
 
 async def _identified(

@@ -15,11 +15,13 @@ from stillpath.compensation.base import DesignError
 from stillpath.models.firmware import Marlin
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.file_motion import FileMotion
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.live_design import design_live, live_filter
 from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
-from stillpath.pipeline.simulate import simulate_file
+from stillpath.pipeline.piece_compensator import DT_S
+from stillpath.pipeline.simulate import simulate_motion
 from tests.integrations.interrupted import two_objects
 
 pytestmark = pytest.mark.slow
@@ -67,7 +69,8 @@ def test_live_is_about_as_good_as_the_file(tmp_path: Path) -> None:
     source.write_text(two_objects())
     shaper = cached_shaper(machine, default_cache_dir())
     live = live_filter(machine, design_live(machine, shaper).taps)
-    ours = simulate_file(source, machine, live=live)
+    motion = FileMotion(source, None, machine, None, DT_S, None)
+    ours = simulate_motion(motion, live=live)
     file = compensate_file(source, tmp_path / "out.gcode", machine, Options())
     error = {
         kind: {c.name: c.extruding.contour_rms_um for c in result.channels}

@@ -87,7 +87,7 @@ def test_a_full_disk_loses_no_job(small_disk: Path, monkeypatch: pytest.MonkeyPa
         for answer in refused:
             assert answer.status_code == 507
             assert "16 MiB stay free" in answer.json()["detail"]
-            assert "Delete jobs" in answer.json()["detail"]
+            assert "Delete finished jobs" in answer.json()["detail"]
 
         assert until(lambda: client.get("/readyz").json().get("part") == "disk", 60)
         fill(foreign)

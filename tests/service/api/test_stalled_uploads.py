@@ -103,7 +103,7 @@ def test_who_has_been_silent_for_long_yields_his_place(monkeypatch: pytest.Monke
         await upload((0, 1), more=False)
         await silent
         assert len(ended) == 1
-        assert "its place was given to another one" in ended[0]
+        assert "its slot was given to another one" in ended[0]
         await lively
 
     asyncio.run(ask())
