@@ -277,7 +277,10 @@ class Interpreter:
         state.span = (start, end - 1 if self._text[end - 1 : end] == b"\n" else end)
         commands = self._split(text)
         if len(commands) > 1:
-            return self._several(commands)
+            state.remembers = False  # what one of them does is not what the line does
+            status = self._several(commands)
+            state.remembers = True
+            return status
         (command,) = commands
         if not command.name and not (command.words and self.dialect.modal_words):
             return note_comment(state, command)
@@ -364,7 +367,10 @@ class Interpreter:
         return execute(int(action), state.w, mask, state.f, state.i, state.rows, state.tables)
 
     def _several(self, commands: list[Command]) -> int:
-        """Carry out the commands of one line; it stays whole, so its moves are not ours."""
+        """Carry out the commands of one line; it stays whole, so its moves are not ours.
+
+        Nor are modes and limits that it sets: none of it may be held back.
+        """
         state, i = self.state, self.state.i
         before = state.f.copy(), i.copy()
         events, moves = int(i[at.I_EVENTS]), int(i[at.I_MOVES])
@@ -387,6 +393,8 @@ class Interpreter:
         state.settle()
         if i[at.I_MOVES] > moves:
             state.rows.tiny[at.M_KNOWN, moves : int(i[at.I_MOVES])] &= KEPT
+        elif worst in (EventKind.MODE, EventKind.LIMITS):
+            worst = EventKind.STATE
         if i[at.I_MOVES] == moves or worst >= EventKind.STOP:
             known = int(i[at.I_KNOWN])
             state.event(worst)

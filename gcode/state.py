@@ -111,6 +111,8 @@ class MachineState:
         self.carry_out: Callable[[Command], int] = nobody
         self.buffer = np.zeros(0, np.uint8)
         self.span = (0, 0)
+        self.remembers = True
+        """The line in hand is one command (`remember`)."""
         self.memos = 0
         self.memo_limits = 0
 
@@ -246,7 +248,8 @@ class MachineState:
 
     def remember(self, command: Command, what: int, value: int) -> bool:
         """Have the kernel do the same whenever the line comes again."""
-        if self.memos >= _MEMOS // 2 or self.conditional_indent >= 0 or command.dropped:
+        known_whole = self.remembers and self.conditional_indent < 0 and not command.dropped
+        if self.memos >= _MEMOS // 2 or not known_whole:
             return False
         key = line_hash(self.buffer, *self.span)
         slot = memo_slot(self.tables.memo_keys, key)

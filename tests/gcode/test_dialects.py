@@ -461,3 +461,15 @@ def test_hop(read) -> None:
 def test_lines_in_inches_stay_as_they_are(read) -> None:
     block, _ = read("G1 X1 F600\nG20\nG1 X1\nG21\nG1 X1\n", "marlin")
     assert (block.moves.known & 8).tolist() == [0, 8, 0]
+
+
+def test_lines_of_several_commands_are_none_of_them(read) -> None:
+    """What the first one does is not remembered for the line; nor is fan or mode held back."""
+    line = "M106 S1 G1 X{0}\nM106 S1 M204 P{0}\nM83 M204 P{0}\nM204 P900\n"
+    text = "".join(line.format(k) for k in (10, 20, 10, 20))
+    block, _ = read(text, "reprapfirmware")
+    assert block.moves.end_mm[:, 0].tolist() == [10, 20, 10, 20]
+    kinds = [EventKind.STATE, EventKind.STATE, EventKind.LIMITS]
+    assert block.events.kind.tolist() == kinds * 4
+    accels = [block.limits[k].print_accel_mm_s2 for k in block.events.limits_id]
+    assert accels == [10, 10, 900, 20, 20, 900] * 2
