@@ -144,6 +144,13 @@ class StreamCommands(Protocol):
     def advance(self, limits: Limits) -> bytes:
         """Lines that set pressure advance of the tool in use, if `shaper_off` turns it off."""
 
+    def advance_aside(self, limits: Limits) -> bytes:
+        """Lines that set pressure advance while the shaper stays off; empty: it is on, or 0."""
+
+    @property
+    def advance_off(self) -> bytes:
+        """Lines after which it is off again, if the limits of a stream do not see to it."""
+
     def conflict(self, line: bytes) -> str | None:
         """Return why a line must not stand in a file with a stream; None: it may."""
 

@@ -17,11 +17,11 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._writing_kernels import format_moves
 from stillpath.gcode.firmware.base import FirmwareAdapter
 from stillpath.gcode.firmware.encoding import Encoded
+from stillpath.gcode.firmware.file_shapers import FileShapers
 from stillpath.gcode.firmware.line_reader import (
     AXES,
     EXTRUSION,
     FEED,
-    NUMBERED,
     POSITIONING,
     SET_POSITION,
     LineReader,
@@ -33,10 +33,7 @@ from stillpath.gcode.types import EventKind, Limits, ModalState
 __all__ = ["StreamWriter"]
 
 _BYTES_PER_LINE = 96
-_VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
-_ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
-"""Pressure advance, which a stream has off like the shaper (RepRapFirmware)."""
 _LEAST_GAP_MM = 1e-7
 _FAR_MM = 10.0
 """32-bit floats hold a micrometre up to here."""
@@ -77,10 +74,9 @@ class StreamWriter:
         self._shaper_off = False
         self._marked: Limits | None = None
         """The file's limits, in force with the mark of a stream because the shaper stays off."""
-        self._shaper_lines: dict[bytes, bytes] = {}
-        """The file's own lines, the last of each form."""
-        self._shaper_names: dict[str, tuple[int, int]] = {}
-        """Commands of the file that set a shaper: number of the first line, and how many."""
+        self._advances = False
+        """Pressure advance is on, although the shaper is off."""
+        self._file_shapers = FileShapers()
         self._at_rest = True
         self._modal: ModalState | None = None
         """What the printer's modes are now, where they may differ from the file's."""
@@ -100,11 +96,7 @@ class StreamWriter:
                 "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
                 "is switched off and stays off; set it again after the print."
             )
-        if self._shaper_names:
-            said = ", ".join(
-                f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
-                for name, (line, count) in self._shaper_names.items()
-            )
+        if said := self._file_shapers.said:
             yield (
                 f"The file sets the firmware's input shaper: {said}. Compensation and shaper do "
                 "not add up: in compensated stretches it is off, around them as the file sets it."
@@ -113,10 +105,12 @@ class StreamWriter:
     @property
     def switching_off(self) -> bytes:
         """Lines that a piece that comes now begins with to switch the shaper off; often none."""
-        if self._streaming or self._shaper_off:
+        if self._streaming:
             return b""
+        if self._shaper_off:
+            return self._stream_commands.advance_off if self._advances else b""
         off = self._stream_commands.shaper_off
-        return off or (self._stream_commands.file_shaper_off if self._shaper_lines else b"")
+        return off or (self._stream_commands.file_shaper_off if self._file_shapers.lines else b"")
 
     def header(self) -> bytes:
         """Lines that say who processed the file, and what to mind."""
@@ -158,11 +152,7 @@ class StreamWriter:
             if events.kind[row] != EventKind.SHAPER or self._lines.is_move(line.split(b";", 1)[0]):
                 continue  # a line that moves too cannot be said again
             self._shaper_off = False
-            if not self._note_shaper(line, int(events.line[row])):
-                continue
-            form = _VALUE.sub(b"", line.split(b";", 1)[0])
-            others = {k: text for k, text in self._shaper_lines.items() if k != form}
-            self._shaper_lines = {**others, form: line.rstrip() + b"\n"}
+            self._file_shapers.note(line, int(events.line[row]))
         if len(moves):
             last_stop = events.move_index[stops(events)]
             stands = len(last_stop) > 0 and int(last_stop[-1]) == len(moves)
@@ -373,16 +363,6 @@ class StreamWriter:
         self._modal = replace(now, absolute_xyz=state.absolute_xyz, absolute_e=state.absolute_e)
         return text
 
-    def _note_shaper(self, line: bytes, number: int) -> bool:
-        """Note a line that sets the shaper; tell whether it does."""
-        words = NUMBERED.sub(b"", line).split()
-        name = words[0].decode("ascii", "replace").upper() if words else ""
-        if name.startswith(_ADVANCE):
-            return _FURTHER_SHAPER.search(line) is not None
-        first, count = self._shaper_names.get(name, (number, 0))
-        self._shaper_names[name] = (first, count + 1)
-        return True
-
     def _on(self, piece: Piece, limits: Limits) -> bytes:
         """Lines before the first segment of a piece."""
         parts: list[bytes] = []
@@ -392,7 +372,7 @@ class StreamWriter:
             parts.append(b"; stillpath: stream on\n")
             parts.append(self.switching_off)
             self._shaper_off = self._shaper_off or bool(self.switching_off)
-            self._marked = None
+            self._marked, self._advances = None, False
             parts.append(self._stream_commands.limits(limits))
             self._limits_now = limits
             self._streaming = True
@@ -456,30 +436,39 @@ class StreamWriter:
         """Set the firmware's shaper again before lines that print on their own.
 
         Firmwares stand still for it. Travel between two streams, as after an object mark, is not
-        worth that: the next stream takes care of its vibration.
+        worth that: the next stream takes care of its vibration. Nor is what somebody chose to leave
+        out, but its filament is the slicer's, and needs the firmware's pressure advance.
         """
         travel = verbatim.moves.end_mm - verbatim.moves.start_mm
         prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again
-        on = (prints and not aside) or foreign
-        return self._shaper_on(verbatim.limits_before) if on else b""
+        if (prints and not aside) or foreign:
+            return self._shaper_on(verbatim.limits_before)
+        return self._advance_on(verbatim.limits_before) if prints else b""
+
+    def _advance_on(self, limits: Limits) -> bytes:
+        if not self._shaper_off or not self._shaper_is_known or self._advances:
+            return b""
+        lines = self._stream_commands.advance_aside(limits)
+        self._advances = bool(lines)
+        return lines
 
     @property
     def _shaper_is_known(self) -> bool:
-        return self._stream_commands.shaper_on is not None or bool(self._shaper_lines)
+        return self._stream_commands.shaper_on is not None or bool(self._file_shapers.lines)
 
     def _shaper_on(self, limits: Limits) -> bytes:
         if not self._shaper_off:
             return b""
-        self._shaper_off = False
+        self._shaper_off = self._advances = False
         stated = self._stream_commands.shaper_on
         if not self._shaper_is_known:
             self._shaper_unknown = True
             self._shaper_off = True
             return b""
-        lines = (stated or b"") + b"".join(self._shaper_lines.values())
+        lines = (stated or b"") + b"".join(self._file_shapers.lines.values())
         advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance
 

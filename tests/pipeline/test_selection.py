@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -86,6 +87,27 @@ def test_the_firmwares_shaper_is_not_switched_between_walls(gear: Path, tmp_path
     target = tmp_path / "out.gcode"
     run(gear, target, Machine.model_validate(document), where="walls")
     assert target.read_bytes().count(b"SET_INPUT_SHAPER") <= 6
+
+
+@pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
+def test_what_is_left_out_has_the_firmwares_pressure_advance(
+    kind: str, gear: Path, tmp_path: Path
+) -> None:
+    """Streams have it in their filament, and the firmware's off; infill is the slicer's."""
+    document = ender3_with(kind).model_dump(mode="json") | {"pressure_advance_s": 0.05}
+    if kind == "marlin":
+        document["firmware"] |= {"linear_advance": True, "linear_advance_k_s": 0.05}
+        document["firmware"]["shaper"] = {"freq_x_hz": 45.0, "freq_y_hz": 35.0}
+    target = tmp_path / "out.gcode"
+    result = run(gear, target, Machine.model_validate(document), where="walls")
+    assert result.left_out_extruding_s > 20.0
+    advance_s, of_stream, of_file = 0.05, set(), set()
+    for line in target.read_bytes().splitlines():
+        if (match := re.match(rb"(?:M572 S|M900 K)([\d.]+)", line)) is not None:
+            advance_s = float(match[1])
+        elif re.match(rb"G1 .*[XY].* E\d", line):
+            (of_file if b";#" in line else of_stream).add(advance_s)
+    assert (of_stream, of_file) == ({0.0}, {0.05})
 
 
 def test_a_file_that_must_not_be_large(gear: Path, tmp_path: Path) -> None:

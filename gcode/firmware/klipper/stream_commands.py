@@ -31,6 +31,7 @@ class KlipperStreamCommands:
     one_command = True
     ignores_subcodes = False
     factors_need_axes = False
+    advance_off = b""
     shaper_off = b"SET_INPUT_SHAPER SHAPER_FREQ_X=0 SHAPER_FREQ_Y=0\n"
     file_shaper_off = shaper_off
 
@@ -52,6 +53,8 @@ class KlipperStreamCommands:
     def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
         """Return nothing: a stream leaves pressure advance on."""
         return b""
+
+    advance_aside = advance
 
     def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
         """Return None: nothing of Klipper's own stands in the way."""

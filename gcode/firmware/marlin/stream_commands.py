@@ -37,6 +37,7 @@ class MarlinStreamCommands:
     one_command = True
     ignores_subcodes = True
     factors_need_axes = False
+    advance_off = b""
     file_shaper_off = b"M593 F0\n"
 
     def __init__(self, firmware: Marlin) -> None:
@@ -80,8 +81,13 @@ class MarlinStreamCommands:
         ).encode()
 
     def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
-        """Return nothing: a stream leaves pressure advance on."""
+        """Return nothing: it comes with the limits."""
         return b""
+
+    def advance_aside(self, limits: Limits) -> bytes:
+        """Return the line that sets K, which `in_stream` has left off."""
+        k_s = cast(MarlinLimits, limits).linear_advance_k_s
+        return f"M900 K{_number(k_s)}\n".encode() if self._advances and k_s > 0.0 else b""
 
     def conflict(self, line: bytes) -> str | None:
         """Return why not, for a line that switches fixed-time motion on."""

@@ -44,7 +44,8 @@ class RepRapStreamCommands:
 
     def __init__(self, firmware: RepRapFirmware, pressure_advance_s: float) -> None:
         shaper = firmware.shaper
-        self.shaper_off = b'M593 P"none"\n' + _advance(0.0)
+        self.advance_off = _advance(0.0)
+        self.shaper_off = b'M593 P"none"\n' + self.advance_off
         self.file_shaper_off = self.shaper_off
         restored = 'M593 P"none"\n'
         if shaper.type != "none":
@@ -54,6 +55,10 @@ class RepRapStreamCommands:
     def advance(self, limits: Limits) -> bytes:
         """Return M572 for the tool in use."""
         return _advance(cast(RepRapLimits, limits).pressure_advance_s)
+
+    def advance_aside(self, limits: Limits) -> bytes:
+        """Return M572 for the tool in use, unless it is 0."""
+        return self.advance(limits) if cast(RepRapLimits, limits).pressure_advance_s > 0.0 else b""
 
     def conflict(self, line: bytes) -> str | None:  # noqa: ARG002
         """Return None: nothing of RepRapFirmware's own stands in the way."""

@@ -1,0 +1,50 @@
+"""The firmware's input shaper as the file itself sets it."""
+
+from __future__ import annotations
+
+import re
+
+from stillpath.gcode.firmware.line_reader import NUMBERED
+
+__all__ = ["FileShapers"]
+
+_VALUE = re.compile(rb"(?<=[SF=])\s*[-+.\d]+")
+_ADVANCE, _FURTHER_SHAPER = "M572", re.compile(rb"M593(?!\d)", re.IGNORECASE)
+"""Pressure advance, which a stream has off like the shaper (RepRapFirmware)."""
+
+
+class FileShapers:
+    """Lines of the file that set the shaper, to say them again after a stream.
+
+    Attributes
+    ----------
+    lines : dict of bytes to bytes
+        The last line of each form.
+    """
+
+    def __init__(self) -> None:
+        self.lines: dict[bytes, bytes] = {}
+        self._names: dict[str, tuple[int, int]] = {}
+        """Commands that set a shaper: number of the first line, and how many."""
+
+    def note(self, line: bytes, number: int) -> None:
+        """Note a line that sets the shaper, or pressure advance, which is no shaper."""
+        words = NUMBERED.sub(b"", line).split()
+        name = words[0].decode("ascii", "replace").upper() if words else ""
+        if name.startswith(_ADVANCE):
+            if _FURTHER_SHAPER.search(line) is None:
+                return
+        else:
+            first, count = self._names.get(name, (number, 0))
+            self._names[name] = (first, count + 1)
+        form = _VALUE.sub(b"", line.split(b";", 1)[0])
+        others = {k: text for k, text in self.lines.items() if k != form}
+        self.lines = {**others, form: line.rstrip() + b"\n"}
+
+    @property
+    def said(self) -> str:
+        """Which commands of the file set a shaper, and where; often none."""
+        return ", ".join(
+            f"{name} (line {line}{f' and {count - 1} more' if count > 1 else ''})"
+            for name, (line, count) in self._names.items()
+        )
