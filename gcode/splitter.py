@@ -217,7 +217,8 @@ class Splitter:
             lasting_s = np.cumsum(_shortest_s(moves))
             most = min(self._most_moves(moves, events), self._enough(moves, lasting_s))
             barrier = self._first_barrier(events, most)
-            closed = final or barrier is not None or len(kept) > 0 or most < count
+            full = len(events) > _MOST_EVENTS or len(self._text) > _MOST_BYTES
+            closed = final or barrier is not None or len(kept) > 0 or most < count or full
             end = min(count if barrier is None else barrier, most, *kept[:1].tolist())
             if not closed and lasting_s[-1] < self._longest_s:
                 return

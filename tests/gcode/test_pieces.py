@@ -12,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stillpath.gcode.errors import GcodeError
+from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
+from stillpath.gcode.splitter import Splitter
 from stillpath.gcode.types import EventKind
 from stillpath.models.machine import AxisTravel, Machine
 from stillpath.models.store import load_machine
@@ -185,8 +187,8 @@ def test_what_a_piece_holds_is_bounded(machine: Machine, between: bytes, kept: i
     data = HEAD.encode() + b"G1 X70\nG1 X60\n" + between + b"G1 X80\nG1 Y60\nG1 X85\n"
     items, whole = (cut(data, machine, chunk=chunk) for chunk in (1 << 18, 1 << 24))
     check(items, data)
-    assert [item.text for item in items] == [item.text for item in whole]
-    pieces = [item for item in items if isinstance(item, Piece)]
+    pieces, others = ([i for i in found if isinstance(i, Piece)] for found in (items, whole))
+    assert [item.text for item in pieces] == [item.text for item in others]
     assert len(pieces) == 3  # one in the head
     assert len(pieces[1].moves) == max(kept, 2)
     assert pieces[1].text.startswith(b"G1 X70\n")
@@ -341,3 +343,12 @@ def test_lines_that_must_find_the_file_s_own_state(kind: str, line: str) -> None
     *_, first, second = pieces_of(HEAD + f"G1 X70\nG1 X80\n{line}\nG1 X90\n", machine)
     assert line.encode() not in first.text + second.text
     assert first.moves.end_mm[-1, 0] == second.moves.start_mm[0, 0] == 80.0
+
+
+def test_comments_do_not_wait_for_the_next_move(machine: Machine) -> None:
+    """They were held until the next move, and copied for every block of the file."""
+    reader, splitter = Interpreter(machine), Splitter(machine)
+    text = b"G28\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 E1\n" + 200_000 * b";\n"
+    found = [item for block in reader.push(text) for item in splitter.push(block)]
+    assert any(isinstance(item, Piece) for item in found)
+    assert sum(len(item.text) for item in found) > len(text) / 2
