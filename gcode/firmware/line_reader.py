@@ -9,7 +9,8 @@ from stillpath.gcode.firmware.base import StreamCommands
 __all__ = ["AXES", "EXTRUSION", "FEED", "NUMBERED", "POSITIONING", "SET_POSITION", "LineReader"]
 
 AXES = re.compile(rb"[XYZ]", re.IGNORECASE)
-FEED = re.compile(rb"F\s*[-+.\d]", re.IGNORECASE)
+FEED = re.compile(rb"F\s*\+?[0.]*[1-9]", re.IGNORECASE)
+"""Marlin passes over what is not above 0; the others refuse it."""
 SET_POSITION = re.compile(rb"^\s*(?:N\d+\s*)?G92(?!\d)")
 POSITIONING = re.compile(rb"^\s*(?:N\d+\s*)?G\s*0*9[01](?!\d)")
 EXTRUSION = re.compile(rb"^\s*(?:N\d+\s*)?M\s*0*8[23](?!\d)")

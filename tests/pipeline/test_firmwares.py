@@ -164,3 +164,14 @@ def test_klipper_reads_marlins_flavour(tmp_path: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_bytes(b"; gcode_flavor = marlin2\nM205 X8 Y8\nM900 K.05\n" + body("marlin"))
     assert plan_file(source, tmp_path / "m.npz", load_machine("ender3")).warnings == []
+
+
+def test_a_rest_with_a_feedrate_that_marlin_passes_over(tmp_path: Path, cache: Path) -> None:
+    """It has the file's F, not the stream's."""
+    source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
+    lines = ("G28", "G90", "M83", "G1 X50 Y50 F3000", "G1 X90 E1", "G1 E-1 F0", "G1 X60 Y60")
+    data = tagged("\n".join([*lines, "G1 E1 F-5", "G1 X90 E1", ""]).encode())
+    source.write_bytes(data)
+    result = compensate_file(source, target, machine_with("marlin"), Options(), cache_dir=cache)
+    assert result.put_back == []
+    assert differences(data, target.read_bytes(), machine_with("marlin")) == []
