@@ -131,6 +131,7 @@ class Job:
             changing = self._work.compensator, self._verifier
         self._motion = MotionRecord(self._adapter.step_mm, self._measurement, self._sum, changing)
         ends = (self._writer.header(), self._writer.footer()) if self._changes else ()
+        self._sum.written = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum.warnings += doubts(source, machine, options.dialect)
         if options.budget_um is not None and not self._changes:
