@@ -48,7 +48,7 @@ DT_S = 1e-3
 _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
-_ACCEL_SHARES = (1.0, 0.8, 0.6)
+_ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
 """Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
 """Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
