@@ -104,8 +104,7 @@ def figures(work: Path) -> None:
     """Draw the figures of docs/figures.md."""
     kept = work / "gear.npz"
     _once(kept, "trajectories", GEAR, "--machine", "ender3", "-o", kept, "--from", 120, "--to", 150)
-    design = work / "design"
-    _once(design, "design", "--machine", "ender3", "--axis", "y", "--report", design)
+    design = _design(work)
     with np.load(kept) as file:
         motion = {name: np.asarray(file[name]) for name in file}
     worst = int(np.argmax(np.where(motion["extruding"] > 0, motion["before_contour_um"], 0.0)))
@@ -114,6 +113,13 @@ def figures(work: Path) -> None:
     _write("error.svg", error_over_time(motion, worst))
     _write("robustness.svg", robustness(json.loads((design / "design.json").read_text())))
     _write("printers.svg", printers((ROOT / "docs" / "benchmarks.md").read_text()))
+
+
+def _design(work: Path) -> Path:
+    """Return the folder of a design report."""
+    folder = work / "design"
+    _once(folder, "design", "--machine", "ender3", "--axis", "y", "--report", folder)
+    return folder
 
 
 def corner(motion: dict[str, Any], worst: int) -> str:
@@ -295,7 +301,7 @@ def screenshots(work: Path) -> None:
         _shoot(_opened(browser, report.as_uri(), height=1000), "report-tutorial.webp")
         fit = work / "tutorial" / "fit" / "identification.html"
         _shoot(_opened(browser, fit.as_uri(), height=1000), "identification.webp")
-        page = _opened(browser, (work / "design" / "design.html").as_uri(), height=1200)
+        page = _opened(browser, (_design(work) / "design.html").as_uri(), height=1200)
         _shoot(page, "design.webp")
         with running(work / "service") as service:
             page = _opened(browser, f"{service.url}/#/", height=860)
