@@ -41,7 +41,9 @@ from readback import (
 )
 from scipy.signal import ss2zpk
 
+from stillpath.applications.machines.checks import derived_envelope
 from stillpath.models.errors import ModelError
+from stillpath.models.firmware.klipper import Klipper
 from stillpath.models.friction import DryFriction
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.readers import ReadSettings, read_content
@@ -80,6 +82,7 @@ class Task:
     files: tuple[Path, ...]
     seconds: float
     oracle: bool
+    max_accel_mm_s2: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +143,11 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first one")
     parser.add_argument("--from", dest="source", choices=list(_GOALS), default="spectra")
     parser.add_argument("--seconds", type=float, default=90.0, help="of each print to judge")
+    parser.add_argument(
+        "--max-accel-mm-s2",
+        type=float,
+        help="of printer.cfg; the motors bear what follows from it (default: the built-in limits)",
+    )
     parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -153,7 +161,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
         files = tuple(plain_copy(find_input(name, shared), Path(folder)) for name in given.files)
         tasks = [
-            Task(kind, seed, given.source, files, given.seconds, given.oracle)
+            Task(
+                kind,
+                seed,
+                given.source,
+                files,
+                given.seconds,
+                given.oracle,
+                given.max_accel_mm_s2,
+            )
             for seed in range(given.first, given.first + given.printers)
             for kind in KINDS
         ]
@@ -202,7 +218,7 @@ def judged(task: Task) -> list[Row]:
     """Measure, identify and print on one printer."""
     printer = draw(task.kind, task.seed)
     rng = np.random.default_rng([KINDS.index(task.kind), task.seed, 1])
-    base = load_machine(BASES[task.kind])
+    base = limited(load_machine(BASES[task.kind]), task.max_accel_mm_s2)
     machine, shapers, note = identified(printer, base, task.source, rng)
     rows = []
     for file in task.files:
@@ -234,6 +250,17 @@ def judged(task: Task) -> list[Row]:
             )
         )
     return rows
+
+
+def limited(base: Machine, max_accel_mm_s2: float | None) -> Machine:
+    """Return the machine that a printer.cfg with such an acceleration leads to."""
+    if max_accel_mm_s2 is None:
+        return base
+    assert isinstance(base.firmware, Klipper)
+    planner = base.firmware.planner.model_copy(update={"max_accel_mm_s2": max_accel_mm_s2})
+    firmware = base.firmware.model_copy(update={"planner": planner})
+    machine = base.model_copy(update={"firmware": firmware})
+    return machine.model_copy(update={"command": derived_envelope(machine)})
 
 
 def identified(

@@ -16,7 +16,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion_of
 from stillpath.models.store import builtin_machines, load_machine
 from stillpath.pipeline.files import replacing
 from stillpath.pipeline.measuring import reference_shaper
@@ -29,11 +29,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
-    motion, extruding = reference_motion(DT_S)
     known = json.loads(FILE.read_text())["machines"] if FILE.exists() else {}
     found = {}
     for name in builtin_machines():
         machine = load_machine(name)
+        motion, extruding = reference_motion_of(machine, DT_S)
         best = reference_shaper.tune_shaper(machine, motion, DT_S, extruding)
         found[name] = {"revision": machine.revision, "shaper": asdict(best)}
         verdict = "" if known.get(name) == found[name] else "MISS"

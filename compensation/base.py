@@ -48,7 +48,10 @@ class Compensator(Protocol):
         ...
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration; return whether it can."""
+        """Ask for at most this share of the machine's acceleration; return whether it can.
+
+        0: for no more than the path itself asks for.
+        """
         ...
 
     def compensate(

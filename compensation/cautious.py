@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.fbf import PreviewFbf
+from stillpath.compensation.preview_axis import GENTLE_RUNG
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
@@ -49,6 +50,9 @@ class Caution:
 class CautiousFbf:
     """share * filtered basis functions + (1 - share) * shaper, axis by axis.
 
+    A shaper asks for no more than the path: where the motors bear no command of filtered basis
+    functions, or only one that follows the path worse, the shaper's is taken.
+
     Parameters
     ----------
     inner : PreviewFbf
@@ -74,6 +78,7 @@ class CautiousFbf:
             machine, dt_s, shaper=caution.shaper, fx_hz=caution.fx_hz, fy_hz=caution.fy_hz
         )
         self._shares = np.array(caution.shares)[:, None]
+        self._shaper_alone = False
         self._last = np.zeros((2, 0))
 
     @property
@@ -97,16 +102,31 @@ class CautiousFbf:
         """Do nothing: the plants of this machine stay."""
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration from now on."""
-        return self._inner.ease(accel_share)
+        """Ask for at most this share of the machine's acceleration from now on.
+
+        0: the shaper alone.
+        """
+        self._shaper_alone = accel_share == 0.0
+        return self._shaper_alone or self._inner.ease(accel_share)
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]
     ) -> Array:
         """See `compensation.base.Compensator.compensate`; both commands stand in the rests."""
-        exact = self._inner.compensate(y_d_mm, extruding, rests)
-        smooth = self._smoothing.compensate(y_d_mm, extruding, rests)
-        self._last = self._shares * exact + (1.0 - self._shares) * smooth
+        self._last = smooth = self._smoothing.compensate(y_d_mm, extruding, rests)
+        if not self._shaper_alone:
+            exact = self._inner.compensate(y_d_mm, extruding, rests)
+            mixed = self._shares * exact + (1.0 - self._shares) * smooth
+            # Bent into the machine's limits further than where the shares were chosen?
+            gentle = max(self._inner.rungs) > GENTLE_RUNG
+            if not gentle or self._better(mixed, smooth, y_d_mm, extruding):
+                self._last = mixed
         # Both end on the plan; sums of products may not, to the last bit.
         self._last[:, -1] = y_d_mm[:, -1]
         return self._last
+
+    def _better(
+        self, one: Array, other: Array, y_d_mm: Array, extruding: NDArray[np.bool_]
+    ) -> bool:
+        errors = [self._inner.contour_square(y_d_mm, u, extruding) for u in (one, other)]
+        return errors[0] <= errors[1]

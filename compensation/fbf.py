@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.compensation._sliding_kernels import contour_square
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.basis import BASES
 from stillpath.compensation.defaults import DEFAULT_BASIS
@@ -55,6 +56,8 @@ RMS_RATIO = 1.5
 _BOUNDED_SHARE = 0.2
 """Solve windows again within bounds if so few leave them; otherwise take a gentler design."""
 _BOUNDED_ROUNDS = 4
+_REACH_S, _STRIDE = 0.03, 7
+"""Of the distance of an answer from the path: how far along, and at which samples."""
 
 
 class PreviewFbf:
@@ -170,9 +173,9 @@ class PreviewFbf:
         """Do nothing: the plants of this machine stay."""
 
     def ease(self, accel_share: float) -> bool:
-        """Ask for at most this share of the machine's acceleration from now on."""
+        """Ask for at most this share of the machine's acceleration from now on; 0 is too little."""
         self._accel_share = accel_share
-        return True
+        return accel_share > 0.0
 
     def compensate(self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: Ints) -> Array:
         """Command of a piece that starts and ends standing still on the path.
@@ -220,6 +223,22 @@ class PreviewFbf:
                 self._axes, self._last, tasks, chosen, extruding, self.along, self._dt_s
             )
         return np.stack([command.position_mm for command in self._last])
+
+    def contour_square(
+        self, y_d_mm: Array, command_mm: Array, extruding: NDArray[np.bool_]
+    ) -> float:
+        """Return the mean squared error [mm2] across a path (2, n) of a piece's command.
+
+        Over the plants designed for, those of X and Y side by side, and over extruding motion.
+        """
+        count = max(axis.members for axis in self._axes)
+        reach = round(_REACH_S / self._dt_s)
+        total = 0.0
+        for j in range(count):
+            rows = zip(self._axes, command_mm, strict=True)
+            y = np.stack([axis.answer(j % axis.members, row) for axis, row in rows])
+            total += contour_square(y_d_mm, y, extruding, reach, _STRIDE)
+        return total / count
 
     def accel_limits_mm_s2(self, y_d_mm: Array) -> tuple[float, float]:
         """Acceleration that the command of X and of Y may ask for on a path (2, n)."""
@@ -286,7 +305,8 @@ class PreviewFbf:
         raise DesignError(
             f"axis {axis.name}: even the gentlest design asks for {asked}; allowed are "
             f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
-            f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the machine)"
+            f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the machine; "
+            "docs/proof.md tells how to measure what its motors bear)"
         )
 
 

@@ -11,7 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["reference_motion"]
+from stillpath.models.machine import Machine
+
+__all__ = ["reference_motion", "reference_motion_of"]
 
 Array = NDArray[np.float64]
 
@@ -27,21 +29,40 @@ _FIGURES = (
 _REST_S = 0.15
 
 
-def reference_motion(dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
+def reference_motion_of(machine: Machine, dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the reference motion as the firmware of a machine would plan it.
+
+    What it would never plan tells nothing of the machine.
+    """
+    firmware = machine.firmware
+    return reference_motion(dt_s, firmware.fastest_mm_s, firmware.largest_accel_mm_s2)
+
+
+def reference_motion(
+    dt_s: float = 1e-3, fastest_mm_s: float = math.inf, largest_accel_mm_s2: float = math.inf
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return the path, shape (2, n) in mm, and where it extrudes, shape (n,).
 
-    About 25 s around the origin; it starts and ends at rest, and rests between the figures.
+    About 25 s around the origin, longer within low limits; it starts and ends at rest, and rests
+    between the figures.
+
+    Parameters
+    ----------
+    dt_s : float
+    fastest_mm_s, largest_accel_mm_s2 : float
+        Limits of speed and acceleration; from 250 mm/s and 5000 mm/s2 they change nothing.
     """
     path, extruding = [np.zeros((2, 1))], [np.zeros(1, bool)]
     here = np.zeros(2)
-    for speed, accel, size in _FIGURES:
+    for printing_mm_s, printing_mm_s2, size in _FIGURES:
         for figure in (_square(size), _zigzag(size), _circle(size / 2), _circle(size / 6)):
             away = np.stack([here, figure[:, 0]], axis=1)
             for line, feeds, v, a in (
                 (away, False, _TRAVEL_MM_S, _TRAVEL_MM_S2),
-                (figure, True, speed, accel),
+                (figure, True, printing_mm_s, printing_mm_s2),
             ):
-                samples = _drive(line, v, a, dt_s)
+                speed, accel = min(v, fastest_mm_s), min(a, largest_accel_mm_s2)
+                samples = _drive(line, speed, accel, dt_s)
                 path.append(samples)
                 extruding.append(np.full(samples.shape[1], feeds))
             here = figure[:, -1]

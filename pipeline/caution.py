@@ -25,9 +25,9 @@ from stillpath.compensation.fbf import PreviewFbf
 from stillpath.compensation.friction import against_friction
 from stillpath.compensation.shapers import ShaperCompensator
 from stillpath.models.friction import DryFriction
-from stillpath.models.machine import Machine
+from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion_of
 from stillpath.pipeline.files import replacing
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 7
+_VERSION = 8
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
@@ -194,12 +194,12 @@ def choose_caution(
 
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
-    path, extruding = reference_motion(dt_s)
+    path, extruding = reference_motion_of(machine, dt_s)
     no_rests = np.zeros((0, 2), np.int64)
     exact = designed(
         Options(),
         "ensemble",
-        lambda mode: PreviewFbf(machine, dt_s, basis=basis, robust=mode),
+        lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode),
     )
     exact.reset(path[:, 0])
     smooth = ShaperCompensator(
@@ -253,6 +253,22 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
         "shaper": commands[1],
     }
     return replace(best, ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+
+
+def _strong(machine: Machine) -> Machine:
+    """Return the machine with motors that bear what most do.
+
+    How far its plants are known is asked here; what its motors bear, every piece of a print is
+    asked by itself (`compensation.cautious`).
+    """
+    usual, own = CommandLimits(), machine.command
+    command = usual.model_copy(
+        update={
+            "velocity_mm_s": max(usual.velocity_mm_s, own.velocity_mm_s),
+            "accel_mm_s2": max(usual.accel_mm_s2, own.accel_mm_s2),
+        }
+    )
+    return machine.model_copy(update={"command": command})
 
 
 def error_ranges(

@@ -22,7 +22,7 @@ from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_mo
 from stillpath.compensation.shapers import shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion_of
 from stillpath.pipeline.caution import (
     error_ranges,
     measured_set,
@@ -41,7 +41,7 @@ __all__ = ["LiveDesign", "cached_live_design", "design_live", "live_filter"]
 Array = NDArray[np.float64]
 
 DT_S = 1e-3
-_VERSION = 2
+_VERSION = 3
 """Part of the cache's name; rises when the design changes."""
 _CORNERS_HZ = (70.0, 90.0, 115.0, 150.0, 200.0, 270.0)
 _REACHES = (80, 160)
@@ -177,7 +177,7 @@ class _Trial:
 
     def __init__(self, machine: Machine, shaper: BestShaper) -> None:
         self._machine, self._shaper = machine, shaper
-        path, extruding = reference_motion(DT_S)
+        path, extruding = reference_motion_of(machine, DT_S)
         centre = [sum((machine.travel[a].min_mm, machine.travel[a].max_mm)) / 2 for a in ("x", "y")]
         self._path = path + np.array(centre)[:, None]
         self._at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]

@@ -187,6 +187,9 @@ class PieceCompensator:
         for soft_s in _SOFT_S:
             with contextlib.suppress(_Sudden, DesignError):
                 return self._compensate(piece, soft_s)
+        if self.compensator.ease(0.0):
+            with contextlib.suppress(_Sudden, DesignError):
+                return self._compensate(piece)
         assert first is not None
         raise first
 

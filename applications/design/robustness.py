@@ -17,7 +17,7 @@ from stillpath.compensation.shapers import shape, shaper_pulses
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSpec, WeightedMember, discretise, plant_set
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion_of
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.simulation.measures import Tally, contour_error
 from stillpath.simulation.response import response
@@ -62,7 +62,7 @@ class Trial:
         motion: tuple[Array, NDArray[np.bool_]] | None = None,
         errors_percent: Sequence[float] = (),
     ) -> None:
-        path, extruding = motion or reference_motion(dt_s)
+        path, extruding = motion or reference_motion_of(machine, dt_s)
         pad = _STRIDE * round(STAND_S / dt_s / _STRIDE)
         self.y_d_mm = np.pad(path, ((0, 0), (pad, pad)), mode="edge")
         self.extruding = np.pad(extruding, pad)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion_of
 from stillpath.simulation.measures import Tally, contour_error, distance_to_path, tracking_error
 from stillpath.simulation.response import response
 
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _ZETA = 0.1
-_VERSION = 1
+_VERSION = 2
 """Part of the cache's name; rises when the definition changes."""
 _SHIPPED, _SHIPPED_US = Path(__file__).with_name("reference_shapers.json"), 1000
 _COARSE = 4
@@ -161,7 +161,7 @@ def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> Best
         found = BestShaper(**json.loads(path.read_text(encoding="utf-8")))
         if found.type in SHAPERS and min(found.fx_hz, found.fy_hz) > 0:
             return found
-    y_d, extruding = reference_motion(dt_s)
+    y_d, extruding = reference_motion_of(machine, dt_s)
     best = tune_shaper(machine, y_d, dt_s, extruding)
     directory.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=directory, prefix=path.stem, suffix=".tmp")

@@ -9,8 +9,12 @@ from stillpath.compensation.base import DesignError
 from stillpath.compensation.cautious import Caution
 from stillpath.compensation.registry import compensator
 from stillpath.compensation.shapers import ShaperCompensator
+from stillpath.models.machine import Machine
+from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
+from stillpath.simulation.measures import contour_error
+from stillpath.simulation.response import response
 
 DT_S = 1e-3
 NO_RESTS = np.zeros((0, 2), np.int64)
@@ -66,3 +70,38 @@ def test_the_machine_follows_the_mixture() -> None:
 def test_shares_are_shares() -> None:
     with pytest.raises(DesignError, match=r"\(1.2, 0.0\): 0 to 1"):
         compensator("fbf", MACHINE, DT_S, caution=caution(1.2, 0.0))
+
+
+def limited(accel_mm_s2: float) -> Machine:
+    command = MACHINE.command.model_copy(update={"accel_mm_s2": accel_mm_s2})
+    return MACHINE.model_copy(update={"command": command})
+
+
+def test_where_the_motors_allow_no_better_the_shaper_s_command_is_taken() -> None:
+    """With as much acceleration as the path itself, what is left of the compensation is bent."""
+    path, extruding = reference_motion(DT_S, 250.0, 3000.0)
+    plants = [plant_set(MACHINE.axes[axis].without_delay(), DT_S).nominal for axis in ("x", "y")]
+    shaped = ShaperCompensator(MACHINE, DT_S, shaper="zv", fx_hz=46.0, fy_hz=33.0)
+    smooth = shaped.compensate(path, extruding, NO_RESTS)
+    shares = Caution((1.0, 1.0), "zv", 46.0, 33.0)
+    errors = []
+    for accel in (20_000.0, 3300.0):
+        one = compensator("fbf", limited(accel), DT_S, robust="off", caution=shares)
+        one.reset(path[:, 0])
+        try:
+            command = one.compensate(path, extruding, NO_RESTS)
+        except DesignError:
+            assert accel < 4000.0
+            assert one.ease(0.0)
+            command = one.compensate(path, extruding, NO_RESTS)
+        assert np.abs(np.diff(command, 2)).max() / DT_S**2 <= accel * (1 + 1e-6)
+        errors.append(contour_error(path, response(plants, command), DT_S)[extruding])
+    free, bent = (float(np.sqrt(np.mean(e**2))) for e in errors)
+    of_shaper = contour_error(path, response(plants, smooth), DT_S)[extruding]
+    assert free < 0.5 * bent
+    assert bent <= float(np.sqrt(np.mean(of_shaper**2))) * (1 + 1e-9)
+
+
+def test_only_a_shaper_can_ask_for_no_more_than_the_path() -> None:
+    assert compensator("fbf", MACHINE, DT_S, caution=caution(0.5, 0.5)).ease(0.0)
+    assert not compensator("fbf", MACHINE, DT_S).ease(0.0)

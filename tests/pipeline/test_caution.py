@@ -17,7 +17,7 @@ from stillpath.models.plants import (
     WeightedMember,
     plant_set,
 )
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.reference_motion import reference_motion, reference_motion_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.caution import (
     caution_for,
@@ -93,6 +93,33 @@ def test_no_member_fares_worse_than_with_the_shaper(name: str, tmp_path: Path) -
         a, b = (contour_um(machine, command, member) for command in commands)
         assert a <= b
         assert a < contour_um(machine, path, member)
+
+
+def slow(machine: Machine, planned_mm_s2: float, borne_mm_s2: float) -> Machine:
+    """A machine whose printer.cfg says less than most."""
+    firmware = machine.firmware
+    planner = firmware.planner.model_copy(update={"max_accel_mm_s2": planned_mm_s2})
+    return machine.model_copy(
+        update={
+            "firmware": firmware.model_copy(update={"planner": planner}),
+            "command": machine.command.model_copy(update={"accel_mm_s2": borne_mm_s2}),
+        }
+    )
+
+
+@pytest.mark.parametrize(("planned_mm_s2", "borne_mm_s2"), [(3000, 4500), (1000, 1500), (500, 500)])
+def test_a_machine_is_tried_within_its_own_limits(
+    planned_mm_s2: float, borne_mm_s2: float, tmp_path: Path
+) -> None:
+    """It once was on motion at 5000 mm/s2, which no command can follow within less."""
+    usual = choose_caution(machine_of(45.0, 44.5, 45.5), shaper(45.0), tmp_path, DT_S)[1]
+    machine = slow(machine_of(45.0, 44.5, 45.5), planned_mm_s2, borne_mm_s2)
+    choice = choose_caution(machine, shaper(45.0), tmp_path, DT_S)[1]
+    assert choice.shares == usual.shares
+    assert choice.worst < 1.2 * usual.worst
+    path, extruding = reference_motion_of(machine, DT_S)
+    accel = np.abs(np.diff(path, 2)).max(axis=0)[extruding[1:-1]] / DT_S**2
+    assert np.median(accel[accel > 1.0]) <= planned_mm_s2
 
 
 def test_chosen_once(tmp_path: Path) -> None:
