@@ -243,10 +243,12 @@ class Client:
         OSError
             If the file cannot be written.
         """
-        job_id = job if isinstance(job, str) else job.id
+        if isinstance(job, str):
+            job = self.job(job)
         target = Path(target)
         with replacing(target) as temporary:
-            self._connection.download(_path(job_id, "result"), temporary, tell)
+            path = _path(job.id, "result")
+            self._connection.download(path, temporary, tell, size_bytes=job.result_bytes)
         return target
 
     def report(self, job_id: str) -> dict[str, Any]:

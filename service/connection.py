@@ -88,8 +88,8 @@ class Connection:
     def __init__(
         self, server: str, key: str | None, *, timeout_s: float, patience_s: float
     ) -> None:
-        parts = urlsplit(server)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        host = _host_of(server)
+        if host is None:
             raise ClientError(
                 f"{server!r} is not the address of a server; one looks like http://127.0.0.1:8000",
                 400,
@@ -107,7 +107,7 @@ class Connection:
             headers=headers,
             timeout=timeout_s,
             follow_redirects=False,
-            trust_env=parts.hostname not in ("localhost", "127.0.0.1", "::1"),
+            trust_env=host not in ("localhost", "127.0.0.1", "::1"),
         )
 
     def close(self) -> None:
@@ -122,7 +122,7 @@ class Connection:
         """Return the answer to a request; `Broken` if another try may bring it."""
         try:
             answer = self._http.request(method, path, **request)
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             raise Broken(_reason(error)) from None
         self._check(answer)
         return answer
@@ -174,11 +174,13 @@ class Connection:
                     raise NoEvents
                 lines = takewhile(lambda _: may_be_silent(deadline), answer.iter_lines())
                 yield from _parsed(lines)
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             raise Broken(_reason(error)) from None
 
-    def download(self, path: str, target: Path, tell: Tell | None) -> None:
-        """Write an answer to a file, in several goes if need be."""
+    def download(
+        self, path: str, target: Path, tell: Tell | None, size_bytes: int | None = None
+    ) -> None:
+        """Write an answer to a file, in several goes if need be; its size may be known."""
         with target.open("wb") as file:
             download = _Download(path, file)
             for attempts_left in reversed(range(_FETCHES)):
@@ -190,6 +192,12 @@ class Connection:
                         reason = f"{path} cannot be fetched from {self.server}: {cut}"
                         raise ClientError(reason) from None
                     time.sleep(FIRST_PAUSE_S)
+            came_bytes = file.tell()
+        if size_bytes is not None and came_bytes != size_bytes:
+            raise ClientError(
+                f"{path} came with {came_bytes} instead of {size_bytes} bytes from {self.server}: "
+                "something on the way answers in its stead, as a proxy with a page to log in"
+            )
         named = (download.tag or "").strip('"')
         if len(named) == 64 and named != download.digest.hexdigest():
             raise ClientError(f"{path} came damaged from {self.server}; fetch it again")
@@ -242,9 +250,9 @@ class Connection:
                         if tell is not None:
                             share = file.tell() / expected if expected > 0 else None
                             tell("fetching", share)
-                except httpx2.TransportError as error:
+                except httpx2.RequestError as error:
                     raise _Cut(_reason(error)) from None
-        except httpx2.TransportError as error:
+        except httpx2.RequestError as error:
             raise Broken(_reason(error)) from None
         if file.tell() != expected >= 0:
             raise _Cut(f"{file.tell()} of {expected} bytes came")
@@ -262,6 +270,15 @@ class _Download:
     file: IO[bytes]
     digest: hashlib._Hash = field(default_factory=hashlib.sha256)
     tag: str | None = None
+
+
+def _host_of(server: str) -> str | None:
+    try:
+        parts = urlsplit(server)
+        fits = parts.scheme in ("http", "https") and parts.port != 0
+    except ValueError:  # a port that is no number, half an IPv6 address
+        return None
+    return parts.hostname or None if fits else None
 
 
 def _parsed(lines: Iterator[str]) -> Iterator[dict[str, str]]:

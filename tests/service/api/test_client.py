@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
 from tests.service.test_server import PRETEND, ROOT, server, until
 
@@ -106,7 +107,9 @@ def test_cancelling_and_giving_up(client: Client, tmp_path: Path):
     assert client.job(again.id).state == "cancelled"
 
 
-@pytest.mark.parametrize("address", ["nas:8000", "ftp://nas", "http://", ""])
+@pytest.mark.parametrize(
+    "address", ["nas:8000", "ftp://nas", "http://", "", "http://[::1", "http://nas:80a0"]
+)
 def test_what_is_no_address(address: str):
     with pytest.raises(ClientError, match="http://127"):
         Client(address)
@@ -153,10 +156,12 @@ def read_body(handler: Handler) -> bytes:
 
 
 def job_document(**fields: Any) -> bytes:
-    from stillpath.service.api.schemas import JobView
-
     (example,) = JobView.model_config["json_schema_extra"]["examples"]
     return json.dumps(example | fields).encode()
+
+
+def done_job(result_bytes: int) -> JobView:
+    return JobView.model_validate_json(job_document(state="done", result_bytes=result_bytes))
 
 
 def test_an_upload_is_repeated_with_the_same_key(tmp_path: Path):
@@ -193,7 +198,7 @@ def test_a_broken_download_is_taken_up_again_or_told(tmp_path: Path):
             handler.give(206, content[3000:], ETag=tag)
 
     with pretending(answer) as address, Client(address) as client:
-        client.fetch("a" * 32, tmp_path / "out")
+        client.fetch(done_job(len(content)), tmp_path / "out")
     assert (tmp_path / "out").read_bytes() == content
     assert asked == [None, "bytes=3000-"]
 
@@ -205,8 +210,34 @@ def test_a_broken_download_is_taken_up_again_or_told(tmp_path: Path):
         Client(address) as client,
         pytest.raises(ClientError, match="damaged"),
     ):
-        client.fetch("a" * 32, tmp_path / "other")
+        client.fetch(done_job(len(content)), tmp_path / "other")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_page_to_log_in_is_no_result(tmp_path: Path):
+    def answer(handler: Handler) -> None:
+        if handler.path.endswith("/result"):
+            handler.give(200, b"<html>log in", Content_Type="text/html")
+        else:
+            handler.give(200, job_document(state="done", result_bytes=7000))
+
+    with pretending(answer) as address, Client(address) as client:
+        for job in (done_job(7000), "a" * 32):
+            with pytest.raises(ClientError, match="12 instead of 7000 bytes"):
+                client.fetch(job, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_answer_that_cannot_be_unpacked_is_told():
+    def answer(handler: Handler) -> None:
+        handler.give(200, b"no gzip", Content_Encoding="gzip")
+
+    with (
+        pretending(answer) as address,
+        Client(address, patience_s=0.3) as client,
+        pytest.raises(ClientError, match="no answer from"),
+    ):
+        client.machines()
 
 
 def test_it_asks_where_events_do_not_come_through():
