@@ -400,16 +400,19 @@ class Service:
         timeout_s: float = 60.0,
         tell: Callable[[str, float | None], object] = lambda _stage, _share: None,
     ) -> None:
-        parts = urlsplit(address)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
+        address, key = address.strip().rstrip("/"), key.strip()
+        host = _host_of(address)
+        if not host:
             raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
-        self._address = address.rstrip("/")
+        if not (key.isascii() and key.isprintable()):
+            raise Failure("the key holds characters that no key has; copy it anew")
+        self._address = address
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
         self._tell = tell
         # A key must not follow a redirection to somewhere else, and no proxy leads to ourselves.
         handlers: list[Any] = [_Web()]
-        if parts.hostname in ("localhost", "127.0.0.1", "::1"):
+        if host in ("localhost", "127.0.0.1", "::1"):
             handlers.append(urllib.request.ProxyHandler({}))
         self._opener = urllib.request.build_opener(*handlers)
 
@@ -438,10 +441,7 @@ class Service:
         job = self._send(source, options)
         path = f"/v1/jobs/{job}"
         try:
-            self._wait(path, wait_s)
-            self._ask(
-                "GET", f"{path}/result", self._timeout_s, take=lambda a: self._save(a, target)
-            )
+            self._fetch(path, self._wait(path, wait_s), target)
             return self._ask("GET", f"{path}/report", self._timeout_s)
         finally:
             self._forget(path)
@@ -459,13 +459,14 @@ class Service:
             raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
         return str(job["id"])
 
-    def _wait(self, path: str, wait_s: float | None) -> None:
+    def _wait(self, path: str, wait_s: float | None) -> dict[str, Any]:
+        """Return the job when it is done."""
         began, pause_s = time.monotonic(), 0.1
         while True:
             job = self._document(self._ask("GET", path, self._timeout_s))
             state = job.get("state")
             if state == "done":
-                return
+                return job
             if state in ("failed", "cancelled"):
                 problem = job.get("error") or {}
                 reason = problem.get("detail", f"the job was {state} on the server")
@@ -478,15 +479,22 @@ class Service:
             time.sleep(pause_s)
             pause_s = min(1.5 * pause_s, self._LONGEST_PAUSE_S)
 
-    def _save(self, answer: Any, target: Path) -> bytes:
-        expected, read = int(answer.headers.get("Content-Length") or -1), 0
-        with target.open("wb") as file:
-            while chunk := _read(answer, 1 << 18):
-                read += file.write(chunk)
-                self._tell("fetching", read / expected if expected > 0 else None)
-        if not read or read != expected >= 0:
-            raise _Broken(f"{read} of {expected} bytes came")
-        return b""
+    def _fetch(self, path: str, job: Mapping[str, Any], target: Path) -> None:
+        """Write the result of a job to a file, all of it and nothing else."""
+        expected = int(job.get("result_bytes") or 0)
+
+        def save(answer: Any) -> bytes:
+            read = 0
+            with target.open("wb") as file:
+                while chunk := _read(answer, 1 << 18):
+                    read += file.write(chunk)
+                    self._tell("fetching", min(read / max(expected, 1), 1.0))
+            # What a proxy answers instead may well be whole: only the job knows the size.
+            if not read or read != expected:
+                raise _Broken(f"{read} of {expected} bytes came")
+            return b""
+
+        self._ask("GET", f"{path}/result", self._timeout_s, take=save)
 
     def _forget(self, path: str) -> None:
         """Delete the job, unless it is gone, or the server: nobody wants it any more."""
@@ -561,6 +569,16 @@ class Service:
 
 class _Broken(Exception):
     """There is no answer, or not all of it: another try may bring it."""
+
+
+def _host_of(address: str) -> str:
+    """Return the host of an address that a server may have, or an empty text."""
+    try:
+        parts = urlsplit(address)
+        fits = parts.scheme in ("http", "https") and parts.port != 0 and parts.path.isascii()
+    except ValueError:  # a port that is no number, half an IPv6 address
+        return ""
+    return (parts.hostname or "") if fits and address.isprintable() and " " not in address else ""
 
 
 def _read(answer: Any, size: int | None = None) -> bytes:

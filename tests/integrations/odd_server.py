@@ -1,15 +1,15 @@
 """The real server, with a pretended pipeline and something odd before it: `odd_server.py DATA_DIR`.
 
 What is odd is told by the beginning of the path: /key wants the key "secret", with /short results
-break off, with /lost a part of the upload gets lost, /moved is somewhere else. All other paths are
-those of the real server.
+break off, with /login a page comes instead of them, with /lost a part of the upload gets lost,
+/moved is somewhere else. All other paths are those of the real server.
 """
 
 import json
 import sys
 from pathlib import Path
 
-ODDITIES = ("key", "short", "lost", "moved")
+ODDITIES = ("key", "short", "login", "lost", "moved")
 
 
 def odd(app):
@@ -25,6 +25,8 @@ def odd(app):
             await answer(send, 401, {"detail": "This key is unknown here."})
         elif oddity == "moved":
             await answer(send, 308, {}, (b"location", b"http://elsewhere.invalid/"))
+        elif oddity == "login" and path.endswith("/result"):
+            await answer(send, 200, {}, (b"content-type", b"text/html"))
         else:
             await app(scope, receive, Changed(send, scope["path"], oddity))
 

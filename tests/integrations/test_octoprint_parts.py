@@ -269,6 +269,7 @@ def test_one_after_the_other(bench: Callable[..., Bench], running: Running):
         ({}, "../jobs", ("../jobs",)),
         ({"key": "wrong", "odd": "key"}, "ender3", ("key", "401")),
         ({"odd": "short"}, "ender3", ("no answer", "bytes came")),
+        ({"odd": "login"}, "ender3", ("no answer", "2 of", "bytes came")),
         ({"odd": "lost"}, "ender3", ("bytes arrived",)),
         ({"odd": "moved"}, "ender3", ("moved to http://elsewhere.invalid/",)),
         ({"address": "http://127.0.0.1:9"}, "ender3", ("no answer from http://127.0.0.1:9",)),

@@ -157,7 +157,14 @@ def test_a_server_that_is_something_else(part: Path, tmp_path: Path):
         done = post("--server", address, "--machine", "ender3", part, home=tmp_path)
         s.shutdown()
     assert_reason(done, 1, "501")
-    for address in ("nas:8000", "ftp://nas", "http://"):
+    for address in (
+        "nas:8000",
+        "ftp://nas",
+        "http://",
+        "http://[::1",
+        "http://nas:80a0",
+        "http://ä/ö",
+    ):
         done = post("--server", address, "--machine", "ender3", part, home=tmp_path)
         assert_reason(done, 2, address, "http://127.0.0.1:8000")
     assert_untouched(part)
@@ -218,10 +225,14 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
         done = post(*arguments, *wrong, part, home=tmp_path)
         assert_reason(done, 2, "does not accept the key (401): This key is unknown here.")
         assert "guessed" not in done.stderr + done.stdout
+    for garbled in ("gues\nsed", "gues–sed"):
+        done = post(*arguments, part, home=tmp_path, STILLPATH_KEY=garbled)
+        assert_reason(done, 2, "the key holds characters that no key has")
+        assert "gues" not in done.stderr + done.stdout
     assert_untouched(part)
     assert post(*arguments, "--key", "secret", part, home=tmp_path).returncode == 0
     part.write_bytes(TEXT)
-    assert post(*arguments, part, home=tmp_path, STILLPATH_KEY="secret").returncode == 0
+    assert post(*arguments, part, home=tmp_path, STILLPATH_KEY="secret\n").returncode == 0
     part.write_bytes(TEXT)
     settings = tmp_path / "settings.toml"
     settings.write_text(f'server = "{arguments[1]}"\nkey = "secret"\nmachine = "ender3"\n')
@@ -231,7 +242,12 @@ def test_keys(running: Running, part: Path, tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("oddity", "code", "word"),
-    [("short", 1, "bytes came"), ("lost", 1, "arrived"), ("moved", 2, "http://elsewhere.invalid/")],
+    [
+        ("short", 1, "bytes came"),
+        ("login", 1, "bytes came"),
+        ("lost", 1, "arrived"),
+        ("moved", 2, "http://elsewhere.invalid/"),
+    ],
 )
 def test_broken_transfers(
     running: Running, part: Path, tmp_path: Path, oddity: str, code: int, word: str

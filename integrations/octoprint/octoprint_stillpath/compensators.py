@@ -126,11 +126,9 @@ class OnServer(Service):
         """
         if not (self._entry.job and self._is_there(source)):
             self._submit(source, name)
-        path = self._path
-        self._wait(path, None)
         target = folder / f"result{source.suffix}"
-        self._ask("GET", f"{path}/result", self._timeout_s, take=lambda a: self._save(a, target))
-        page = self._ask("GET", f"{path}/report", self._timeout_s)
+        self._fetch(self._path, self._wait(self._path, None), target)
+        page = self._ask("GET", f"{self._path}/report", self._timeout_s)
         return Made(target, page, self._figures())
 
     def cancel(self) -> None:
