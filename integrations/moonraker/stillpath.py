@@ -179,19 +179,27 @@ class Stillpath:
 
     def _enqueue(self, file: str, print_after: bool, force: bool = False) -> dict[str, Any]:
         source, result = self._paths(file)
+        version = _state_of(source)
         known = self._jobs.get(file)
+        if not force and known is not None and known["version"] == version:
+            # Moonraker tells of a file some time after it came, and whenever it reads it again.
+            raise Refused("it was asked for already")
         if known is not None and known["state"] in _WAITING:
             # It was uploaded again: what is made of the earlier one will not be kept.
-            known["again"] = known["state"] == "running" and _state_of(source) != self._taken
+            known["again"] = known["state"] == "running" and version != self._taken
+            known["version"] = version
             if print_after and (force or not known["held"]):
                 self._arm(known)
+            elif not print_after:
+                known.update(print_after=False, held="")
             self._save()
             return known
-        if not force and result.is_file() and result.stat().st_mtime >= source.stat().st_mtime:
-            raise Refused(f"{result.name} is newer")
+        if not force and result.is_file() and _state_of(result)[1] == version[1]:
+            raise Refused(f"{result.name} was made of it")
         job = {
             "file": file,
-            "result": str(result.relative_to(self._root())),
+            "version": version,
+            "result": result.relative_to(self._root()).as_posix(),
             "print_after": False,
             "held": "",
             "stage": "",
@@ -221,11 +229,16 @@ class Stillpath:
         return Path(self._files.get_directory("gcodes")).resolve()
 
     def _paths(self, file: str) -> tuple[Path, Path]:
-        """Return the paths of a print file and of its result, or say why it is none."""
-        root = self._root()
-        source = (root / file.strip("/")).resolve()
-        if root not in source.parents or not source.is_file():
-            raise Refused("there is no such file in gcodes")
+        """Return the paths of a print file and of its result, or say why it is none.
+
+        Links in gcodes are followed, as Moonraker follows them: to a memory stick, for instance.
+        """
+        source = self._root() / file.strip("/")
+        try:
+            if ".." in source.parts or not source.is_file():
+                raise Refused("there is no such file in gcodes")
+        except OSError as error:  # a name longer than any
+            raise Refused(str(error)) from None
         if source.name.lower().endswith(_RESULT):
             raise Refused("it was compensated already; take the original")
         if source.suffix.lower() not in _SUFFIXES:
@@ -263,8 +276,8 @@ class Stillpath:
     async def _compensate(self, job: dict[str, Any]) -> None:
         loop = asyncio.get_running_loop()
         source, result = self._paths(job["file"])
-        await self._check_free(job["result"], result)
         self._taken = _state_of(source)
+        await self._check_free(job["result"], result)
         work = self._folder / "work"
         copy = work / source.name
         try:
@@ -273,11 +286,14 @@ class Stillpath:
             if not await loop.run_in_executor(None, _is_stamped, copy):
                 raise Refused("what came back is not marked as compensated; it was not kept")
             if _state_of(source) != self._taken:
-                raise Refused("it was changed while it was processed; the result was not kept")
+                raise Refused(
+                    "it was changed, moved or deleted while it was processed; the result was not "
+                    "kept"
+                )
             await self._check_free(job["result"], result)
             if job["state"] == "cancelled":
                 raise Refused("cancelled")
-            await loop.run_in_executor(None, _placed, copy, result)
+            await loop.run_in_executor(None, _placed, copy, result, self._taken[1])
         finally:
             await loop.run_in_executor(None, lambda: shutil.rmtree(work, ignore_errors=True))
 
@@ -448,8 +464,11 @@ def load_component(config: Any) -> Stillpath:
 
 
 def _state_of(file: Path) -> tuple[int, int]:
-    """Return what tells whether a file is changed later."""
-    found = file.stat()
+    """Return size and time of a file, which tell whether it is changed later."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return 0, 0
     return found.st_size, found.st_mtime_ns
 
 
@@ -464,13 +483,18 @@ def _is_stamped(file: Path) -> bool:
     return re.search(IDENT, head, re.MULTILINE) is not None
 
 
-def _placed(made: Path, result: Path) -> None:
-    """Put a file in its place, whole or not at all; Moonraker sees it by its last name only."""
-    part = result.with_name(f".{result.name}.part")
+def _placed(made: Path, result: Path, time_ns: int) -> None:
+    """Put a file in its place, whole or not at all; Moonraker sees it by its last name only.
+
+    Its time becomes that of the original. So it tells what it was made of, also where files are
+    copied with their times or the computer's clock jumps.
+    """
+    part = result.with_name(f".{result.name[:40]}.part")
     try:
         shutil.copyfile(made, part)
         with part.open("rb+") as file:
             os.fsync(file.fileno())
+        os.utime(part, ns=(time_ns, time_ns))
         part.replace(result)
     except BaseException:
         with contextlib.suppress(OSError):

@@ -175,7 +175,8 @@ def _write_report(page: bytes, job: PrintJob, settings: Settings, voice: Voice) 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary file beside `target` that takes its place when the block ends well."""
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    prefix = f".{target.name[:40]}."  # a name may be as long as names can be
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=".part", dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:

@@ -179,11 +179,16 @@ class Server:
                 assert not processor.get("enabled", True), "it would hold the upload back"
         return found
 
-    def upload(self, name: str, content: str) -> Path:
-        """Bring a file, as a slicer does; its metadata are read, and then told of."""
+    def upload(self, name: str, content: str, changed: bool = True) -> Path:
+        """Bring a file, as a slicer does; its metadata are read, and then told of.
+
+        One that is not `changed` lies there already: its metadata are read later, or again.
+        """
         path = self.gcodes / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
+        if changed:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(content)
+        assert path.read_text() == content
         assert self._handlers["file_manager:metadata_processed"](name) is None
         return path
 

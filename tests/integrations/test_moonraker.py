@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -261,6 +262,97 @@ def test_what_is_uploaded_again_meanwhile_is_done_again(tmp_path: Path):
 
     server = with_component(tmp_path, scenario)
     assert (server.gcodes / "a.sp.gcode").read_text().endswith("1\nG28\n")
+
+
+def stamping(component: Any) -> list[str]:
+    """Let a component compensate without a server; return what it was given, as it comes."""
+    given: list[str] = []
+
+    async def run(_: dict[str, Any], copy: Path) -> None:
+        given.append(copy.read_text())
+        copy.write_text(f"; Processed by stillpath 1\n{given[-1]}")
+
+    component._run = run
+    return given
+
+
+def test_what_is_told_late_is_no_second_wish(tmp_path: Path):
+    """Somebody asks for a file, and Moonraker tells of it when it has read its metadata."""
+
+    async def scenario(server: Server, component: Any) -> None:
+        given = stamping(component)
+        (server.gcodes / "a.gcode").write_text(PART)
+        await server.from_macro("stillpath_process", filename="a.gcode", print_after=0)
+        server.upload("a.gcode", PART, changed=False)
+        server.upload("b.gcode", PART)
+        await server.from_macro("stillpath_process", filename="b.gcode", print_after=0)
+        (server.gcodes / "c.gcode").write_text(PART)
+        await server.from_macro("stillpath_process", filename="c.gcode")
+        await server.from_macro("stillpath_cancel", filename="c.gcode")
+        server.upload("c.gcode", PART, changed=False)
+        assert [(await settled(server, f"{n}.gcode"))["state"] for n in "abc"] == [
+            *("done", "done", "cancelled")
+        ]
+        assert len(given) == 2
+
+    server = with_component(tmp_path, scenario, print_after="True")
+    assert server.started == []
+    assert "not started" not in "\n".join(server.console)
+
+
+def test_a_file_is_known_by_its_own_time_whatever_the_clock_says(tmp_path: Path):
+    """Copying keeps a file's time, and a small computer's clock may be behind for some minutes."""
+
+    async def scenario(server: Server, component: Any) -> None:
+        given = stamping(component)
+        server.upload("a.gcode", PART)
+        await settled(server, "a.gcode")
+        source = server.gcodes / "a.gcode"
+        source.write_text("G28\n")
+        os.utime(source, (1.6e9, 1.6e9))
+        server.upload("a.gcode", "G28\n", changed=False)
+        await server.until(lambda: len(given) == 2)
+        assert (await settled(server, "a.gcode"))["state"] == "done"
+
+    async def scanned_again(server: Server, _: Any) -> None:
+        server.upload("a.gcode", "G28\n", changed=False)
+        assert (await server.call("GET /server/stillpath/status"))["jobs"] == []
+
+    server = with_component(tmp_path, scenario)
+    assert (server.gcodes / "a.sp.gcode").read_text().endswith("1\nG28\n")
+    with_component(tmp_path, scanned_again)
+
+
+def test_a_linked_folder_and_a_very_long_name(tmp_path: Path):
+    stick, long = tmp_path / "stick", "ü" * 121
+    stick.mkdir()
+
+    async def scenario(server: Server, component: Any) -> None:
+        stamping(component)
+        (server.gcodes / "usb").symlink_to(stick)
+        for name in ("usb/it's.gcode", f"{long}.gcode"):
+            server.upload(name, PART)
+            assert (await settled(server, name))["state"] == "done", server.console
+        with pytest.raises(ServerError):
+            await server.call("POST /server/stillpath/process", filename="x" * 300 + ".gcode")
+
+    server = with_component(tmp_path, scenario)
+    assert (stick / "it's.sp.gcode").exists()
+    assert (server.gcodes / f"{long}.sp.gcode").exists()
+
+
+def test_a_file_that_is_deleted_meanwhile(tmp_path: Path):
+    async def scenario(server: Server, component: Any) -> None:
+        async def run(_: dict[str, Any], copy: Path) -> None:
+            (server.gcodes / "a.gcode").unlink()
+            copy.write_text("; Processed by stillpath 1\n")
+
+        component._run = run
+        server.upload("a.gcode", PART)
+        assert "moved or deleted" in (await settled(server, "a.gcode"))["reason"]
+
+    server = with_component(tmp_path, scenario)
+    assert list(server.gcodes.iterdir()) == []
 
 
 def test_a_full_disk_ends_nothing(tmp_path: Path):
