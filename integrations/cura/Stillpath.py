@@ -227,9 +227,12 @@ class Stillpath(Script):
         if not self._value("reports"):
             return ""
         folder = Path(self._value("reports")).expanduser()
-        folder.mkdir(parents=True, exist_ok=True)
         target = folder / f"{Path(name).stem}.stillpath.html"
-        target.write_bytes(page)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(page)
+        except OSError as error:  # the print is right all the same
+            return f"none, it cannot be written ({error})"
         return str(target)
 
     def _by_program(self, source: Path, name: str) -> str:
