@@ -14,10 +14,10 @@ sender was killed is taken up by another.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import Engine, and_, or_, select, update
+from sqlalchemy import Engine, and_, case, or_, select, update
 
 from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import deliveries
@@ -105,22 +105,23 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     return after, before.state == "sending"
 
 
-def bring_forward(engine: Engine, *, waiting: Mapping[int, float], sending: float) -> None:
+def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -> None:
     """Let nothing be due later than that, because the clock was set back.
 
     Parameters
     ----------
     engine : Engine
-    waiting : mapping of int to float
-        By the number of attempts.
+    waiting : sequence of float
+        After one attempt, two, ...; the last also after more.
     sending : float
         A sender that is alive prolongs its claim before.
     """
     row = deliveries.c
-    latest = [(and_(row.state == "waiting", row.attempts == k), at) for k, at in waiting.items()]
+    latest = [(row.attempts <= k, at) for k, at in enumerate(waiting, 1)]
+    due = case((row.state == "sending", sending), *latest, else_=waiting[-1])
+    statement = update(deliveries).where(row.state.in_(("waiting", "sending")), row.next_at > due)
     with writing(engine) as connection:
-        for which, at in [*latest, (row.state == "sending", sending)]:
-            connection.execute(update(deliveries).where(which, row.next_at > at).values(next_at=at))
+        connection.execute(statement.values(next_at=due))
 
 
 def prolong(engine: Engine, claimed: Delivery, *, until: float) -> bool:

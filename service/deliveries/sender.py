@@ -34,7 +34,7 @@ __all__ = ["Sender", "SendingTimes"]
 
 _AT_ONCE = 4
 _STOP_S = 5.0
-_GROWTH = 3.0
+_GROWTH, _MOST_STEPS = 3.0, 20
 _LONGEST_WAIT_S = 6 * 3600.0
 # Asking again would be answered in the same way.
 _IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
@@ -66,7 +66,8 @@ class SendingTimes:
 
     def wait_s(self, attempts: int) -> float:
         """Return how long the next attempt waits after so many (1, 2, ...)."""
-        return min(self.first_wait_s * _GROWTH ** (attempts - 1), _LONGEST_WAIT_S)
+        growth = _GROWTH ** min(attempts - 1, _MOST_STEPS)
+        return min(self.first_wait_s * growth, _LONGEST_WAIT_S)
 
 
 class Sender:
@@ -180,7 +181,7 @@ class Sender:
         now = time.time()
         if now < self._seen_at:
             times = self._times
-            waiting = {k: now + times.wait_s(k) for k in range(1, times.attempts + 1)}
+            waiting = [now + times.wait_s(k) for k in range(1, _MOST_STEPS + 2)]
             rows.bring_forward(self._engine, waiting=waiting, sending=now + times.claim_s)
         self._seen_at = now
 
