@@ -374,7 +374,7 @@ class Interpreter:
         state, i = self.state, self.state.i
         before = state.f.copy(), i.copy()
         events, moves = int(i[at.I_EVENTS]), int(i[at.I_MOVES])
-        worst = EventKind.HARMLESS
+        kinds = {EventKind.HARMLESS}
         for command in commands:
             i[at.I_EVENTS] = events
             status = self._command(command)
@@ -386,7 +386,8 @@ class Interpreter:
                 i[at.I_NEED] = need
                 return status
             if i[at.I_EVENTS] > events:
-                worst = max(worst, EventKind(int(state.rows.tiny[at.E_KIND, events])))
+                kinds.add(EventKind(int(state.rows.tiny[at.E_KIND, events])))
+        worst = _together(kinds)
         i[at.I_EVENTS] = events
         for filled in (at.I_FILLED_EVENTS, at.I_LIMITED_EVENTS):
             i[filled] = min(int(i[filled]), events)
@@ -467,3 +468,14 @@ def _skipped(raw: bytes) -> int:
 
 
 _BLANK_OR_DIGIT = frozenset(bytes([c]) for c in b" 0123456789")
+
+
+def _together(kinds: set[EventKind]) -> EventKind:
+    """Return what a line does whose commands do this."""
+    told = kinds - {EventKind.HARMLESS}
+    if EventKind.UNKNOWN in told or (EventKind.SHAPER in told and len(told) > 1):
+        # A line that sets the shaper is said again behind streams, and this does more.
+        return EventKind.UNKNOWN
+    # Where the motion stops, modes and what the printer keeps are the file's.
+    stopping = told - {EventKind.MODE, EventKind.LIMITS, EventKind.STATE}
+    return max(stopping or told, default=EventKind.HARMLESS)

@@ -36,7 +36,7 @@ _BUSY = (408, 429, 502, 503, 504)
 _LONGEST_PAUSE_S = 5.0
 _SILENCE_S = 45.0
 """Watching is given up when nothing came for so long; the service sends something every 15 s."""
-_FETCHES = 4
+_GOES, _FETCHES = 3, 4
 
 
 class ClientError(Exception):
@@ -67,9 +67,11 @@ class ClientError(Exception):
 class Broken(Exception):
     """There is no answer, or not all of it: another try may bring it."""
 
-    def __init__(self, reason: str, pause_s: float | None = None) -> None:
+    def __init__(self, reason: str, pause_s: float | None = None, *, midway: bool = False) -> None:
         super().__init__(reason)
         self.pause_s = pause_s
+        self.midway = midway
+        """It broke off in an upload, perhaps after minutes."""
 
 
 class NoEvents(Exception):
@@ -123,17 +125,22 @@ class Connection:
         try:
             answer = self._http.request(method, path, **request)
         except httpx2.RequestError as error:
-            raise Broken(_reason(error)) from None
+            # Not where it did not begin, or all was sent and the service only says nothing.
+            whole = httpx2.ConnectError | httpx2.ConnectTimeout | httpx2.ReadTimeout
+            midway = "content" in request and not isinstance(error, whole)
+            raise Broken(_reason(error), midway=midway) from None
         self._check(answer)
         return answer
 
     def patiently(self, ask: Callable[[], Found], tell: Tell | None) -> Found:
         """Return what `ask` returns; what may pass by itself is tried again for some time."""
-        deadline, pause_s = time.monotonic() + self._patience_s, FIRST_PAUSE_S
+        deadline, pause_s, goes = time.monotonic() + self._patience_s, FIRST_PAUSE_S, _GOES
         while True:
             try:
                 return ask()
             except Broken as error:
+                if error.midway and goes:
+                    deadline, goes = time.monotonic() + self._patience_s, goes - 1
                 wait_s = max(pause_s, error.pause_s or 0.0)
                 if time.monotonic() + wait_s > deadline:
                     raise ClientError(f"no answer from {self.server}: {error}") from None

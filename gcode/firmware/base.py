@@ -141,6 +141,9 @@ class StreamCommands(Protocol):
     def file_shaper_off(self) -> bytes:
         """Lines that switch off a shaper that the file has set, whatever the machine states."""
 
+    def shaped_axes(self, line: bytes) -> str:
+        """Return the axes, of X and Y, whose frequency a line that sets the shaper states."""
+
     def advance(self, limits: Limits) -> bytes:
         """Lines that set pressure advance of the tool in use, if `shaper_off` turns it off."""
 

@@ -87,14 +87,16 @@ class StreamWriter:
         self._file_feed_mm_min = 0.0
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
-        self._shaper_unknown = False
+        self._left_off: set[str] = set()
+        """Axes whose shaper nobody states, so that it stays off behind a stream."""
 
     def shaper_warnings(self) -> Iterator[str]:
         """Yield what became of the firmware's shaper, and of those that the file itself sets."""
-        if self._shaper_unknown:
+        if self._left_off:
+            whose = f" of {min(self._left_off)}" if len(self._left_off) == 1 else ""
             yield (
-                "The firmware's own input shaper is not known (firmware.shaper in the machine): it "
-                "is switched off and stays off; set it again after the print."
+                f"The firmware's own input shaper{whose} is not known (firmware.shaper in the "
+                "machine): it is switched off and stays off; set it again after the print."
             )
         if said := self._file_shapers.said:
             yield (
@@ -463,12 +465,14 @@ class StreamWriter:
         if not self._shaper_off:
             return b""
         self._shaper_off = self._advances = False
-        stated = self._stream_commands.shaper_on
+        stated, said = self._stream_commands.shaper_on, self._file_shapers.lines.values()
+        if stated is None:
+            set_again = [self._stream_commands.shaped_axes(line) for line in said]
+            self._left_off |= {"X", "Y"}.difference(*set_again)
         if not self._shaper_is_known:
-            self._shaper_unknown = True
             self._shaper_off = True
             return b""
-        lines = (stated or b"") + b"".join(self._file_shapers.lines.values())
+        lines = (stated or b"") + b"".join(said)
         advance = self._stream_commands.advance(limits)
         return lines if lines.endswith(advance) else lines + advance
 

@@ -24,7 +24,8 @@ from typing import Any
 
 IDENT = r"^; Processed by stillpath (?P<version>\S+)"
 _SUFFIXES = (".gcode", ".gco", ".g")
-_RESULT = ".sp.gcode"
+_MARK = ".sp"
+"""Before the suffix, which stays: files that differ in it only do not meet."""
 _KEPT = 50
 _PROGRESS = re.compile(r"stillpath-post: (?P<stage>.*?)(?: (?P<percent>\d+) %)?$")
 _OPTIONS = (
@@ -239,11 +240,11 @@ class Stillpath:
                 raise Refused("there is no such file in gcodes")
         except OSError as error:  # a name longer than any
             raise Refused(str(error)) from None
-        if source.name.lower().endswith(_RESULT):
+        if source.stem.lower().endswith(_MARK):
             raise Refused("it was compensated already; take the original")
         if source.suffix.lower() not in _SUFFIXES:
             raise Refused(f"its name does not end in {', '.join(_SUFFIXES)}")
-        return source, source.with_name(source.stem + _RESULT)
+        return source, source.with_name(source.stem + _MARK + source.suffix)
 
     # The work
 
@@ -338,7 +339,8 @@ class Stillpath:
         report = copy.with_name(f"{copy.stem}.stillpath.html")
         if report.is_file():
             # In the folder of the file: others may have the same name.
-            name = Path(job["result"]).parent / report.name
+            own = report.name if copy.suffix == ".gcode" else f"{copy.name}.stillpath.html"
+            name = Path(job["result"]).parent / own
             kept = self._folder / "reports" / name
             kept.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(str(report), str(kept))

@@ -30,9 +30,10 @@ import tempfile
 import time
 import traceback
 import urllib.request
+import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.error import HTTPError
+from urllib.error import HTTPError, URLError
 from urllib.parse import quote, urlencode, urlsplit
 
 if TYPE_CHECKING:
@@ -508,6 +509,8 @@ class Service:
     _FIRST_PATIENCE_S = 3.0
     _BUSY = (429, 502, 503, 504)
     _LONGEST_PAUSE_S = 2.0
+    _GOES = 3
+    """So often a transfer that broke off midway, perhaps after minutes, has its patience anew."""
 
     def __init__(
         self,
@@ -563,17 +566,35 @@ class Service:
             self._forget(path)
 
     def _send(self, source: Path, options: Mapping[str, Any]) -> str:
-        size = source.stat().st_size
         # A job of our own: it is deleted afterwards, also if others send the same file.
-        name = options["name"][-255:]
-        query = urlencode({**options, "name": name, "fresh": "true"}, errors="replace")
-        with source.open("rb") as file:
-            body = _CountedFile(file, size, lambda share: self._tell("sending", share))
-            job = self._document(self._ask("POST", f"/v1/jobs?{query}", 0.0, body))
+        options = {**options, "fresh": "true"}
+        job, _ = self._upload(source, options, uuid.uuid4().hex)
+        size = source.stat().st_size
         if job.get("source_bytes") != size:
             self._forget(f"/v1/jobs/{job.get('id')}")
             raise Failure(f"sent {size} bytes, but {job.get('source_bytes')} arrived", 1)
         return str(job["id"])
+
+    def _upload(
+        self, source: Path, options: Mapping[str, Any], key: str, patience_s: float = 0.0
+    ) -> tuple[dict[str, Any], bool]:
+        """Return the job that the server makes of a file, and whether it is a new one.
+
+        Sent again with the same key, it is one job all the same.
+        """
+        query = urlencode({**options, "name": options["name"][-255:]}, errors="replace")
+        is_new = False
+
+        def take(answer: Any) -> bytes:
+            nonlocal is_new
+            is_new = answer.status == 202
+            return _read(answer)
+
+        with source.open("rb") as file:
+            size = source.stat().st_size
+            body = _CountedFile(file, size, lambda share: self._tell("sending", share), key)
+            answer = self._ask("POST", f"/v1/jobs?{query}", patience_s, body, take)
+        return self._document(answer), is_new
 
     def _wait(self, path: str, wait_s: float | None) -> dict[str, Any]:
         """Return the job when it is done."""
@@ -626,12 +647,14 @@ class Service:
         take: Callable[[Any], bytes] = lambda answer: _read(answer),
     ) -> bytes:
         """Return what is taken of the answer; what may pass by itself is tried for some time."""
-        deadline, pause_s = time.monotonic() + patience_s, 0.2
+        deadline, pause_s, goes = time.monotonic() + patience_s, 0.2, self._GOES
         while True:
             try:
                 with self._open(method, path, body) as answer:
                     return take(answer)
             except _Broken as error:
+                if error.midway and goes:
+                    deadline, goes = time.monotonic() + self._timeout_s, goes - 1
                 if time.monotonic() + pause_s > deadline:
                     raise Failure(f"no answer from {self._address}: {error}", 1) from None
             self._tell("the server does not answer; trying again", None)
@@ -650,6 +673,8 @@ class Service:
         if body is not None:
             headers["Content-Type"] = "application/octet-stream"
             headers["Content-Length"] = str(body.size)
+            headers["Idempotency-Key"] = body.key
+            body.rewind()
         request = urllib.request.Request(
             self._address + path, data=body, headers=headers, method=method
         )
@@ -661,7 +686,10 @@ class Service:
                     raise _Broken(f"{error.code} {error.reason}") from None
                 raise self._refusal(error) from None
         except (OSError, http.client.HTTPException) as error:
-            raise _Broken(str(getattr(error, "reason", "") or error)) from None
+            # Not where all was sent, and the server only says nothing.
+            broke_off = isinstance(error, (URLError, ConnectionError, http.client.HTTPException))
+            midway = body is not None and body.is_begun and broke_off
+            raise _Broken(str(getattr(error, "reason", "") or error), midway) from None
 
     def _document(self, answer: bytes) -> dict[str, Any]:
         document = _object(answer)
@@ -684,7 +712,11 @@ class Service:
 
 
 class _Broken(Exception):
-    """There is no answer, or not all of it: another try may bring it."""
+    """There is no answer, or not all of it: another try may bring it; `midway`: it broke off."""
+
+    def __init__(self, reason: str, midway: bool = False) -> None:
+        super().__init__(reason)
+        self.midway = midway
 
 
 def _host_of(address: str) -> str:
@@ -701,7 +733,7 @@ def _read(answer: Any, size: int | None = None) -> bytes:
     try:
         return bytes(answer.read(size))
     except (OSError, http.client.HTTPException) as error:
-        raise _Broken(str(error) or type(error).__name__) from None
+        raise _Broken(str(error) or type(error).__name__, midway=True) from None
 
 
 def _object(answer: bytes) -> dict[str, Any]:
@@ -740,10 +772,19 @@ class _Web(
 
 
 class _CountedFile:
-    """A file that tells which share of it has been read."""
+    """A file that tells which share of it has been read, and the key of its job."""
 
-    def __init__(self, file: BinaryIO, size: int, tell: Callable[[float], object]) -> None:
-        self._file, self.size, self._tell = file, size, tell
+    def __init__(
+        self, file: BinaryIO, size: int, tell: Callable[[float], object], key: str
+    ) -> None:
+        self._file, self.size, self._tell, self.key = file, size, tell, key
+
+    @property
+    def is_begun(self) -> bool:
+        return self._file.tell() > 0
+
+    def rewind(self) -> None:
+        self._file.seek(0)
 
     def read(self, size: int = -1) -> bytes:
         self._tell(min(self._file.tell() / max(self.size, 1), 1.0))

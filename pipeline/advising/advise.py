@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 
+from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
@@ -88,15 +89,29 @@ def advise_file(
 
     Parameters and errors are those of `pipeline.compensate.compensate_file`. The slicer's times
     in the file stay as they are, whatever `options.times` says: only lines of our own are added.
+    So no other choice makes the file smaller where it exceeds `options.max_mb`.
     """
     opened = file_rewriting(source, target, plate=options.plate, layers=layers, progress=progress)
     with opened as file, EarlierErrors(target.parent, 2) as earlier:
         container = file.container
+        # At first, too: with advice it is larger, and that takes its time.
+        _check_size(source.name, container.text, options.max_mb)
         job = _Job(container.text, file.spool, machine, options, cache_dir, progress)
         result = job.run(source.name, container.facts(), earlier, file.layers)
-        file.spool.seek(0)
+        _check_size(source.name, file.spool, options.max_mb)
         shutil.copyfileobj(file.spool, file.text, _BLOCK_BYTES)
     return result.model_copy(update=file.sizes)
+
+
+def _check_size(name: str, text: BinaryIO, max_mb: float | None) -> None:
+    """See that a file is not larger than it may be; it stands at its beginning then."""
+    size_mb = 1e-6 * text.seek(0, io.SEEK_END)
+    text.seek(0)
+    if max_mb is not None and size_mb > max_mb:
+        raise GcodeError(
+            f"{name} exceeds max_mb {max_mb:g}: with all its moves, which method advise leaves as "
+            f"they are, it has {size_mb:.3g} MB; allow more"
+        )
 
 
 class _Job:

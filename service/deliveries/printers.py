@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, f
 
 from stillpath.models.complaints import complaint
 from stillpath.pipeline.options import BudgetUm, MethodName
-from stillpath.service.deliveries.http_requests import Reply, post
+from stillpath.service.deliveries.http_requests import Reply, Unanswered, post
 from stillpath.service.deliveries.targets import TargetRefused, read_url
 
 __all__ = ["Printer", "PrinterFileError", "load_printers", "printer_for", "upload", "what_started"]
@@ -138,15 +138,23 @@ def upload(
     headers = {}
     if printer.api_key is not None:
         headers["X-Api-Key"] = printer.api_key.get_secret_value()
+    target = read_url(printer.url + path)
     with file.open("rb") as stream:
-        return post(
-            read_url(printer.url + path),
+        reply = post(
+            target,
             headers=headers,
             fields=fields,
             file=(name, stream),
             loopback=True,  # whoever wrote the file of printers meant it
             timeout_s=_TIMEOUT_S,
         )
+    if 200 <= reply.status < 300 and not reply.text.lstrip().startswith("{"):
+        # A page: of a proxy, or of whatever else listens there. Nothing was uploaded, perhaps.
+        raise Unanswered(
+            f"{target} answers with status {reply.status}, but not as {printer.kind} does; check "
+            f"url in [printer.{printer.name}]"
+        )
+    return reply
 
 
 def what_started(printer: Printer, reply: Reply) -> str | None:

@@ -14,15 +14,15 @@ sender was killed is taken up by another.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from sqlalchemy import Engine, select, update
+from sqlalchemy import Engine, and_, case, or_, select, update
 
 from stillpath.service.database.engine import reading, writing
 from stillpath.service.database.tables import deliveries
 
-__all__ = ["Delivery", "claim", "deliveries_of", "prolong", "settle"]
+__all__ = ["Delivery", "bring_forward", "claim", "deliveries_of", "prolong", "settle"]
 
 _AT_ONCE = 500
 
@@ -84,9 +84,13 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
         As claimed; and whether an earlier attempt ended without a word, so that nobody knows
         whether it arrived. None: nothing is due.
     """
+    # What was never tried need not wait, whatever the clock of the worker says that noted it.
+    new = and_(deliveries.c.state == "waiting", deliveries.c.attempts == 0)
     due = (
         select(deliveries)
-        .where(deliveries.c.state.in_(("waiting", "sending")), deliveries.c.next_at <= now)
+        .where(
+            deliveries.c.state.in_(("waiting", "sending")), or_(new, deliveries.c.next_at <= now)
+        )
         .order_by(deliveries.c.next_at, deliveries.c.id)
         .limit(1)
     )
@@ -99,6 +103,25 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     if not _changed(engine, before, after):
         return None  # another process was quicker; there will be a next time
     return after, before.state == "sending"
+
+
+def bring_forward(engine: Engine, *, waiting: Sequence[float], sending: float) -> None:
+    """Let nothing be due later than that, because the clock was set back.
+
+    Parameters
+    ----------
+    engine : Engine
+    waiting : sequence of float
+        After one attempt, two, ...; the last also after more.
+    sending : float
+        A sender that is alive prolongs its claim before.
+    """
+    row = deliveries.c
+    latest = [(row.attempts <= k, at) for k, at in enumerate(waiting, 1)]
+    due = case((row.state == "sending", sending), *latest, else_=waiting[-1])
+    statement = update(deliveries).where(row.state.in_(("waiting", "sending")), row.next_at > due)
+    with writing(engine) as connection:
+        connection.execute(statement.values(next_at=due))
 
 
 def prolong(engine: Engine, claimed: Delivery, *, until: float) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -33,7 +34,7 @@ __all__ = ["Sender", "SendingTimes"]
 
 _AT_ONCE = 4
 _STOP_S = 5.0
-_GROWTH = 3.0
+_GROWTH, _MOST_STEPS = 3.0, 20
 _LONGEST_WAIT_S = 6 * 3600.0
 # Asking again would be answered in the same way.
 _IN_VAIN = frozenset((400, 401, 404, 405, 410, 413, 414, 415, 422))
@@ -62,6 +63,11 @@ class SendingTimes:
     claim_s: float = 60.0
     poll_s: float = 1.0
     start_within_s: float = 3600.0
+
+    def wait_s(self, attempts: int) -> float:
+        """Return how long the next attempt waits after so many (1, 2, ...)."""
+        growth = _GROWTH ** min(attempts - 1, _MOST_STEPS)
+        return min(self.first_wait_s * growth, _LONGEST_WAIT_S)
 
 
 class Sender:
@@ -112,6 +118,8 @@ class Sender:
         self._main: threading.Thread | None = None
         # What is being sent, and until when it is claimed; touched by the main thread only.
         self._sending: dict[threading.Thread, tuple[Delivery, float]] = {}
+        self._seen_at = math.inf
+        """What the clock said last: it may have been set back while no service ran."""
 
     def start(self) -> None:
         """Begin to send."""
@@ -144,6 +152,7 @@ class Sender:
         while not self._stopping.is_set():
             try:
                 self._keep_claims()
+                self._look_at_clock()
                 claimed = len(self._sending) < _AT_ONCE and self._claim()
                 away = False
             except DatabaseAway as error:
@@ -162,10 +171,19 @@ class Sender:
         for thread, (claimed, until) in list(self._sending.items()):
             if not thread.is_alive():
                 del self._sending[thread]
-            elif until - now < self._times.claim_s / 2:
+            elif not self._times.claim_s / 2 <= until - now <= self._times.claim_s:
                 until = now + self._times.claim_s
                 rows.prolong(self._engine, claimed, until=until)
                 self._sending[thread] = (claimed, until)
+
+    def _look_at_clock(self) -> None:
+        """Where it was set back, let nothing wait longer than it was meant to."""
+        now = time.time()
+        if now < self._seen_at:
+            times = self._times
+            waiting = [now + times.wait_s(k) for k in range(1, _MOST_STEPS + 2)]
+            rows.bring_forward(self._engine, waiting=waiting, sending=now + times.claim_s)
+        self._seen_at = now
 
     def _claim(self) -> bool:
         now = time.time()
@@ -192,9 +210,7 @@ class Sender:
             state, error = "waiting", "the service broke; its log holds the details"
         wait_s = 0.0
         if state == "waiting":
-            wait_s = min(
-                self._times.first_wait_s * _GROWTH ** (claimed.attempts - 1), _LONGEST_WAIT_S
-            )
+            wait_s = self._times.wait_s(claimed.attempts)
             if claimed.attempts >= self._times.attempts:
                 state, error = "failed", f"{error}; given up after {claimed.attempts} attempts"
         log.info("delivery", state=state, reason=error)
@@ -243,7 +259,8 @@ class Sender:
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
         warnings, unsafe = self._looked_at(printer, job)
-        late = time.time() - (job.finished_at or 0.0) > self._times.start_within_s
+        # Where a clock was set back, nobody knows how long ago it was.
+        late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s
         starts = job.print_after and not unsafe and not late
         copy = contextlib.ExitStack()
         file = copy.enter_context(self._storage.local(f"{job.output}/result/{job.result_name}"))

@@ -473,3 +473,22 @@ def test_lines_of_several_commands_are_none_of_them(read) -> None:
     assert block.events.kind.tolist() == kinds * 4
     accels = [block.limits[k].print_accel_mm_s2 for k in block.events.limits_id]
     assert accels == [10, 10, 900, 20, 20, 900] * 2
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"),
+    [
+        ('M98 P"x.g" M120', EventKind.UNKNOWN),
+        ('M120 M98 P"x.g"', EventKind.UNKNOWN),
+        ("M400 M120", EventKind.STOP),
+        ("M120 M83", EventKind.STATE),
+        ("M486 S1 M120", EventKind.OBJECT),
+        ('M593 P"zvd" F40 M120', EventKind.UNKNOWN),
+        ('M593 P"zvd" F40 G91', EventKind.UNKNOWN),
+        ('M572 D0 S.05 M593 P"zvd" F40', EventKind.SHAPER),
+    ],
+)
+def test_a_line_of_several_commands_does_what_the_strongest_does(read, line: str, kind: EventKind):
+    """A macro stops the motion, whatever stands beside it; a shaper's line is said again."""
+    block, _ = read(f"G1 X1 F600\n{line}\nG1 X2\n", "reprapfirmware")
+    assert block.events.kind.tolist() == [kind]

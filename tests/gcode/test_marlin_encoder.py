@@ -116,6 +116,7 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
         False,
         False,
         2e6,
+        120.0,
         0.0,
         feedrate,
         predicted,
@@ -127,6 +128,21 @@ def test_rates_reach_the_ends_in_time(seed: int, per_mm: float) -> None:
     rate = feedrate / 60.0 * per_mm
     # The firmware rounds up: nothing that is written lies on a whole rate.
     assert np.all(np.abs(rate - np.round(rate)) > 0.1)
+
+
+def test_what_a_stand_is_too_short_is_made_up_for() -> None:
+    """No step takes longer than 1/120 s, whatever feedrate is written; the next segment waits."""
+    steps, planned_s = np.array([20.0, 1.0, 20.0, 20.0]), np.array([2e-3, 50e-3, 2e-3, 2e-3])
+    feedrate, predicted = np.zeros(4), np.zeros(4)
+    ours, free = np.ones(4, np.bool_), np.zeros(4)
+    ends_s = np.cumsum(planned_s)
+    per_mm, fastest = 80.0, np.full(4, 500.0)
+    assign_rates(
+        *(ours, steps, steps / per_mm, ends_s, planned_s, fastest, free, free, free, 20_000.0),
+        *(False, True, 2e6, 120.0, 0.0, feedrate, predicted),
+    )
+    assert predicted[1] == pytest.approx(1 / 120.0, rel=1e-3)
+    assert np.sum(predicted) == pytest.approx(ends_s[-1], abs=1e-4)
 
 
 # Words

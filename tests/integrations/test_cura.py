@@ -129,6 +129,14 @@ def test_reports(cura: Cura, script: Any, tmp_path: Path):
     assert str(report) in cura.shown[-1][1]
 
 
+def test_a_report_that_cannot_be_written_stops_nothing(cura: Cura, script: Any, tmp_path: Path):
+    (tmp_path / "file").touch()
+    script.values["reports"] = str(tmp_path / "file")
+    made = cura.write_started([script], list(LAYERS))
+    assert made[0].startswith("; compensated\n")
+    assert cura.shown[-1][0] == "POSITIVE", cura.shown
+
+
 def test_settings_that_cura_read_back_are_text(cura: Cura, script: Any):
     script.values |= {key: str(value) for key, value in script.values.items()}
     script.values["tolerance_um"] = "2,5"

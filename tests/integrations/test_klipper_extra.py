@@ -155,8 +155,20 @@ def test_the_installer_links_and_takes_away(klipper: Path) -> None:
     assert link.is_symlink()
     assert "Taken away" in installed("-u", "-k", klipper).stdout
     assert not link.is_symlink()
+    assert exclude.read_text() == ""
     assert installed("-u", "-k", klipper).returncode == 0
     assert (EXTRA / "stillpath/__init__.py").exists()
+
+
+def test_lines_of_others_stay(klipper: Path) -> None:
+    exclude = klipper / ".git/info/exclude"
+    exclude.write_text("klippy/extras/led_effect.py")  # and no end of the line
+    installed("-k", klipper)
+    assert exclude.read_text() == "klippy/extras/led_effect.py\nklippy/extras/stillpath\n"
+    installed("-u", "-n", "-k", klipper)
+    assert "klippy/extras/stillpath\n" in exclude.read_text()
+    installed("-u", "-k", klipper)
+    assert exclude.read_text() == "klippy/extras/led_effect.py\n"
 
 
 def test_the_installer_refuses_what_is_no_klipper(tmp_path: Path, klipper: Path) -> None:

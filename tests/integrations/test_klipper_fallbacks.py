@@ -53,11 +53,24 @@ def load_config(config):
         elif what == "late":
             extend = extra.filter._extend
             extra.filter._extend = lambda size: extend(size + 500)
+        elif what == "endstop":
+            gcode, (rail, *_) = extra.gcode, extra.toolhead.get_kinematics().rails
+            endstop = rail.get_endstops()[0][0]
+            def raising(*given, **more):
+                raise printer.command_error("the endstop does not answer")
+            def home(gcmd):
+                endstop.home_start, gcode.is_fileinput = raising, False  # which would exit
+                try:
+                    gcode.run_script_from_command("G28 X")
+                except printer.command_error:
+                    del endstop.home_start
+                gcode.is_fileinput = True
+            gcode.register_command("FAIL_TO_HOME", home)
     printer.register_event_handler("klippy:ready", ready)
     return ready
 """
 """An extra of Klipper that makes trouble: computing takes .7 s for each s; the plan is taken for
-known .5 s further than Klipper promises, so that moves come late."""
+known .5 s further than Klipper promises, so that moves come late; X's endstop raises once."""
 WATCH = """
 import gc, logging, tracemalloc
 def load_config(config):
@@ -119,6 +132,19 @@ def test_it_passes_the_plan_through_where_it_falls_behind(
     # Switched on again, it says nothing of what is over.
     assert f"stillpath: on for {name}; limited" in prints.log.rpartition("passing for")[2]
     check(prints, machine)
+
+
+def test_an_endstop_that_raises_does_not_leave_it_off(
+    troubled: Path, export: Export, tmp_path: Path
+) -> None:
+    machine = homed(load_machine("ender3"))
+    text = "G28\nFAIL_TO_HOME\nFAIL_TO_HOME\nSTILLPATH_STATUS\nG28\nG90\nG1 X50 Y20 F9000\n"
+    more = "[trouble]\nwhat: endstop\n"
+    print_with(f"{text}STILLPATH_STATUS\n", machine, export("ender3"), tmp_path, troubled, more)
+    log = (tmp_path / "klippy.log").read_text()
+    assert log.count("the endstop does not answer") == 2
+    assert "Traceback" not in log
+    assert re.findall(r"stillpath: (\w+) for ender3", log) == ["on", "on"]
 
 
 def troubled_pair(

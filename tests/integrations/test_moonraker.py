@@ -245,6 +245,27 @@ def test_a_file_of_ones_own_is_not_written_over(tmp_path: Path):
     assert (server.gcodes / "a.sp.gcode").read_text() == "mine\n"
 
 
+@pytest.mark.slow
+def test_files_that_differ_in_their_suffix_only(tmp_path: Path, running: Running):
+    names = ("a.g", "a.gcode", "a.GCO")
+
+    async def scenario(server: Server, _: Any) -> None:
+        for name in names:
+            server.upload(name, f"{PART};{name}\n")
+            job = await settled(server, name)
+            assert job["state"] == "done", job["reason"]
+        with pytest.raises(ServerError, match="compensated already"):
+            await server.call("POST /server/stillpath/process", filename="a.sp.g")
+
+    server = with_component(tmp_path, scenario, server=running.address)
+    for name, made in zip(names, ("a.sp.g", "a.sp.gcode", "a.sp.GCO"), strict=True):
+        assert f";{name}\n" in (server.gcodes / made).read_text()
+    reports = Path(server.directories["stillpath"])
+    assert sorted(page.name for page in reports.iterdir()) == [
+        *("a.GCO.stillpath.html", "a.g.stillpath.html", "a.stillpath.html")
+    ]
+
+
 def test_what_is_uploaded_again_meanwhile_is_done_again(tmp_path: Path):
     async def scenario(server: Server, component: Any) -> None:
         sent = []

@@ -147,6 +147,29 @@ def test_cancelled_replaced_and_switched_off(octoprint: OctoPrint, running: Runn
         assert octoprint.ask("process", path=odd).status_code == 404
 
 
+def test_asked_for_again_at_once(octoprint: OctoPrint):
+    octoprint.set(automatic=False)
+    path = octoprint.upload("hasty.gcode", "slow G1\n")
+
+    def ask() -> dict[str, Any]:
+        return octoprint.ask("process", path=path).json()["entry"]
+
+    first = ask()
+    octoprint.working(path)
+    assert ask()["id"] == first["id"]
+    octoprint.ask("cancel", id=first["id"])
+    second = ask()  # the first is not over yet
+    assert second["id"] != first["id"]
+    until(lambda: (e := octoprint.working(path)) and e["id"] == second["id"])
+    octoprint.upload("hasty.gcode", "G1 X3\n")  # while it is worked on
+    third = ask()
+    ended = octoprint.ended(path)
+    assert (ended["id"], ended["state"]) == (third["id"], "done")
+    assert [e["state"] for e in octoprint.entries() if e["path"] == path] == [
+        *("done", "cancelled", "cancelled")
+    ]
+
+
 def test_printed_afterwards_but_never_onto_another_print(octoprint: OctoPrint):
     octoprint.connect_printer()
     octoprint.set(print_after=True)

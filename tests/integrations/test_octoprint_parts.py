@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from stillpath.gcode.slicers.marks import MarkKind, read_mark
 from stillpath.pipeline.options import Options
 from stillpath.version import __version__
+from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.integrations.octoprint import PLUGIN
 from tests.integrations.posting import PROGRAM
 from tests.integrations.running import Running
@@ -401,6 +402,20 @@ def test_a_program_ends_with_its_job(bench: Callable[..., Bench], tmp_path: Path
     assert not Path(f"/proc/{pid.read_text()}").exists()
     here = bench(command="/gone/stillpath")
     assert "/gone/stillpath cannot be run" in here.ended(here.add("a.gcode", "G1\n")).message
+
+
+def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
+    """Also where it took longer than the patience with a server that is silent."""
+    part = tmp_path / "part.gcode"
+    part.write_bytes(BODY)
+    noted: dict[str, Any] = {}
+    with breaking_server({"id": "7"}) as (address, keys):
+        entry = ledger.Entry(part.name, "ender3", {"method": "fbf"}, server=address)
+        told = lambda *_: None  # noqa: E731
+        server = compensators.OnServer(entry, "", 0.5 * TAKES_S, told, lambda **n: noted.update(n))
+        server._submit(part, part.name)
+    assert (noted["job"], noted["is_ours"]) == ("7", True)
+    assert keys == [f"{entry.id}-0"] * 2
 
 
 # The package

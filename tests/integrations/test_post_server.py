@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import stillpath_post
 
+from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.integrations.posting import PROGRAM, finish, post, start
 from tests.integrations.running import Running
 from tests.service.test_server import PRETEND, server, until
@@ -256,6 +257,17 @@ def test_broken_transfers(
     assert_reason(done, code, word)
     assert_untouched(part)
     until(lambda: not running.job_ids())
+
+
+def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
+    """Also where it took longer than the patience with a server that is silent."""
+    part = tmp_path / "part.gcode"
+    part.write_bytes(BODY)
+    with breaking_server({"id": "7"}) as (address, keys):
+        service = stillpath_post.Service(address, timeout_s=0.5 * TAKES_S)
+        assert service._send(part, {"machine": "ender3", "name": part.name}) == "7"
+    assert len(keys) == 2
+    assert len(set(keys)) == 1  # one job all the same
 
 
 def test_a_file_that_somebody_else_changes_meanwhile(

@@ -327,3 +327,16 @@ def test_a_binary_file_stays_one(tmp_path: Path, cache: Path) -> None:
     remove_advice(advised, back)
     with open_text(packed) as one, open_text(back) as other:
         assert other.text.read() == one.text.read()
+
+
+def test_a_file_larger_than_it_may_be_is_refused(tmp_path: Path, cache: Path) -> None:
+    """As sliced, or with the lines of ours."""
+    data = printed(1)
+    size_mb = 1e-6 * len(data)
+    for max_mb in (0.999 * size_mb, size_mb):
+        with pytest.raises(GcodeError, match=r"exceeds max_mb .* MB; allow more"):
+            advise(data, tmp_path, machine_of(Klipper()), cache, max_mb=max_mb)
+        assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
+    result, written = advise(data, tmp_path, machine_of(Klipper()), cache, max_mb=2.0 * size_mb)
+    assert result.put_back == []
+    assert len(data) < len(written) < 2 * len(data)

@@ -123,6 +123,29 @@ def test_a_machine_that_states_no_shaper_and_a_file_that_sets_one(tmp_path: Path
     assert not [line for line in lines if line.startswith("M593")]
 
 
+@pytest.mark.parametrize(
+    ("kind", "line", "whose"),
+    [
+        ("klipper", "SET_INPUT_SHAPER SHAPER_FREQ_X=45 ; SHAPER_FREQ_Y=40", " of Y"),
+        ("klipper", "set_input_shaper shaper_freq_y=45", " of X"),
+        ("klipper", "SET_INPUT_SHAPER SHAPER_TYPE=ei", ""),
+        ("klipper", SETS["klipper"], None),
+        ("marlin", "M593 X F42", " of Y"),
+        ("marlin", "M593 D0.1", ""),
+        ("marlin", SETS["marlin"], None),
+    ],
+)
+def test_an_axis_whose_shaper_nobody_states_is_told(
+    kind: str, line: str, whose: str | None, tmp_path: Path, cache: Path
+):
+    """What a stream switched off there cannot be set again: only the printer knows what it was."""
+    machine = machine_with(kind, shaper=None)
+    result, lines = compensated(f"{line}\n{HEAD}{PART}{BEHIND}", machine, tmp_path, cache)
+    assert lines.count(line) > 1
+    told = [w.split(" is not known")[0] for w in result.warnings if "is not known (firm" in w]
+    assert told == ([] if whose is None else [f"The firmware's own input shaper{whose}"])
+
+
 def test_without_one_nothing_is_said(tmp_path: Path, cache: Path):
     text = f"M572 S0.04\n{HEAD}{PART}{BEHIND}"
     for kind in SETS:

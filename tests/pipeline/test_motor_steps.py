@@ -72,6 +72,28 @@ def test_a_wipe_on_the_spot_may_wait(tmp_path: Path) -> None:
     assert "Y60.043" not in written.read_text()
 
 
+@pytest.mark.parametrize("junction", ["classic_jerk", "deviation"])
+@pytest.mark.parametrize("y_steps", [(0, 0), (0, 1), (0, 1, 0, -1)])
+def test_moves_of_single_steps_lose_no_time(
+    junction: str, y_steps: tuple[int, ...], tmp_path: Path
+) -> None:
+    """To and fro, in stairs, in a meander: slower than the firmware steps, it ran ahead."""
+    document = machine_with("marlin").model_dump(mode="json")
+    document["firmware"] |= {"min_steps_per_segment": 1, "junction": junction}
+    x_mm, y_mm, lines = 80.0, 60.0, ["G28", "G90", "M83", "G1 X60 Y60 Z5 F6000", "G1 X80 E1 F3000"]
+    for k in range(300):
+        across = y_steps[k % len(y_steps)]
+        back = not any(y_steps) and k % 2
+        x_mm += 0.0 if across else -0.0125 if back else 0.0125
+        y_mm += 0.0125 * across
+        lines.append(f"G1 X{x_mm:.4f} Y{y_mm:.4f} E.001 F600")
+    source = tmp_path / "steps.gcode"
+    source.write_text("\n".join([*lines, "G1 X110 E1 F3000", "G1 Y90 E1", ""]))
+    machine = Machine.model_validate(document)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    assert not [one.reason for one in result.put_back if "from its command" in one.reason]
+
+
 def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
     """Marlin passes these corners without slowing down: no command follows all of them at once."""
     document = machine_with("marlin").model_dump(mode="json")

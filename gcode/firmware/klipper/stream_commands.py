@@ -50,6 +50,11 @@ class KlipperStreamCommands:
             f"SHAPER_FREQ_Y={s.freq_y_hz:g} DAMPING_RATIO_Y={s.damping_y:g}\n"
         ).encode()
 
+    def shaped_axes(self, line: bytes) -> str:
+        """Return the axes of SHAPER_FREQ_X and SHAPER_FREQ_Y."""
+        code = line.split(b";", 1)[0].upper()
+        return "".join(axis for axis in "XY" if b"SHAPER_FREQ_%b=" % axis.encode() in code)
+
     def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
         """Return nothing: a stream leaves pressure advance on."""
         return b""

@@ -203,6 +203,7 @@ def assign_rates(
     bugfix: bool,
     instant: bool,
     timer_hz: float,
+    least_hz: float,
     start_s: float,
     feedrate: Any,
     predicted_s: Any,
@@ -225,6 +226,9 @@ def assign_rates(
         Speed from which bugfix starts and stops at once.
     instant : bool
         Every block starts at its own speed (classic jerk of the releases).
+    least_hz : float
+        The slowest step rate that there is: what a creep or a stand would take longer is carried,
+        too.
     """
     now = start_s
     before = 0.0
@@ -274,6 +278,7 @@ def assign_rates(
             if slow_s != 0.0:
                 free = max((free + slow_s) / (1.0 + slow_steps / n), 0.5 * free)
             ticks = max(np.round(timer_hz * free / n), 1.0)
+            ticks = min(ticks, np.floor(timer_hz / least_hz))
             # A rate that gives these ticks, as near as can be to the one that is meant.
             lowest, highest = np.floor(timer_hz / (ticks + 1.0)) + 1.0, np.floor(timer_hz / ticks)
             rate = min(max(np.ceil(n / free), lowest), highest)

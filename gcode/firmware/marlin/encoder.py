@@ -31,6 +31,7 @@ from stillpath.gcode.firmware.encoding import (
     limits_in_force,
     to_units,
 )
+from stillpath.gcode.firmware.marlin._block_kernels import C_MIN_RATE
 from stillpath.gcode.firmware.marlin._encoder_kernels import (
     assign_rates,
     bend_reversals,
@@ -38,7 +39,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     thin,
 )
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
-from stillpath.gcode.firmware.marlin.planner import Planner
+from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.marlin.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.pieces import Piece
@@ -154,6 +155,7 @@ class MarlinEncoder:
         if firmware.link == "serial":
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
+        self._least_hz = float(planner_facts(firmware, corexy=corexy)[C_MIN_RATE])
         self._burst = 0.5 * firmware.block_buffer_size
         low_mm, high_mm = np.transpose(travel_mm)
         self._lattice = Lattice(
@@ -216,6 +218,7 @@ class MarlinEncoder:
                 self._firmware.variant == "bugfix",
                 self._releases and self._firmware.junction == "classic_jerk",
                 self._firmware.step_timer_hz,
+                self._least_hz,
                 float(timeline.start_s[0]),
                 feedrate,
                 predicted,

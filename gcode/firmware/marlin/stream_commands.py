@@ -80,6 +80,11 @@ class MarlinStreamCommands:
             f"M593 X F{s.freq_x_hz:g} D{s.damping_x:g}\nM593 Y F{s.freq_y_hz:g} D{s.damping_y:g}\n"
         ).encode()
 
+    def shaped_axes(self, line: bytes) -> str:
+        """Return the axes of an M593 with F: those that it names, or both."""
+        code = line.split(b";", 1)[0].upper().decode("latin-1")
+        return ("".join(axis for axis in "XY" if axis in code) or "XY") if "F" in code else ""
+
     def advance(self, limits: Limits) -> bytes:  # noqa: ARG002
         """Return nothing: it comes with the limits."""
         return b""

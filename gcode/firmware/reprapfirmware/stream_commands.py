@@ -52,6 +52,10 @@ class RepRapStreamCommands:
             restored = f'M593 P"{shaper.type}" F{shaper.freq_hz:g} S{shaper.damping:g}\n'
         self.shaper_on: bytes | None = restored.encode() + _advance(pressure_advance_s)
 
+    def shaped_axes(self, line: bytes) -> str:  # noqa: ARG002
+        """Return both: M593 is of all axes."""
+        return "XY"
+
     def advance(self, limits: Limits) -> bytes:
         """Return M572 for the tool in use."""
         return _advance(cast(RepRapLimits, limits).pressure_advance_s)

@@ -26,6 +26,7 @@ extras=$klipper/klippy/extras
 [ -f "$klipper/klippy/klippy.py" ] && [ -d "$extras" ] ||
     fail "no Klipper in $klipper (no klippy/klippy.py); name its folder with -k"
 link=$extras/stillpath
+exclude=$klipper/.git/info/exclude line=klippy/extras/stillpath
 [ ! -e "$link" ] || [ -L "$link" ] ||
     fail "$link is there and is no link: not made by this script, take it away by hand"
 
@@ -35,6 +36,9 @@ if [ -n "$remove" ]; then
         [ -n "$dry" ] || echo "Taken away: $link"
     else
         echo "Nothing to do: there is no $link"
+    fi
+    if grep -qx "$line" "$exclude" 2>/dev/null; then
+        run sed -i "\\#^$line\$#d" "$exclude"
     fi
     echo "Take the section [stillpath] out of printer.cfg, then restart Klipper."
     exit 0
@@ -46,12 +50,13 @@ else
     [ -n "$dry" ] || echo "Linked: $link"
 fi
 # Klipper's updates must not call the checkout dirty.
-exclude=$klipper/.git/info/exclude
-if [ -d "$klipper/.git/info" ] && ! grep -qx 'klippy/extras/stillpath' "$exclude" 2>/dev/null; then
+if [ -d "$klipper/.git/info" ] && ! grep -qx "$line" "$exclude" 2>/dev/null; then
     if [ -n "$dry" ]; then
-        echo "would add klippy/extras/stillpath to $exclude"
+        echo "would add $line to $exclude"
     else
-        echo 'klippy/extras/stillpath' >> "$exclude"
+        # The last line of others may not be ended.
+        [ ! -s "$exclude" ] || [ -z "$(tail -c 1 "$exclude")" ] || echo >> "$exclude"
+        echo "$line" >> "$exclude"
     fi
 fi
 echo "Add to printer.cfg, then restart Klipper:"

@@ -229,9 +229,12 @@ class StillpathPlugin(
                 409,
                 description=f"{path} was already processed by Stillpath; compensate the original",
             )
+        version = _version(source)
         for entry in self._ledger.open():
-            if entry.path == path:
+            same = entry.path == path and entry.version == version
+            if same and not self._ledger.is_cancelled(entry):
                 return entry
+        self._give_up(path)  # of an earlier upload, or cancelled and not over yet
         return self._take(path)
 
     def _list_machines(self, data: dict[str, Any]) -> Any:

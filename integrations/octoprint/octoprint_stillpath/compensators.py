@@ -14,9 +14,9 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
-from .client import Failure, Service, _Broken, _CountedFile, _read
+from .client import Failure, Service, _Broken
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -179,33 +179,13 @@ class OnServer(Service):
         self._ask("GET", f"/v1/machines/{machine}", self._FIRST_PATIENCE_S)
         self._note(tries=self._entry.tries + 1, job="", is_ours=False)
         # Sent twice after a lost answer, or by an OctoPrint that was started anew: one job.
-        self._headers["Idempotency-Key"] = f"{self._entry.id}-{self._entry.tries}"
-        try:
-            job, is_new = self._sent(source, name)
-        finally:
-            del self._headers["Idempotency-Key"]
+        key = f"{self._entry.id}-{self._entry.tries}"
+        options = {"machine": self._entry.machine, **self._entry.options, "name": name}
+        job, is_new = self._upload(source, options, key, self._timeout_s)
         self._note(job=str(job["id"]), is_ours=is_new)
         if job.get("source_bytes") != source.stat().st_size:
             self.cancel()
             raise Failure(f"{job.get('source_bytes')} bytes arrived, not all of the file", 1)
-
-    def _sent(self, source: Path, name: str) -> tuple[dict[str, Any], bool]:
-        """Return the job that the server makes of a file, and whether it is a new one."""
-        parameters = {"machine": self._entry.machine, **self._entry.options, "name": name[-255:]}
-        query = urlencode(parameters, errors="replace")
-        deadline = time.monotonic() + self._timeout_s
-        while True:
-            with source.open("rb") as file:
-                size = source.stat().st_size
-                body = _CountedFile(file, size, lambda share: self._tell("sending", share))
-                try:
-                    with self._open("POST", f"/v1/jobs?{query}", body) as answer:
-                        return self._document(_read(answer)), answer.status == 202
-                except _Broken as error:
-                    if time.monotonic() > deadline:
-                        raise Failure(f"no answer from {self._address}: {error}", 1) from None
-            self._tell("the server does not answer; trying again", None)
-            time.sleep(self._LONGEST_PAUSE_S)
 
     def _figures(self) -> dict[str, Any]:
         try:

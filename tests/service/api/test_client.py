@@ -20,6 +20,7 @@ import pytest
 
 from stillpath.service.api.schemas import JobView
 from stillpath.service.client import Client, ClientError
+from tests.integrations.breaking import BODY, TAKES_S, breaking_server
 from tests.service.test_server import PRETEND, ROOT, server, until
 
 STILLPATH = [sys.executable, "-c", "from stillpath.cli.main import main; main()"]
@@ -158,6 +159,20 @@ def read_body(handler: Handler) -> bytes:
 def job_document(**fields: Any) -> bytes:
     (example,) = JobView.model_config["json_schema_extra"]["examples"]
     return json.dumps(example | fields).encode()
+
+
+def test_a_long_upload_that_breaks_off_is_sent_again(tmp_path: Path):
+    """Also where it took longer than the patience with a server that is away."""
+    source = tmp_path / "part.gcode"
+    source.write_bytes(BODY)
+    job = json.loads(job_document(state="queued"))
+    with (
+        breaking_server(job) as (address, keys),
+        Client(address, patience_s=0.5 * TAKES_S) as client,
+    ):
+        assert client.submit(source, machine="ender3").id == job["id"]
+    assert len(keys) == 2
+    assert len(set(keys)) == 1  # one job all the same
 
 
 def done_job(result_bytes: int) -> JobView:

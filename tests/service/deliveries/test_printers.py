@@ -103,6 +103,19 @@ def test_a_printer_that_does_not_begin_is_told(tmp_path: Path, kind: str):
     assert "did not begin" in (delivery.error or "")
 
 
+def test_a_page_is_no_answer_of_a_printer(tmp_path: Path):
+    """As a proxy answers that wants a login, or a page that listens at a wrong port."""
+    with (
+        Listener(lambda _: (200, {"Content-Type": "text/html"}, b"<html>log in")) as server,
+        at(tmp_path, printer("m", "moonraker", server.url)) as place,
+    ):
+        job = place.finish(tmp_path, printer="m")
+        with place.sending(attempts=2, first_wait_s=0.01):
+            delivery = place.settled(job)
+    assert (delivery.state, len(uploads(server))) == ("failed", 2)
+    assert "not as moonraker does; check url in [printer.m]" in (delivery.error or "")
+
+
 def test_a_printer_that_must_not_be_started_is_not(tmp_path: Path):
     with moonraker() as server, at(tmp_path, printer("m", "moonraker", server.url)) as place:
         job = place.finish(tmp_path, printer="m", print_after=True)
@@ -132,13 +145,13 @@ def test_a_printer_that_is_off_gets_it_when_it_is_on(tmp_path: Path):
         job = place.finish(tmp_path, printer="m", print_after=True)
         with place.sending(attempts=1000, first_wait_s=0.01):
             until(lambda: place.delivery(job).attempts >= 2)
-            with Listener(port=port) as server:
+            with Listener(lambda _: (201, {}, b"{}"), port=port) as server:
                 assert place.settled(job).state == "done"
     [seen] = uploads(server)
     assert seen.parts()["file"][1] == RESULT
 
 
-@pytest.mark.parametrize("answer", ["silence", "502"])
+@pytest.mark.parametrize("answer", ["silence", "502", "page"])
 def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
     """Nobody knows whether the first upload began to print: it is left to a person."""
     servers: list[Listener] = []
@@ -146,6 +159,8 @@ def test_a_print_is_not_started_twice(tmp_path: Path, answer: str):
     def answers(_: Seen):
         if answer == "silence":
             raise ConnectionResetError
+        if answer == "page":
+            return 200, {"Content-Type": "text/html"}, b"<html>log in"
         return 502, {}, b"bad gateway"
 
     with (
@@ -175,7 +190,7 @@ def test_a_sender_that_breaks_starts_no_second_print(
 
     monkeypatch.setattr(sender, "_judged", breaks_once)
     with (
-        Listener() as server,
+        Listener(lambda _: (201, {}, b"{}")) as server,
         at(tmp_path, printer("m", "moonraker", server.url, start=True)) as place,
     ):
         job = place.finish(tmp_path, printer="m", print_after=prints)

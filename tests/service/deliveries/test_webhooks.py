@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from stillpath.service.deliveries import sender
 from stillpath.service.deliveries.rows import claim, settle
 from stillpath.service.deliveries.webhooks import SignatureRefused, sign, verify
 from tests.service.deliveries.listeners import Listener, Seen, until
@@ -189,6 +190,65 @@ def test_a_sender_killed_in_between_is_followed_by_another(tmp_path: Path):
             delivery = place.settled(job)
     assert (delivery.state, delivery.attempts) == ("done", 2)
     assert [check(seen)["job"]["id"] for seen in listener.seen] == [job.id] * 2
+
+
+class SetClock:
+    """Stands for `time` in a module: a clock that can be set."""
+
+    def __init__(self, back_s: float = 0.0) -> None:
+        self.back_s = back_s
+        self.monotonic = time.monotonic
+
+    def time(self) -> float:
+        return time.time() - self.back_s
+
+
+def test_nothing_waits_because_the_clock_was_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """In between, before the service started, and behind that of the worker who noted it."""
+    clock = SetClock()
+    monkeypatch.setattr(sender, "time", clock)
+    answers = iter([503])
+    with (
+        Listener(lambda _: (next(answers, 200), {}, b"")) as listener,
+        listed(tmp_path, listener) as place,
+    ):
+        in_between = place.fail(webhook=listener.url)
+        with place.sending(first_wait_s=1.0):
+            until(lambda: place.delivery(in_between).error)
+            clock.back_s = 3600.0
+            assert place.settled(in_between).state == "done"
+            of_worker = place.fail(webhook=listener.url)
+            assert place.settled(of_worker).state == "done"
+        answers = iter([503])
+        before = place.fail(webhook=listener.url)
+        with place.sending(first_wait_s=1.0):
+            until(lambda: place.delivery(before).error)
+        left = place.fail(webhook=listener.url)
+        now = clock.time()
+        claim(place.engine, now=now, until=now + 60.0)  # a sender that was killed
+        clock.back_s = 7200.0
+        with place.sending(first_wait_s=1.0, claim_s=1.0):
+            assert place.settled(before).state == place.settled(left).state == "done"
+
+
+def test_a_claim_holds_although_the_clock_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    clock = SetClock()
+    monkeypatch.setattr(sender, "time", clock)
+
+    def answer(_: Seen):
+        clock.back_s = 3600.0
+        time.sleep(1.0)
+        return 200, {}, b""
+
+    with Listener(answer) as listener, listed(tmp_path, listener) as place:
+        job = place.fail(webhook=listener.url)
+        with place.sending(claim_s=0.4), place.sending(claim_s=0.4):
+            assert place.settled(job).state == "done"
+        assert len(listener.seen) == 1
 
 
 def test_a_deleted_jobs_delivery_goes_with_it(place: Place):

@@ -42,7 +42,7 @@ class Stillpath:
         self.wanted = config.getboolean("enable", True)
         self.export = self.toolhead = self.queue = self.filter = None
         self.motors = []
-        self.engaged, self.aside = False, 0
+        self.engaged, self.aside, self.homing = False, 0, False
         self.reason, self.passing_reason = "not started", ""
         self.late = 0
         self.busy_s = self.moved_s = self.advanced_s = 0.0
@@ -133,8 +133,10 @@ class Stillpath:
         toolhead.trapq_append, toolhead.drip_move = append, drip_move
         self.queue.begin(self._advance)
         on = self.printer.register_event_handler
-        on("homing:homing_move_begin", lambda _move: self._step_aside())
-        on("homing:homing_move_end", lambda _move: self._come_back())
+        on("homing:homing_move_begin", lambda _move: self._home(True))
+        on("homing:homing_move_end", lambda _move: self._home(False))
+        # An endstop that raises before the move leaves it without an end.
+        on("gcode:command_error", self._command_failed)
         on("toolhead:set_position", self._placed)
         for name in ASIDE:
             plain = self.gcode.register_command(name, None)
@@ -159,7 +161,7 @@ class Stillpath:
 
     def _engage(self):
         """Take the motors, if they may be taken. Everything stands afterwards."""
-        if self.engaged or self.export is None or not self.wanted or self.aside:
+        if self.engaged or self.export is None or not self.wanted or self.aside or self.homing:
             return
         if self._shaper_on():
             if self.reason != SHAPER:
@@ -186,6 +188,17 @@ class Stillpath:
             motor.release()
         self.engaged = False
         self.queue.hold(0.0)
+
+    def _home(self, homing):
+        self.homing = homing
+        if homing:
+            self._release()
+        else:
+            self._engage()
+
+    def _command_failed(self):
+        if self.homing and not self.printer.is_shutdown():
+            self._home(False)
 
     def _step_aside(self):
         self.aside += 1
