@@ -305,8 +305,8 @@ class PreviewFbf:
         raise DesignError(
             f"axis {axis.name}: even the gentlest design asks for {asked}; allowed are "
             f"{bounds.accel / dt**2:.0f} mm/s2, {bounds.speed / dt:.0f} mm/s and "
-            f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the machine; "
-            "docs/proof.md tells how to measure what its motors bear)"
+            f"{bounds.low_mm:g} to {bounds.high_mm:g} mm (command and travel limits of the "
+            "machine; docs/proof.md tells how to measure what its motors bear)"
         )
 
 
