@@ -38,24 +38,36 @@ _APART = 0.5
 """Repeats differ by at most so much of their mean, or it was something else."""
 
 
-def dry_friction(logs: Sequence[tuple[AlignedLog, FrequencyResponse]]) -> float:
-    """Return how far dry friction holds an axis back in mm, from repeats; 0 where none is clear.
+def dry_friction(
+    logs: Sequence[AlignedLog], motions: Sequence[Sequence[FrequencyResponse]]
+) -> tuple[float, int]:
+    """Return how far dry friction holds an axis back, from repeats, and by which of its motions.
 
     Parameters
     ----------
-    logs : sequence of (AlignedLog, FrequencyResponse)
-        Each with the response that it leads to as it is.
+    logs : sequence of AlignedLog
+        Repeats.
+    motions : sequence of sequence of FrequencyResponse
+        What may slide: each a response per log (as felt; over a frame that shakes).
+
+    Returns
+    -------
+    held_mm : float
+        0 where no friction is clear.
+    motion : int
+        That with which the logs are explained best.
     """
-    rows = [_left(aligned, response) for aligned, response in logs]
-    if not rows or any(len(row) == 0 for row in rows):
-        return 0.0
-    left = np.stack(rows)
-    every = left.mean(axis=0)
-    size_mm = _lowest(every)
-    alone = [_lowest(one) for one in left]
-    clear = every[0] - every.min() > _CLEARLY
+    every = [[_left(log, one) for log, one in zip(logs, way, strict=True)] for way in motions]
+    rows = [np.stack(way) for way in every if way and all(len(row) for row in way)]
+    if len(rows) < len(motions) or not rows:
+        return 0.0, 0
+    motion = int(np.argmin([left.mean(axis=0).min() for left in rows]))
+    left = rows[motion].mean(axis=0)
+    size_mm = _lowest(left)
+    alone = [_lowest(one) for one in rows[motion]]
+    clear = left[0] - left.min() > _CLEARLY
     agree = max(alone) - min(alone) <= _APART * size_mm
-    return size_mm if clear and agree else 0.0
+    return (size_mm if clear and agree else 0.0), motion
 
 
 def freed(aligned: AlignedLog, response: FrequencyResponse, size_mm: float) -> AlignedLog:

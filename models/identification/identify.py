@@ -6,7 +6,7 @@ a set. What was measured with a weight on the bed or at different places becomes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -31,7 +31,7 @@ from stillpath.models.identification.messages import (
     scale_warnings,
 )
 from stillpath.models.identification.modal_fit import refit
-from stillpath.models.identification.nozzle import frame_of
+from stillpath.models.identification.nozzle import Frame, frame_of
 from stillpath.models.identification.readers import (
     ReadSettings,
     date_in_name,
@@ -216,15 +216,13 @@ class _AxisWork:
     def _from_responses(self) -> AxisIdentification:
         responses = [(self._response(m), m.condition) for m in self._used]
         common = usual([c for _, c in responses], self._axis)
-        friction_mm = self._friction_mm([(r, c in common) for r, c in responses])
-        if friction_mm:
-            responses = [(self._freed(k, r, friction_mm), c) for k, (r, c) in enumerate(responses)]
-        chosen = [r for r, c in responses if c in common]
         # A schedule counts the modes of the plant as it was fitted.
         frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
-        frame = None
-        if self._kind == "raw log" and not frame_firm:
-            frame = frame_of(mean_response(chosen))
+        friction_mm = 0.0
+        if self._kind == "raw log":
+            responses, friction_mm = self._without_friction(responses, common, frame_firm)
+        chosen = [r for r, c in responses if c in common]
+        frame = self._frame(chosen, frame_firm)
         if frame is not None:
             chosen = [frame.over_bed(response) for response in chosen]
         found = response_set(
@@ -327,20 +325,47 @@ class _AxisWork:
         self._steps.stepped(what)
         return response
 
-    def _friction_mm(self, responses: Sequence[tuple[FrequencyResponse, bool]]) -> float:
-        """Return how far dry friction holds the axis back, from the usual logs."""
-        if self._kind != "raw log":
-            return 0.0
-        logs = zip(self._aligned, responses, strict=True)
-        return dry_friction([(aligned, r) for aligned, (r, usual) in logs if usual])
+    def _frame(self, responses: Sequence[FrequencyResponse], firm: bool) -> Frame | None:
+        """Return the frame that shakes in raw logs, if it may shake and one is seen."""
+        if self._kind != "raw log" or firm:
+            return None
+        return frame_of(mean_response(responses))
+
+    def _without_friction(
+        self,
+        responses: Sequence[tuple[FrequencyResponse, Condition]],
+        common: Collection[Condition],
+        frame_firm: bool,
+    ) -> tuple[list[tuple[FrequencyResponse, Condition]], float]:
+        """Return responses without what dry friction did, and how far it holds the axis back.
+
+        Guides feel motion over the frame, a sensor what the frame does as well.
+        """
+        used = [k for k, (_, c) in enumerate(responses) if c in common]
+        felt = [r for r, _ in responses]
+        frame = self._frame([felt[k] for k in used], frame_firm)
+        motions = [felt] if frame is None else [felt, [frame.over_bed(r) for r in felt]]
+        held_mm, which = dry_friction(
+            [self._aligned[k] for k in used], [[way[k] for k in used] for way in motions]
+        )
+        if held_mm:
+            responses = [
+                (self._freed(k, response, motions[which][k], held_mm), condition)
+                for k, (response, condition) in enumerate(responses)
+            ]
+        return list(responses), held_mm
 
     def _freed(
-        self, number: int, response: FrequencyResponse, friction_mm: float
+        self,
+        number: int,
+        response: FrequencyResponse,
+        motion: FrequencyResponse,
+        friction_mm: float,
     ) -> FrequencyResponse:
-        """Return the response of a log without what dry friction did."""
+        """Return the response of a log without what dry friction did to a motion over the frame."""
         log = self._used[number].measurement
         assert isinstance(log, AccelerationLog)
-        aligned = freed(self._aligned[number], response, friction_mm)
+        aligned = freed(self._aligned[number], motion, friction_mm)
         test = excitation_for(log, self._settings)
         again = estimate_aligned(log, aligned, test, label=response.label)
         return replace(again, notes=response.notes)

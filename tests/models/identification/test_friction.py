@@ -11,6 +11,7 @@ from stillpath.models.identification.alignment import align
 from stillpath.models.identification.averaging import mean_response
 from stillpath.models.identification.estimation import estimate_aligned, estimate_response
 from stillpath.models.identification.friction import dry_friction, freed
+from stillpath.models.identification.nozzle import frame_of
 from stillpath.models.identification.types import AccelerationLog, Excitation
 from stillpath.simulation.printers.drawing import draw
 from stillpath.simulation.printers.machines import Printer
@@ -26,13 +27,16 @@ def held_mm(printer: Printer, number: int) -> float:
     return float(1e3 * friction.force_n * printer.nozzle[number] @ np.linalg.solve(k, along))
 
 
-def logs(printer: Printer, test: Excitation, runs: int = 2):  # type: ignore[no-untyped-def]
+def logs(  # type: ignore[no-untyped-def]
+    printer: Printer, test: Excitation, axis: str = "x", runs: int = 2
+):
     rng = np.random.default_rng(4)
     sensor = drawn_sensor(rng, "lis2dw")
     out = []
+    test = replace(test, direction=(1.0, 0.0) if axis == "x" else (0.0, 1.0))
     for run in range(runs):
-        record = run_test(printer, "x", sensor, rng, test)
-        log = AccelerationLog(record.time_s, record.accel_mm_s2, "x", f"raw_x_{run}.csv")
+        record = run_test(printer, axis, sensor, rng, test)
+        log = AccelerationLog(record.time_s, record.accel_mm_s2, axis, f"raw_{axis}_{run}.csv")
         aligned = align(log, test)
         out.append((log, aligned, estimate_response(log, test, aligned=aligned)))
     return out
@@ -42,7 +46,7 @@ def logs(printer: Printer, test: Excitation, runs: int = 2):  # type: ignore[no-
 def test_it_is_told_by_the_log(test: Excitation) -> None:
     printer = draw("bed slinger", 3)
     read = logs(printer, test)
-    found = dry_friction([one[1:] for one in read])
+    found, _ = dry_friction([one[1] for one in read], [[one[2] for one in read]])
     assert found == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.
     log, aligned, response = read[0]
@@ -51,9 +55,23 @@ def test_it_is_told_by_the_log(test: Excitation) -> None:
     assert np.mean(1 - again.coherence[low]) < 0.9 * np.mean(1 - response.coherence[low])
 
 
+@pytest.mark.parametrize("seed", [2, 8])
+def test_a_frame_that_shakes_does_not_hide_it(seed: int) -> None:
+    """The sensor on a bed feels the frame too, at 8 Hz where friction shows most."""
+    printer = draw("bed slinger", seed)
+    read = logs(printer, OLD_TEST, "y")
+    felt = [one[2] for one in read]
+    frame = frame_of(mean_response(felt))
+    assert frame is not None
+    over_it = [frame.over_bed(response) for response in felt]
+    found, motion = dry_friction([one[1] for one in read], [felt, over_it])
+    assert found == pytest.approx(held_mm(printer, 1), rel=0.3)
+    assert motion == 1
+
+
 def test_guides_that_do_not_rub_have_none() -> None:
     printer = draw("corexy", 3)
     smooth = replace(printer, bodies=replace(printer.bodies, frictions=()))
     read = logs(smooth, OLD_TEST)
-    assert dry_friction([one[1:] for one in read]) < 2e-4
+    assert dry_friction([one[1] for one in read], [[one[2] for one in read]])[0] < 2e-4
     assert mean_response([one[2] for one in read]).f_hz[0] < 10
