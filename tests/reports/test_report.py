@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from stillpath.pipeline.result import Result
+from stillpath.cli.console import budget_line
+from stillpath.pipeline.result import BudgetFigures, Result
 from stillpath.reports import render_report, write_report
 from tests.service.synthetic import make_result
 
@@ -129,3 +130,17 @@ def test_a_result_without_motion_still_renders(result: Result):
         }
     )
     assert "Nothing: all 0 pieces" in render_report(empty)
+
+
+def test_a_budget_says_whether_the_shaper_is_quicker(result: Result):
+    budget = BudgetFigures(
+        budget_um=10.0,
+        saved_share=0.3,
+        shaper_time_s=408.9,
+        saved_share_against_shaper=-0.018,
+        classes=[],
+    )
+    for share, words in ((-0.018, "1.8 % more than with"), (0.018, "1.8 % less than with")):
+        found = budget.model_copy(update={"saved_share_against_shaper": share})
+        assert words in render_report(result.model_copy(update={"budget": found}))
+        assert words in budget_line(found)
