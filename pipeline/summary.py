@@ -25,7 +25,10 @@ from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM
 from stillpath.version import __version__
 
-__all__ = ["Summary"]
+__all__ = ["SHAPER_IS_BETTER", "Summary"]
+
+SHAPER_IS_BETTER = "The firmware's own shaper would serve this file better"
+"""How the warning begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +130,7 @@ class Summary:
         compared = self.budget is None and not self.options.method.startswith("shaper:")
         if compared and ours >= max(shaper, NEGLIGIBLE_UM):
             yield (
-                f"The firmware's own shaper would serve this file better: {self.shaper.label} "
+                f"{SHAPER_IS_BETTER}: {self.shaper.label} "
                 f"alone would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
                 "Print it as sliced with that shaper, or let --method advise write the commands"
             )
