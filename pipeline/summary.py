@@ -88,6 +88,11 @@ class Summary:
     def _channels(self) -> list[Channel]:
         """Return the figures of the whole print, with what counts where a part is compensated."""
         channels = self.measurement.channels()
+        if self.writer is None:
+            channels = [
+                c.model_copy(update={"label": "as written"}) if c.name == "after" else c
+                for c in channels
+            ]
         if self.options.where != "all":
             features = self.measurement.features(self.reader.feature_names)
             rms_um = self.selection.rms_um(features)
