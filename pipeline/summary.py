@@ -25,7 +25,10 @@ from stillpath.pipeline.totals import Totals
 from stillpath.pipeline.verifying import NEGLIGIBLE_UM
 from stillpath.version import __version__
 
-__all__ = ["Summary"]
+__all__ = ["SHAPER_IS_BETTER", "Summary"]
+
+SHAPER_IS_BETTER = "The firmware's own shaper would serve this file better"
+"""How the warning begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +88,11 @@ class Summary:
     def _channels(self) -> list[Channel]:
         """Return the figures of the whole print, with what counts where a part is compensated."""
         channels = self.measurement.channels()
+        if self.writer is None:
+            channels = [
+                c.model_copy(update={"label": "as written"}) if c.name == "after" else c
+                for c in channels
+            ]
         if self.options.where != "all":
             features = self.measurement.features(self.reader.feature_names)
             rms_um = self.selection.rms_um(features)
@@ -127,7 +135,7 @@ class Summary:
         compared = self.budget is None and not self.options.method.startswith("shaper:")
         if compared and ours >= max(shaper, NEGLIGIBLE_UM):
             yield (
-                f"The firmware's own shaper would serve this file better: {self.shaper.label} "
+                f"{SHAPER_IS_BETTER}: {self.shaper.label} "
                 f"alone would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
                 "Print it as sliced with that shaper, or let --method advise write the commands"
             )

@@ -13,7 +13,10 @@ from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
 from stillpath.pipeline.verbatim import feeding, last_length_mm
 
-__all__ = ["Totals"]
+__all__ = ["NOT_COMPENSATED", "Totals"]
+
+NOT_COMPENSATED = "of the extruding time is not compensated"
+"""How the warning begins, after the share."""
 
 _WARN_SHARE = 0.2
 """Of the extruding time, above which it is said that it is not compensated."""
@@ -144,8 +147,9 @@ class Totals:
             )
         elif passed_s > _WARN_SHARE * self.extruding_s:
             yield (
-                f"{passed_s / self.extruding_s:.0%} of the extruding time is not compensated, from "
-                f"line {self.passed_line} on: its moves keep their own lines, because they "
-                "climb faster than Z can follow a stream (max_z_accel_mm_s2, max_z_velocity_mm_s), "
-                "take long for their length, or start where the position is not known"
+                f"{passed_s / self.extruding_s:.0%} {NOT_COMPENSATED}, from line "
+                f"{self.passed_line} on: its moves keep their own lines, because they lie between "
+                "STILLPATH_OFF and STILLPATH_ON, climb faster than Z can follow a stream "
+                "(max_z_accel_mm_s2, max_z_velocity_mm_s), take long for their length, or start "
+                "where the position is not known"
             )

@@ -31,7 +31,7 @@ def spectrum_figures(result: Result) -> list[SpectrumFigure]:
         axis = spectrum.axis.upper()
         chart = Chart(
             about=f"Spectrum of the error along {axis}: {_resonances(spectrum)}.",
-            x_title="Hz",
+            x_title="frequency, Hz",
             y_title="µm/√Hz",
             lines=[
                 Line(spectrum.f_hz, spectrum.um_per_sqrt_hz[name], name)

@@ -31,7 +31,8 @@
       .find((step) => span / step <= count) || 86400;
   }
 
-  // `chart`: {series: {name: values}, at: i -> x, text: i -> readout head, tick: x -> text, step}
+  // `chart`: {name: of x, series: {name: values}, at: i -> x, text: i -> readout head,
+  // tick: x -> text, step}
   function lineChart(box, readout, chart) {
     const shown = names.filter((name) => chart.series[name]);
     const count = Math.max(...shown.map((name) => chart.series[name].length));
@@ -41,8 +42,19 @@
     function draw() {
       box.replaceChildren();
       const width = box.clientWidth, height = Math.min(260, Math.max(180, width * .3));
-      const left = 44, right = 12, top = 26, bottom = 30;
+      const left = 44, right = 12, bottom = 44;
       const svg = node(box, "svg", { viewBox: `0 0 ${width} ${height}`, height });
+      let legend = width - right;
+      for (const name of [...shown].reverse()) {
+        const text = node(svg, "text", { x: legend, y: 12, "text-anchor": "end" }, label[name]);
+        legend -= text.getComputedTextLength() + 8;
+        node(svg, "path", { class: name, d: `M${legend - 14} 8h14` });
+        legend -= 28;
+      }
+      const unit = legend > 50 ? 12 : 30; // below the legend where there is no room beside it
+      node(svg, "text", { x: 0, y: unit }, "µm rms");
+      node(svg, "text", { x: (left + width - right) / 2, y: height - 6, "text-anchor": "middle" }, chart.name);
+      const top = unit + 14;
       const x0 = chart.at(0), span = (chart.at(count - 1) - x0) || 1;
       const x = (i) => left + (chart.at(i) - x0) / span * (width - left - right);
       const step = roundStep(peak, 4), ceiling = Math.ceil(peak / step) * step;
@@ -54,17 +66,9 @@
       const xStep = chart.step(span, Math.max(2, Math.floor((width - left) / 90)));
       for (let v = Math.ceil(x0 / xStep) * xStep; v <= x0 + span; v += xStep) {
         const at = left + (v - x0) / span * (width - left - right);
-        node(svg, "text", { x: at, y: height - 10,
+        node(svg, "text", { x: at, y: height - 26,
           "text-anchor": at > width - 30 ? "end" : "middle" }, chart.tick(v));
       }
-      let legend = width - right;
-      for (const name of [...shown].reverse()) {
-        const text = node(svg, "text", { x: legend, y: 12, "text-anchor": "end" }, label[name]);
-        legend -= text.getComputedTextLength() + 8;
-        node(svg, "path", { class: name, d: `M${legend - 14} 8h14` });
-        legend -= 28;
-      }
-      node(svg, "text", { x: 0, y: 12 }, legend > 60 ? "µm rms" : "µm");
       for (const name of shown) {
         let d = "", pen = "M";
         chart.series[name].forEach((v, i) => {
@@ -98,9 +102,11 @@
 
   const redraws = [];
   const track = data.track.values;
-  if (names.some((name) => track[name] && track[name].length > 1)) {
+  const longest = Math.max(0, ...names.map((name) => (track[name] || []).length));
+  if (longest > 1) {
     $("track-section").hidden = false;
     redraws.push(lineChart($("track"), $("track-readout"), {
+      name: `print time, ${data.track.bin_s * longest < 3600 ? "min:s" : "h:min:s"}`,
       series: track, at: (i) => i * data.track.bin_s, tick: clock, step: timeStep,
       text: (i) => "At " + clock(i * data.track.bin_s) }));
   }
@@ -113,7 +119,8 @@
       }
     }
     redraws.push(lineChart($("bylayer"), $("bylayer-readout"), {
-      series, at: (i) => i, tick: (v) => (data.layers[v].name.length < 6 ? data.layers[v].name : ""),
+      name: "layer", series, at: (i) => i,
+      tick: (v) => (data.layers[v].name.length < 6 ? data.layers[v].name : ""),
       step: (span, count) => Math.max(1, roundStep(span, count)),
       text: (i) => "Layer " + data.layers[i].name + ", " + clock(data.layers[i].seconds) }));
   }

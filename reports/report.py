@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from stillpath.gcode.slicers.features import feature_title
 from stillpath.pipeline.result import Channel, GroupFigures, Result
 from stillpath.reports.figures import spectrum_figures
 from stillpath.reports.pages import asset, content_hash, rendered, write_texts
 
-__all__ = ["render_report", "write_report"]
+__all__ = ["headline_figures", "render_report", "write_report"]
 
 _PACKAGE = "stillpath.reports"
 _PUT_BACK_SHOWN = 100
@@ -59,7 +58,6 @@ def render_report(result: Result) -> str:
         asset(_PACKAGE, "report.css"),
         {
             "um": _um,
-            "feature": feature_title,
             "short": _short,
             "plain": _plain,
             "duration": _duration,
@@ -70,7 +68,7 @@ def render_report(result: Result) -> str:
         result=result,
         channels=channels,
         writes="after" in channels and result.settings.get("method") != "live",
-        headline=_headline(result.channels),
+        headline=headline_figures(result.channels),
         rows=_rows(result.channels),
         features=features[:_FEATURES_SHOWN],
         widest=_widest(features),
@@ -82,10 +80,11 @@ def render_report(result: Result) -> str:
     )
 
 
-def _headline(channels: Sequence[Channel]) -> dict[str, Any]:
+def headline_figures(channels: Sequence[Channel]) -> dict[str, Any]:
     """Contour error rms while extruding, by channel, and how many times smaller it became.
 
-    Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion.
+    Of a file that extrudes nothing, such as a coupon drawn with a pen, that of all motion; of one
+    that is compensated in part, that of this part.
     """
     extrudes = any(channel.extruding.contour_max_um > 0 for channel in channels)
     scope = "extruding" if extrudes else "all_motion"

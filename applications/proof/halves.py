@@ -20,6 +20,7 @@ from stillpath.applications.proof.program import (
     place,
 )
 from stillpath.gcode.firmware.registry import adapter
+from stillpath.gcode.firmware.writing import FILE_SETS_SHAPER
 from stillpath.models.machine import Machine
 from stillpath.models.plants import continuous
 from stillpath.pipeline.compensate import compensate_file
@@ -27,6 +28,8 @@ from stillpath.pipeline.files import replacing
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.progress import ProgressCallback
 from stillpath.pipeline.result import Result
+from stillpath.pipeline.summary import SHAPER_IS_BETTER
+from stillpath.pipeline.totals import NOT_COMPENSATED
 
 __all__ = ["AS_PLANNED", "COMPENSATED", "Halves", "ProofPrint", "Ringing", "write_proof"]
 
@@ -35,6 +38,8 @@ Point = tuple[float, float]
 AS_PLANNED, COMPENSATED = "as planned", "compensated"
 
 _LONGEST_STAND_S = 0.5
+_BY_DESIGN = (FILE_SETS_SHAPER, NOT_COMPENSATED, SHAPER_IS_BETTER)
+"""Warnings about an ordinary file; half of this one is uncompensated on purpose."""
 _GAP_MM, _RIM_MM, _PURGE_MM = 10.0, 4.0, 5.0
 
 
@@ -207,7 +212,7 @@ def _ringing(result: Result) -> dict[str, Ringing]:
 
 
 def _warnings(machine: Machine, result: Result) -> list[str]:
-    out = list(result.warnings)
+    out = [w for w in result.warnings if not any(words in w for words in _BY_DESIGN)]
     stream_commands = adapter(machine).stream_commands()
     if stream_commands.shaper_off and stream_commands.shaper_on is None:
         out.append(

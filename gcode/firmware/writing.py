@@ -30,7 +30,10 @@ from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.types import EventKind, Limits, ModalState
 
-__all__ = ["StreamWriter"]
+__all__ = ["FILE_SETS_SHAPER", "StreamWriter"]
+
+FILE_SETS_SHAPER = "The file sets the firmware's input shaper"
+"""How the warning begins."""
 
 _BYTES_PER_LINE = 96
 _SHAPED = (EventKind.UNKNOWN, EventKind.SHAPER)
@@ -100,7 +103,7 @@ class StreamWriter:
             )
         if said := self._file_shapers.said:
             yield (
-                f"The file sets the firmware's input shaper: {said}. Compensation and shaper do "
+                f"{FILE_SETS_SHAPER}: {said}. Compensation and shaper do "
                 "not add up: in compensated stretches it is off, around them as the file sets it."
             )
 

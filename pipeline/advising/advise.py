@@ -20,6 +20,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.facts import SlicerFacts
+from stillpath.gcode.slicers.features import feature_title
 from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
@@ -319,9 +320,11 @@ class _Job:
                 continue
             bound = bounds.get(f)
             limit = self._bound_um(f, was) if f in choice.rung else None
+            name = names[f] if f >= 0 else "unnamed"
             features.append(
                 AdvisedFeature(
-                    name=names[f] if f >= 0 else "unnamed",
+                    name=name,
+                    title=feature_title(name),
                     accel_mm_s2=bound.at_least if bound else None,
                     exact=f in choice.visible,
                     bound_um=None if limit is None or np.isinf(limit) else limit,
@@ -418,6 +421,7 @@ def _merged(before: Sequence[GroupFigures], after: Sequence[GroupFigures]) -> li
         out.append(
             GroupFigures(
                 name=group.name,
+                title=group.title,
                 seconds=other.seconds,
                 contour_rms_um=_in_order(group.contour_rms_um | other.contour_rms_um),
                 contour_max_um=_in_order(group.contour_max_um | other.contour_max_um),

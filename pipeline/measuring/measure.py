@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stillpath.gcode.slicers.features import feature_title
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
@@ -256,6 +257,7 @@ class Measurement:
             out.append(
                 GroupFigures(
                     name=label,
+                    title=label if names is None else feature_title(label),
                     seconds=round(self._stride * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
                     contour_max_um={

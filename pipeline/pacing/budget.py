@@ -25,6 +25,7 @@ from stillpath.gcode.pacing import (
     top_limits,
 )
 from stillpath.gcode.pieces import Piece
+from stillpath.gcode.slicers.features import feature_title
 from stillpath.gcode.types import Moves
 from stillpath.models.machine import Machine
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -231,9 +232,11 @@ class SpeedBudget:
         """Return what came of it."""
         classes = []
         for one, found in sorted(sums.items()):
+            name = _name(one, names)
             classes.append(
                 BudgetClass(
-                    name=_name(one, names),
+                    name=name,
+                    title=feature_title(name),
                     acceleration_factor=round(self._factors.get(one, 1.0), 4),
                     shaper_acceleration_factor=round(self.shaper_paces.factors.get(one, 1.0), 4),
                     contour_rms_um=found.worst.rms_um,

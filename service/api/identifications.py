@@ -262,7 +262,7 @@ async def _received(request: Request, folder: Path, disk: Disk) -> list[Received
     if not files:
         raise Problem(
             422,
-            "Machine not usable",
+            "Identification not possible",
             "the form holds no file; send at least one measurement",
         )
     return files

@@ -21,7 +21,7 @@ __all__ = [
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 _REFUSED = {
     JobKind.TRAJECTORIES: "Trajectories not available",
-    JobKind.IDENTIFICATION: "Machine not usable",
+    JobKind.IDENTIFICATION: "Identification not possible",
     JobKind.DESIGN: "Design not possible",
     JobKind.CONTROLLER: "Controller not possible",
     JobKind.LIVE: "Live printing not available",

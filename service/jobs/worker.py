@@ -158,7 +158,7 @@ def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[s
     """Compensate the task's file and write its report; see `Runner`."""
     from stillpath.pipeline.compensate import compensate_file
     from stillpath.pipeline.options import Options
-    from stillpath.reports import write_report
+    from stillpath.reports import headline_figures, write_report
     from stillpath.service.compiling import compiling_reported
 
     pinned = task.pinned()
@@ -175,10 +175,14 @@ def run_compensation(task: Task, progress: Callable[[Progress], None]) -> dict[s
     result.warnings.extend(pinned.warnings)
     write_report(result, task.report)
     contour_um = {c.name: c.extruding.contour_rms_um for c in result.channels}
+    shown = headline_figures(result.channels)
     return {
         "original_s": result.original_time_s,
         "written_s": result.time_s,
         **{f"{name}_um": contour_um.get(name) for name in ("before", "after", "shaper")},
+        "headline_um": {
+            name: shown[name] for name in ("before", "after", "range") if shown[name] is not None
+        },
         "put_back": len(result.put_back),
         "warnings": len(result.warnings),
     }

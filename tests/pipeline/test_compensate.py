@@ -125,6 +125,7 @@ def test_method_none_returns_the_bytes(tmp_path: Path, cache: Path) -> None:
         result, written = compensate(data, tmp_path, cache, method="none")
         assert written == data
         assert result.put_back == []
+        assert [c.label for c in result.channels][:2] == ["as sliced", "as written"]
 
 
 @pytest.mark.parametrize(

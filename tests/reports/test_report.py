@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from stillpath.pipeline.result import Result
-from stillpath.reports import render_report, write_report
+from stillpath.cli.console import budget_line
+from stillpath.pipeline.result import BudgetFigures, Result
+from stillpath.reports import headline_figures, render_report, write_report
 from tests.service.synthetic import make_result
 
 
@@ -110,7 +111,7 @@ def test_gaps_stay_gaps(page: str):
 
 def test_a_simulation_promises_nothing():
     page = render_report(make_result(channels=("before", "shaper"), layers=1))
-    assert "the sliced file" in page
+    assert '<p class="note">as sliced</p>' in page
     for word in ("times smaller", "Put back", "The written file", "Compensated"):
         assert word not in page
 
@@ -128,4 +129,35 @@ def test_a_result_without_motion_still_renders(result: Result):
             "pieces": 0,
         }
     )
-    assert "Nothing: all 0 pieces" in render_report(empty)
+    assert "Nothing: no piece of the file was to be compensated" in render_report(empty)
+
+
+def test_a_budget_says_whether_the_shaper_is_quicker(result: Result):
+    budget = BudgetFigures(
+        budget_um=10.0,
+        saved_share=0.3,
+        shaper_time_s=408.9,
+        saved_share_against_shaper=-0.018,
+        classes=[],
+    )
+    for share, words in ((-0.018, "1.8 % more than with"), (0.018, "1.8 % less than with")):
+        found = budget.model_copy(update={"saved_share_against_shaper": share})
+        assert words in render_report(result.model_copy(update={"budget": found}))
+        assert words in budget_line(found)
+
+
+def test_a_part_that_is_compensated_is_compared_with_itself(result: Result):
+    """Not with the whole print as sliced, as the list of jobs did."""
+    selected = {"before": 13.2, "after": 0.84, "shaper": 2.66}
+    channels = [
+        c.model_copy(update={"selected_rms_um": selected[c.name], "contour_range_um": (0.84, 10.1)})
+        for c in result.channels
+    ]
+    figures = headline_figures(channels)
+    assert (figures["before"], figures["after"], figures["range"]) == (13.2, 0.84, (0.84, 10.1))
+
+
+def test_features_have_the_names_of_people_in_both_files(result: Result, page: str):
+    titles = {f["title"] for f in json.loads(result.model_dump_json())["features"]}
+    assert "outer wall (External perimeter)" in titles
+    assert all(title in page for title in titles)

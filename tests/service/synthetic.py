@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 
+from stillpath.gcode.slicers.features import feature_title
 from stillpath.pipeline.result import (
     Channel,
     ErrorFigures,
@@ -89,6 +90,7 @@ def make_result(
         layers=[
             GroupFigures(
                 name=str(k) if k else "before the first layer",
+                title=str(k) if k else "before the first layer",
                 seconds=60 + 10 * rng.random(),
                 contour_rms_um={n: LEVEL[n] * (0.8 + 0.4 * rng.random()) for n in channels},
             )
@@ -97,6 +99,7 @@ def make_result(
         features=[
             GroupFigures(
                 name=name,
+                title=feature_title(name),
                 seconds=seconds,
                 contour_rms_um={n: LEVEL[n] * factor for n in channels},
             )

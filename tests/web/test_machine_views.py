@@ -7,6 +7,7 @@ from pathlib import Path
 
 from playwright.sync_api import expect
 
+from stillpath.applications.identification.page import interval_text
 from tests.applications.test_machine_m503 import M503
 from tests.models.identification.recordings import QUICK_QUERY, quick_raw
 from tests.web.machines import put
@@ -23,7 +24,7 @@ def test_machines_are_listed_and_found(visitor: Visitor, service: Service):
     visitor.shoot(page, "machines")
     page.get_by_role("link", name=re.compile("Voron 2.4")).click()
     expect(page.get_by_role("heading", name="X axis")).to_be_visible()
-    expect(page.get_by_role("region", name="Modes of the X axis")).to_contain_text("65.2")
+    expect(page.get_by_role("region", name="Modes of the X axis")).to_contain_text("65.16 ± 0.73")
     expect(page.locator(".plot canvas")).to_have_count(2)
     visitor.shoot(page, "machine-builtin")
 
@@ -32,7 +33,10 @@ def test_revisions_are_compared_approved_and_brought_back(visitor: Visitor, serv
     put(service, "changed")
     page = visitor.open("#/machines/changed")
     page.get_by_role("button", name="Show differences").click()
-    expect(page.get_by_role("region", name="Differences from 1 to 2")).to_contain_text("4321")
+    expect(page.get_by_role("region", name="Differences from 1 to 2")).to_contain_text(
+        "4321 (-13.6 %)"
+    )
+    expect(page.get_by_role("cell", name="-13.6 %", exact=True)).to_be_visible()
     page.get_by_role("button", name="Approve revision 2").click()
     dialog = page.get_by_role("dialog")
     dialog.get_by_label("Your name").fill("clara")
@@ -61,7 +65,8 @@ def test_a_measurement_is_tried_then_kept(visitor: Visitor, service: Service, tm
         page.locator(f"#test-{name}").fill(str(value))
     page.get_by_role("button", name="Look at the fit").click()
     expect(page.get_by_role("heading", name="The fit")).to_be_focused()
-    expect(page.get_by_role("region", name="Modes of the X axis").last).to_contain_text("42")
+    modes = page.get_by_role("region", name="Modes of the X axis").last
+    expect(modes).to_contain_text(re.compile(r"4[12]\.\d\d ± 0\.\d\d"))
     visitor.shoot(page, "machine-fit")
     assert len(service.api.get("/v1/machines/measured/revisions").json()["revisions"]) == 2
     page.get_by_role("button", name="Keep as the next revision").click()
@@ -94,6 +99,18 @@ def test_a_fit_is_kept_under_the_name_it_was_looked_at(
     assert service.api.get("/v1/machines/another").status_code == 404
 
 
+def test_intervals_are_those_of_the_command_line(visitor: Visitor):
+    page = visitor.open()
+    module = page.locator("script[type=module]").get_attribute("src") or ""
+    cases = [(47.0, None, 2), (46.9996, 0.0002, 2), (46.9996, 1e-9, 2), (0.0612, 0.0007, 4)]
+    shown = page.evaluate(
+        "async ([from, cases]) => {"
+        " const { interval } = await import(from); return cases.map((c) => interval(...c)); }",
+        [f"/{module.replace('app.js', 'lib/format.js')}", cases],
+    )
+    assert shown == [interval_text(*case) for case in cases]
+
+
 def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: Path):
     file = tmp_path / "raw_data_x_broken.csv"
     file.write_text("#time,accel_x,accel_y,accel_z\n0,1,2\n")
@@ -103,6 +120,7 @@ def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: 
     page.get_by_label("Name of your machine").fill("mine")
     page.get_by_role("button", name="Look at the fit").click()
     expect(page.get_by_role("alert")).to_contain_text("raw_data_x_broken.csv")
+    expect(page.get_by_role("alert")).to_contain_text("Identification not possible")
 
 
 def test_a_machine_is_made_of_what_marlin_answers(visitor: Visitor, tmp_path: Path):

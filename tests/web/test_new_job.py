@@ -177,6 +177,28 @@ def test_the_list_has_pages_and_states(visitor: Visitor, service: Service, gear:
         service.api.delete(f"/v1/jobs/{job}")
 
 
+@pytest.mark.parametrize("options", [{}, {"where": "walls"}, {"method": "none"}])
+def test_list_page_and_report_say_the_same(
+    visitor: Visitor, service: Service, options: dict[str, str]
+):
+    job = service.finished(service.submit(GEAR.read_bytes(), "gear.gcode", **options))
+    page = visitor.open("#/jobs")
+    row = page.locator(f"[data-job='{job['id']}'] .figures")
+    listed = [row.locator(f".{name}").inner_text() for name in ("before", "after")]
+    page.goto(f"{visitor.url}/#/jobs/{job['id']}")
+    shown = [page.locator(f".headline .{name}") for name in ("before", "after")]
+    assert listed == [figure.inner_text() for figure in shown]
+    features = page.get_by_role("region", name="Contour error by feature").inner_text()
+    assert "Outer wall (WALL-OUTER)" in features
+    page.goto(visitor.url + job["links"]["report"])
+    expect(page.locator(".figure.main .big")).to_have_text(f"{listed[0]} → {listed[1]} µm")
+    expect(page.get_by_role("rowheader", name="outer wall (WALL-OUTER)")).to_be_visible()
+    if options.get("method") == "none":
+        # Nothing was compensated, and nothing says so.
+        expect(page.get_by_role("columnheader", name="as written").first).to_be_visible()
+        expect(page.locator("main")).to_contain_text("no piece of the file was to be compensated")
+
+
 def test_a_job_that_is_not_there(visitor: Visitor):
     visitor.expected = {404}
     page = visitor.open("#/nowhere")

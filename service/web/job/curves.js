@@ -23,7 +23,7 @@ export function trackChart(report, channels, labels, signal) {
   return h("section", null, h("h2", null, "Along the print"), lineChart({
     title: "Contour error along the print", signal,
     at: Array.from({ length: count }, (_, k) => k * bin),
-    x: { label: "time", text: clock, time: true }, y: { label: "µm, rms", text: (v) => `${um(v)} µm` },
+    x: { label: `print time, ${count * bin < 3600 ? "min:s" : "h:min:s"}`, text: clock, time: true }, y: { label: "µm rms", text: (v) => `${um(v)} µm` },
     series: curves(channels, labels, values),
   }));
 }
@@ -45,7 +45,7 @@ export function spectra(report, channels, labels, signal) {
       h("p.hint", null, axis.resonances_hz.length ? `Resonances at ${axis.resonances_hz.map(hz).join(", ")} Hz` : "No resonances"),
       lineChart({
         title: `Spectrum of the error along ${axis.axis.toUpperCase()}`, signal, at: axis.f_hz, marks: axis.resonances_hz,
-        x: { label: "Hz", text: (v) => `${number(v)} Hz`, tick: (v) => number(v) }, y: { label: "µm/√Hz", text: (v) => `${number(v)} µm/√Hz`, log: true },
+        x: { label: "frequency, Hz", text: (v) => `${number(v)} Hz`, tick: (v) => number(v) }, y: { label: "µm/√Hz", text: (v) => `${number(v)} µm/√Hz`, log: true },
         range: decades(axis.um_per_sqrt_hz), series: curves(channels, labels, axis.um_per_sqrt_hz),
       })))));
 }

@@ -2,7 +2,7 @@
 
 import { announce } from "../lib/announce.js";
 import { fill, h } from "../lib/dom.js";
-import { counted, remaining } from "../lib/format.js";
+import { capital, counted, remaining } from "../lib/format.js";
 
 const ANNOUNCE_EVERY = 0.25;
 
@@ -44,9 +44,4 @@ function begunAnew(job) {
   return job.losses
     ? `restarted, because its worker was lost${job.losses > 1 ? ` ${job.losses} times` : ""}`
     : "restarted, because the service was restarted";
-}
-
-/** @param {string} text */
-function capital(text) {
-  return text ? text[0].toUpperCase() + text.slice(1) : "";
 }

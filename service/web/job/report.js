@@ -2,7 +2,7 @@
 
 import { h } from "../lib/dom.js";
 import { isAbort } from "../lib/api.js";
-import { counted, duration, feature, grouped, bytes, um } from "../lib/format.js";
+import { bytes, capital, counted, duration, grouped, um } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { folded, longTable, table } from "../parts/table.js";
 import { headline } from "./headline.js";
@@ -88,7 +88,7 @@ function features(report, channels, labels) {
   if (groups.length === 0) return null;
   return section("By feature", longTable("Contour error by feature, root mean square", [{ title: "Contour, rms, µm", text: true },
     ...channels.map((c) => ({ title: key(c.name, labels[c.name]) })), { title: "Time", wide: true }], groups, (g) => [
-    feature(g.name), ...channels.map((c) => um(g.contour_rms_um[c.name])), duration(g.seconds)], 12));
+    title(g), ...channels.map((c) => um(g.contour_rms_um[c.name])), duration(g.seconds)], 12));
 }
 
 /** @param {any} report */
@@ -97,11 +97,11 @@ function budget(report) {
   if (!found) return null;
   const saved = (/** @type {number} */ share) => `${(100 * share).toFixed(1)} %`;
   const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
-    : `, and ${saved(found.saved_share_against_shaper)} less than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
+    : `, and ${saved(Math.abs(found.saved_share_against_shaper))} ${found.saved_share_against_shaper >= 0 ? "less" : "more"} than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
   return section("Speed budget",
     h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the sliced file${shaper}.`),
     longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
-      feature(c.name), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
+      title(c), `× ${c.acceleration_factor.toFixed(2)}`, `× ${c.shaper_acceleration_factor.toFixed(2)}`, um(c.contour_rms_um)], 20));
 }
 
 /** @param {any} report */
@@ -112,8 +112,8 @@ function advice(report) {
   return section("Advice",
     h("p", null, `All moves are those of the file. ${grouped(found.lines)} lines were added; without them (they hold “; stillpath advise”) the file is as sliced.`),
     h("p", null, shapers ? `Shaper: ${shapers}.` : `The firmware's shaper stays: ${found.before_shaper}.`),
-    longTable("Advice by feature", [{ title: "Feature", text: true }, { title: "Acceleration, mm/s²" }, { title: "Contour, rms of the worst plant, µm", wide: true }, { title: "May have" }, { title: "Time", wide: true }], found.features, (f) => [
-      feature(f.name), f.accel_mm_s2 === null ? "as sliced" : `${f.exact ? "" : "≥ "}${grouped(Math.round(f.accel_mm_s2))}`, `${um(f.before_um)} → ${um(f.after_um)}`,
+    longTable("Advice by feature", [{ title: "Feature", text: true }, { title: "Acceleration, mm/s²" }, { title: "Contour, rms of the worst plant, µm" }, { title: "Allowed, µm" }, { title: "Time", wide: true }], found.features, (f) => [
+      title(f), f.accel_mm_s2 === null ? "as sliced" : `${f.exact ? "" : "≥ "}${grouped(Math.round(f.accel_mm_s2))}`, `${um(f.before_um)} → ${um(f.after_um)}`,
       f.bound_um === null ? "–" : um(f.bound_um), `${duration(f.before_s)} → ${duration(f.after_s)}`], 20));
 }
 
@@ -123,6 +123,7 @@ function putBack(report, channels) {
   const pieces = report.put_back;
   const byChoice = report.left_out_s ? h("p", null, `By choice (${report.settings.where}) ${duration(report.left_out_s)} of the print, ${duration(report.left_out_extruding_s)} of it extruding, stay as sliced.`) : null;
   const byRule = h("p", null, `By rule ${duration(report.left_alone_s || 0)} of the print (${(100 * (report.left_alone_s || 0) / (report.time_s || 1)).toFixed(2)} %), ${duration(report.left_alone_extruding_s || 0)} of it extruding, keep the file's own lines: after homing or an object's mark, say, or steep ones.`);
+  if (report.pieces === 0) return section("Reverted to the sliced lines", h("p", null, "Nothing: no piece of the file was to be compensated."));
   if (pieces.length === 0) return section("Reverted to the sliced lines", byChoice, byRule, h("p", null, `Nothing: ${report.pieces === 1 ? "the one piece was" : `all ${grouped(report.pieces)} pieces were`} verified and compensated.`));
   return section("Reverted to the sliced lines",
     h("p", null, `${grouped(pieces.length)} of ${counted(report.pieces, "piece")}, ${(100 * report.put_back_extruding_share).toFixed(2)} % of the extruding time. They are in the file as the slicer wrote them.`),
@@ -154,12 +155,12 @@ function written(report) {
   return h("section", null, folded(isLive(report) ? "The file in figures" : "The written file in figures", () => h("dl.facts", null, facts.map(([name, value]) => [h("dt", null, name), h("dd", null, value)]).flat())));
 }
 
+/** Reports of earlier versions hold the slicer's name only. @param {any} group */
+function title(group) {
+  return capital(group.title || group.name) || "Not named";
+}
+
 /** @param {string} name @param {string} label */
 function key(name, label) {
   return h("span.keyed", { dataset: { channel: name } }, label);
-}
-
-/** @param {string} text */
-function capital(text) {
-  return text ? text[0].toUpperCase() + text.slice(1) : "";
 }

@@ -2,7 +2,7 @@
 
 import { getJson, isAbort } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
-import { counted, duration, um } from "../lib/format.js";
+import { capital, counted, duration, um } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { folded, longTable } from "../parts/table.js";
 import { wireGestures } from "./gestures.js";
@@ -56,7 +56,7 @@ export async function layerView(where, labels, signal) {
     slider.value = String(k);
     const layer = index.layers[k];
     const text = `${layer.name}, z ${layer.z_mm} mm`;
-    fill(name, `${k + 1} of ${last + 1}`, h("small", null, `z ${layer.z_mm} mm`));
+    fill(name, capital(layer.name), h("small", null, `z ${layer.z_mm} mm`));
     slider.setAttribute("aria-valuetext", `Layer ${layer.name}, z ${layer.z_mm} millimetres`);
     stage.element.setAttribute("aria-label", `Path of layer ${text}, coloured by contour error. Arrow keys move, plus and minus zoom, brackets change the layer, comma and full stop walk along the path.`);
     if (!isLoading) load();

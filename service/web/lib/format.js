@@ -15,6 +15,38 @@ export function um(value) {
 
 /**
  * @param {number} value
+ * @param {[number, number] | null} [range] Where it may lie instead, if that is known.
+ * @returns {string} "0.92 to 11.0"
+ */
+export function umOrRange(value, range) {
+  return range ? `${um(range[0])} to ${um(range[1])}` : um(value);
+}
+
+/**
+ * A value with its 95 % interval, with as many decimals as that needs.
+ *
+ * @param {number} value
+ * @param {number | null | undefined} deviation Standard deviation.
+ * @param {number} decimals At least.
+ * @returns {string} "34.66 ± 0.07"
+ */
+export function interval(value, deviation, decimals) {
+  if (!deviation) return value.toFixed(decimals);
+  const half = 1.96 * deviation;
+  const shown = Math.min(Math.max(decimals, -Math.floor(Math.log10(half))), decimals + 2);
+  return `${value.toFixed(shown)} ± ${half.toFixed(shown)}`;
+}
+
+/**
+ * @param {string} text
+ * @returns {string} Beginning with a capital.
+ */
+export function capital(text) {
+  return text ? text[0].toUpperCase() + text.slice(1) : "";
+}
+
+/**
+ * @param {number} value
  * @returns {string} With a thin space between thousands.
  */
 export function grouped(value) {
@@ -108,15 +140,6 @@ export function when(moment) {
  */
 export function counted(count, one, many = `${one}s`) {
   return `${grouped(count)} ${count === 1 ? one : many}`;
-}
-
-/**
- * @param {string} name A feature as slicers write it.
- * @returns {string}
- */
-export function feature(name) {
-  const text = name.replaceAll(/[-_]+/g, " ").trim().toLowerCase();
-  return text ? text[0].toUpperCase() + text.slice(1) : "Not named";
 }
 
 /** @param {number} value */

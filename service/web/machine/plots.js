@@ -1,11 +1,11 @@
 /** Plants over frequency: modulus and phase of the model, of its set, and what was measured. */
 
 import { h } from "../lib/dom.js";
-import { hz, number } from "../lib/format.js";
+import { interval, number } from "../lib/format.js";
 import { lineChart } from "../charts/line-chart.js";
 import { table } from "../parts/table.js";
 
-const HZ = { label: "Hz", text: (/** @type {number} */ v) => `${number(v)} Hz`, tick: (/** @type {number} */ v) => number(v) };
+const HZ = { label: "frequency, Hz", text: (/** @type {number} */ v) => `${number(v)} Hz`, tick: (/** @type {number} */ v) => number(v) };
 
 /**
  * @param {any[]} responses Of both axes, from the service.
@@ -21,7 +21,7 @@ export function responsePlots(responses, signal) {
       series: [...members(axis.members, "magnitude", axis.nominal.f_hz.length), { label: axis.members.length ? "Nominal (thin: its set)" : "Nominal", values: axis.nominal.magnitude, colour: "--after", width: 2.2 }],
     }),
     modeTable(axis),
-    h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "Where the model was measured is not known."))));
+    h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "The machine's document names no measurement of this axis: frequencies and damping may be typed in or typical."))));
 }
 
 /**
@@ -51,7 +51,7 @@ export function fitPlots(axis, signal) {
       series: [{ label: "Measured", values: s.measured, colour: "--soft", width: 1.2 }, { label: "Model", values: s.predicted, colour: "--after", width: 2.2 }],
     })),
     axis.responses.flatMap((/** @type {any} */ r) => [lineChart({
-      title: `Measured and fitted response, ${letter}: ${r.label}`, signal, at: r.f_hz, x: HZ, y: { label: "|G|" },
+      title: `Measured and fitted response, ${letter}: ${r.label}`, signal, at: r.f_hz, x: HZ, y: { label: "|G|, mm/mm" },
       series: [{ label: "Measured", values: r.magnitude, colour: "--before", dots: true }, { label: "Model", values: onto(axis.model, "magnitude", r.f_hz), colour: "--after", width: 2.2 }],
     }), lineChart({
       title: `Phase, ${letter}: ${r.label}`, signal, at: r.f_hz, x: HZ, y: { label: "phase, °" },
@@ -65,9 +65,9 @@ export function fitPlots(axis, signal) {
 /** @param {any} axis With `modes`. */
 function modeTable(axis) {
   if (axis.modes.length === 0) return h("p.hint", null, "No resonances.");
-  const spread = (/** @type {number | null} */ sd, /** @type {number} */ digits) => (sd === null || sd === undefined ? "" : ` ± ${number(2 * sd, digits)}`);
-  return table(`Modes of the ${axis.axis.toUpperCase()} axis`, [{ title: "Mode", text: true }, { title: "Frequency, Hz" }, { title: "Damping ratio" }],
-    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), `${hz(m.f_hz)}${spread(m.f_sd_hz, 2)}`, `${m.zeta.toFixed(3)}${spread(m.zeta_sd, 2)}`]));
+  const modes = table(`Modes of the ${axis.axis.toUpperCase()} axis`, [{ title: "Mode", text: true }, { title: "Frequency, Hz" }, { title: "Damping ratio" }],
+    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), interval(m.f_hz, m.f_sd_hz, 2), interval(m.zeta, m.zeta_sd, 4)]));
+  return axis.modes.some((/** @type {any} */ m) => m.f_sd_hz) ? h("div", null, modes, h("p.hint", null, "± is 95 %, from the fit's own scatter.")) : modes;
 }
 
 /** @param {any[]} curves @param {"magnitude"} what @param {number} length */

@@ -4,7 +4,7 @@ import { getJson, isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, h } from "../lib/dom.js";
-import { number, when } from "../lib/format.js";
+import { when } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { table } from "../parts/table.js";
 
@@ -49,7 +49,7 @@ export async function revisionPanel(where, name, signal) {
   function show(/** @type {any} */ diff) {
     fill(changes, h("h3", null, `From ${diff.before} to ${diff.after}`), diff.changes.length
       ? table(`Differences from ${diff.before} to ${diff.after}`, [{ title: "What", text: true }, { title: "Change" }, { title: "Place", text: true, wide: true }],
-        diff.changes.map((/** @type {any} */ c) => [c.text, c.percent === null ? "" : `${c.percent > 0 ? "+" : ""}${number(c.percent, 2)} %`, h("code", null, c.place)]))
+        diff.changes.map((/** @type {any} */ c) => [c.text, c.percent === null ? "" : `${c.percent > 0 ? "+" : ""}${c.percent.toFixed(1)} %`, h("code", null, c.place)]))
       : h("p.hint", null, "They do not differ."));
   }
 

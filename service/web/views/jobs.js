@@ -4,7 +4,7 @@ import { getJson, isAbort, request } from "../lib/api.js";
 import { announce } from "../lib/announce.js";
 import { confirmed } from "../lib/dialog.js";
 import { fill, h } from "../lib/dom.js";
-import { bytes, duration, um, when } from "../lib/format.js";
+import { bytes, duration, um, umOrRange, when } from "../lib/format.js";
 import { problemPanel } from "../lib/problem.js";
 import { isOver } from "../lib/watch.js";
 import { stateBadge } from "../parts/state.js";
@@ -112,9 +112,11 @@ function outcome(job) {
   if (job.state === "failed") return h("small.bad", null, job.error?.detail ?? job.error?.title ?? "");
   const figures = job.summary;
   if (job.state !== "done" || !figures) return null;
-  if (Number.isFinite(figures.after_um)) {
-    return h("span.figures", null, h("span.before", null, um(figures.before_um)), " → ", h("span.after", null, um(figures.after_um)), " µm",
+  // Jobs of earlier versions have no headline.
+  const { before, after, range } = figures.headline_um ?? { before: figures.before_um, after: figures.after_um };
+  if (Number.isFinite(after)) {
+    return h("span.figures", null, h("span.before", null, um(before)), " → ", h("span.after", null, umOrRange(after, range)), " µm",
       h("small", null, duration(figures.written_s)));
   }
-  return Number.isFinite(figures.before_um) ? h("span.figures", null, `${um(figures.before_um)} µm`) : null;
+  return Number.isFinite(before) ? h("span.figures", null, `${um(before)} µm`) : null;
 }

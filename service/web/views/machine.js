@@ -2,7 +2,7 @@
 
 import { getJson, isAbort } from "../lib/api.js";
 import { fill, h } from "../lib/dom.js";
-import { number } from "../lib/format.js";
+import { capital, number } from "../lib/format.js";
 import { fileLink } from "../lib/files.js";
 import { problemPanel } from "../lib/problem.js";
 import { folded } from "../parts/table.js";
@@ -83,6 +83,5 @@ function words(key) {
   for (const [suffix, unit] of Object.entries(units)) {
     if (key.endsWith(suffix)) return words(key.slice(0, -suffix.length)) + unit;
   }
-  const text = key.replaceAll("_", " ");
-  return text[0].toUpperCase() + text.slice(1);
+  return capital(key.replaceAll("_", " "));
 }

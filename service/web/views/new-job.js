@@ -17,7 +17,7 @@ const METHODS = [
   ["Firmware shapers", [["shaper:zv", "ZV"], ["shaper:mzv", "MZV"], ["shaper:ei", "EI"], ["shaper:2hump_ei", "2-hump EI"], ["shaper:3hump_ei", "3-hump EI"]]],
   ["", [["advise", "Advise: moves stay, firmware commands are added"], ["none", "None: measure only"]]],
 ];
-const DIALECTS = [["", "As the machine's firmware reads it"], ["klipper", "Klipper"], ["marlin", "Marlin"], ["prusa", "Prusa"], ["bambu", "Bambu"], ["reprapfirmware", "RepRapFirmware"]];
+const DIALECTS = [["", "The machine's firmware"], ["klipper", "Klipper"], ["marlin", "Marlin"], ["prusa", "Prusa"], ["bambu", "Bambu"], ["reprapfirmware", "RepRapFirmware"]];
 
 /** @param {import("../lib/router.js").Place} place */
 export async function show({ main, signal, setTitle }) {
@@ -119,7 +119,7 @@ function complaint(file) {
 /** What few need, folded away. */
 function moreOptions() {
   const basis = select("basis", [["", [["ce-opt", "CE-optimal"], ["robust", "Robust"], ["bspline", "B-splines"], ["dct", "Cosines"]]]]);
-  const robust = select("robust", [["", [["auto", "Automatic: what the measurement bears"], ["off", "The nominal plant"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
+  const robust = select("robust", [["", [["auto", "Automatic"], ["off", "The nominal plant"], ["ensemble", "All of its set"], ["minimax", "The worst of its set"]]]]);
   const along = h("input", { type: "number", id: "along", min: "0.01", max: "1", step: "0.01", placeholder: "1" });
   const budget = h("input", { type: "number", id: "budget", min: "0.5", max: "1000", step: "0.5", placeholder: "keep all speeds" });
   const where = select("where", [["", [["all", "Everywhere"], ["visible", "Outer walls, top and bottom"], ["walls", "Outer walls"]]]]);
