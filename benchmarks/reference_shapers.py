@@ -2,7 +2,7 @@
 
     python benchmarks/reference_shapers.py [--write]
 
-Prints machine, revision, shaper and error, and whether
+Prints machine, digest of its plants and limits, shaper and error, and whether
 `pipeline/measuring/reference_shapers.json` says the same; exits with 1 if it does not. With
 `--write` the file is made anew: after a change of a built-in machine, of the reference motion or of
 what the best shaper is.
@@ -35,10 +35,11 @@ def main() -> int:
         machine = load_machine(name)
         motion, extruding = reference_motion_of(machine, DT_S)
         best = reference_shaper.tune_shaper(machine, motion, DT_S, extruding)
-        found[name] = {"revision": machine.revision, "shaper": asdict(best)}
+        digest = reference_shaper.tuning_digest(machine)
+        found[name] = {"digest": digest, "shaper": asdict(best)}
         verdict = "" if known.get(name) == found[name] else "MISS"
         print(
-            f"{name:20} {machine.revision} {best.label:28} {best.contour_rms_um:8.3f} um {verdict}",
+            f"{name:20} {digest} {best.label:28} {best.contour_rms_um:8.3f} um {verdict}",
             flush=True,
         )
     if given.write:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillpath.models.machine import Machine
 
-__all__ = ["reference_motion", "reference_motion_of"]
+__all__ = ["reference_limits", "reference_motion", "reference_motion_of"]
 
 Array = NDArray[np.float64]
 
@@ -29,13 +29,23 @@ _FIGURES = (
 _REST_S = 0.15
 
 
+def reference_limits(machine: Machine) -> tuple[float, float]:
+    """Return the speed [mm/s] and acceleration [mm/s2] up to which a machine plans the motion."""
+    fastest_mm_s = max(_TRAVEL_MM_S, *(v for v, _, _ in _FIGURES))
+    largest_accel_mm_s2 = max(_TRAVEL_MM_S2, *(a for _, a, _ in _FIGURES))
+    firmware = machine.firmware
+    return (
+        min(fastest_mm_s, firmware.fastest_mm_s),
+        min(largest_accel_mm_s2, firmware.largest_accel_mm_s2),
+    )
+
+
 def reference_motion_of(machine: Machine, dt_s: float = 1e-3) -> tuple[Array, NDArray[np.bool_]]:
     """Return the reference motion as the firmware of a machine would plan it.
 
     What it would never plan tells nothing of the machine.
     """
-    firmware = machine.firmware
-    return reference_motion(dt_s, firmware.fastest_mm_s, firmware.largest_accel_mm_s2)
+    return reference_motion(dt_s, *reference_limits(machine))
 
 
 def reference_motion(

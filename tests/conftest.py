@@ -14,7 +14,7 @@ from tests.nginx import is_installed as _nginx_is_installed
 from tests.service.database.postgres import MISSING as _NO_POSTGRESQL
 from tests.service.database.postgres import is_installed, postgres_server, postgres_url
 
-__all__ = ["postgres_server", "postgres_url", "shared_dir"]
+__all__ = ["cache", "postgres_server", "postgres_url", "shared_dir"]
 
 # Before numpy and numba are imported anywhere.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -43,6 +43,12 @@ def shared_dir() -> Path:
     folder = _shared()
     assert folder is not None, _MISSING  # a test without it is stopped before, by its marker
     return folder
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of what is designed once per machine; the names of its files say for which."""
+    return tmp_path_factory.mktemp("cache")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -13,6 +13,7 @@ grid with more points finds their floor, and all points decide between the best.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import math
@@ -29,8 +30,8 @@ from numpy.typing import NDArray
 from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
-from stillpath.models.reference_motion import reference_motion_of
-from stillpath.simulation.measures import Tally, contour_error, distance_to_path, tracking_error
+from stillpath.models.reference_motion import reference_limits, reference_motion_of
+from stillpath.simulation.measures import PathDistances, Tally, contour_error, tracking_error
 from stillpath.simulation.response import response
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "shaped_at",
     "tune_each",
     "tune_shaper",
+    "tuning_digest",
 ]
 
 Array = NDArray[np.float64]
@@ -149,14 +151,15 @@ def evaluate_shaper(
 
 
 def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> BestShaper:
-    """Return the best shaper on the reference motion, tuned once per machine revision.
+    """Return the best shaper on the reference motion, tuned once for what it depends on.
 
     The result is a small JSON file in `directory`, written whole or not at all. A file that
     cannot be read is made again. For the built-in machines it comes with the program.
     """
-    if round(dt_s * 1e6) == _SHIPPED_US and machine.revision in _shipped():
-        return _shipped()[machine.revision]
-    path = directory / f"shaper-{machine.revision}-{round(dt_s * 1e6)}us-v{_VERSION}.json"
+    basis = tuning_digest(machine)
+    if round(dt_s * 1e6) == _SHIPPED_US and basis in _shipped():
+        return _shipped()[basis]
+    path = directory / f"shaper-{basis}-{round(dt_s * 1e6)}us-v{_VERSION}.json"
     with contextlib.suppress(OSError, ValueError, TypeError):
         found = BestShaper(**json.loads(path.read_text(encoding="utf-8")))
         if found.type in SHAPERS and min(found.fx_hz, found.fy_hz) > 0:
@@ -175,13 +178,20 @@ def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> Best
     return best
 
 
+def tuning_digest(machine: Machine) -> str:
+    """Return 12 hex digits that change with the nominal plants and the reference motion only."""
+    plants = {axis: machine.axes[axis].nominal.model_dump(mode="json") for axis in ("x", "y")}
+    document = json.dumps([plants, reference_limits(machine)], sort_keys=True)
+    return hashlib.sha256(document.encode()).hexdigest()[:12]
+
+
 @cache
 def _shipped() -> dict[str, BestShaper]:
-    """Return the shapers of built-in machines, by revision (`benchmarks/reference_shapers.py`)."""
+    """Return the shapers of built-in machines, by digest (`benchmarks/reference_shapers.py`)."""
     found = json.loads(_SHIPPED.read_text(encoding="utf-8"))
     if found["version"] != _VERSION:
         return {}
-    return {row["revision"]: BestShaper(**row["shaper"]) for row in found["machines"].values()}
+    return {row["digest"]: BestShaper(**row["shaper"]) for row in found["machines"].values()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -200,6 +210,7 @@ class _Trial:
         use = extruding if extruding.any() else np.ones(len(extruding), bool)
         self._y_d, use = _with_rests(y_d_mm, use, dt_s)
         self._dt_s = dt_s
+        self._distances = PathDistances(self._y_d, dt_s)
         self._answer = response(_plants(machine, dt_s), self._y_d)
         chosen = np.flatnonzero(use)
         self._chosen = chosen.astype(np.int64)
@@ -223,7 +234,7 @@ class _Trial:
         if key not in self._known:
             at = self._points[points].index
             y = np.stack([self._axis(0, kind, i, points), self._axis(1, kind, j, points)])
-            error = distance_to_path(self._y_d, y, at, self._dt_s)
+            error = self._distances.at(y, at)
             self._known[key] = float(np.sqrt(error @ error / len(error)))
         return self._known[key]
 

@@ -188,10 +188,10 @@ def test_own_lines_at_start_and_end_and_the_shaper_put_back():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", builtin_machines())
-def test_the_compensated_half_of_the_coupon_is_three_times_nearer(name, tmp_path):
+def test_the_compensated_half_of_the_coupon_is_three_times_nearer(name, tmp_path, cache):
     machine = load_machine(name)
     planned = moves_of(text_of("coupon", machine).encode(), machine)[0]
-    made = write_coupon(machine, tmp_path / "c.gcode", cache_dir=tmp_path)
+    made = write_coupon(machine, tmp_path / "c.gcode", cache_dir=cache)
     data = (tmp_path / "c.gcode").read_bytes()
     assert data.startswith(b"; Coupon for ")
     written, _, last = moves_of(data, machine)
@@ -221,9 +221,9 @@ def write_again(source: Path, machine: Machine) -> None:
 @pytest.mark.parametrize(
     ("name", "axis"), [(name, "xy"[k % 2]) for k, name in enumerate(builtin_machines())]
 )
-def test_every_band_of_the_tower_is_three_times_nearer(name, axis, tmp_path):
+def test_every_band_of_the_tower_is_three_times_nearer(name, axis, tmp_path, cache):
     machine = load_machine(name)
-    made = write_tower(machine, axis, tmp_path / "t.gcode", count=3, cache_dir=tmp_path)
+    made = write_tower(machine, axis, tmp_path / "t.gcode", count=3, cache_dir=cache)
     moves_of((tmp_path / "t.gcode").read_bytes(), machine)
     assert len(made.bands) == 3
     assert made.written.result.put_back == []

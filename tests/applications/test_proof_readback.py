@@ -172,9 +172,9 @@ def test_files_that_are_no_log(machine, printed, tmp_path):
         ("taz6-x", 3200, 1 - 1e-4, 300, 20),
     ],
 )
-def test_compensated_prints(name, rate_hz, clock, start_s, seconds, tmp_path):
+def test_compensated_prints(name, rate_hz, clock, start_s, seconds, tmp_path, cache):
     machine, printed, log = load_machine(name), tmp_path / "c.gcode", tmp_path / "log.csv"
-    write_coupon(machine, printed, cache_dir=tmp_path)
+    write_coupon(machine, printed, cache_dir=cache)
     record(
         printed,
         machine,

@@ -37,11 +37,6 @@ REFUSED = {
 """What cannot be done, and what is said then."""
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def test_the_plain_reader() -> None:
     found = read(
         b"G28\nG1 X5 Y5 E2 F600\nG92 E0\nG1 E1 X-3\nM83\ng1x7e.5 ; X99\nT1\nN7 G1 Z2 E1*33\n"

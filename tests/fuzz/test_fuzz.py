@@ -84,11 +84,6 @@ def test_what_a_file_says_about_itself_is_found_in_passing(name: str) -> None:
     assert detect(head).certainty < 1.0
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 FOUND = {
     "an arc may begin with chords of Z alone": (
         "G28\nM83\nG1 X126 Y120\nG1 X125.518 Y120.144 E.06729\nG4 P1\nG3 X12 Z3 I1 K1\n"

@@ -70,11 +70,6 @@ CASES = {
 START = "G28\nG90\nM83\nG1 X60 Y60 F6000\nG1 X90 E2.3\nG1 Y90 E2.1\n"
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 REFUSED = {(kind, NO_NUMBER) for kind in KINDS if kind != "marlin"} | {("klipper", INCHES)}
 
 

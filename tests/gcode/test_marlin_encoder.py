@@ -218,12 +218,12 @@ def test_a_stock_machine_can(per_mm: float) -> None:
 PRINT = HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2100\nG28 X\n"
 
 
-def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None:
+def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path, cache: Path) -> None:
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_text("M204 P1500 T1800\n" + PRINT)
     firmware = FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)})
     machine = with_firmware(firmware)
-    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
     assert result.pieces > 0
     assert result.put_back == []
     text = target.read_bytes()
@@ -239,14 +239,14 @@ def test_a_print_is_compensated_and_its_limits_come_back(tmp_path: Path) -> None
 @pytest.mark.slow
 @pytest.mark.parametrize("stated", [True, None])
 def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
-    tmp_path: Path, stated: bool | None
+    tmp_path: Path, cache: Path, stated: bool | None
 ) -> None:
     """Whether the machine says that it has it or only the file does."""
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_text("M900 K0.05\n" + PRINT)
     facts = {"home_mm": (0.0, 0.0, 0.0), "linear_advance": stated}
     machine = with_firmware(FIRMWARE.model_copy(update=facts))
-    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
     assert result.pieces > 0
     assert result.put_back == []
     text = target.read_bytes()
@@ -266,7 +266,7 @@ def test_linear_advance_is_off_in_the_stream_and_on_again_after_it(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["M82", "M83"])
-def test_far_from_zero_no_filament_is_lost(tmp_path: Path, mode: str) -> None:
+def test_far_from_zero_no_filament_is_lost(tmp_path: Path, cache: Path, mode: str) -> None:
     """Marlin adds up E in single precision: nine metres out a stream would lose a percent."""
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     lines, e = [f"{mode}\nG92 E9000\nG1 X120 Y100 F6000"], 9000.0
@@ -281,7 +281,7 @@ def test_far_from_zero_no_filament_is_lost(tmp_path: Path, mode: str) -> None:
     source.write_bytes(original)
     machine = with_firmware(FIRMWARE.model_copy(update={"home_mm": (0.0, 0.0, 0.0)}))
     options = Options(method="shaper:mzv")
-    result = compensate_file(source, target, machine, options, cache_dir=tmp_path / "cache")
+    result = compensate_file(source, target, machine, options, cache_dir=cache)
     assert result.put_back == []
     written = target.read_bytes()
     assert differences(original, written, machine) == []

@@ -284,7 +284,7 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
 
 
 @pytest.mark.slow
-def test_a_stock_printer_executes_every_move_of_a_stream(tmp_path: Path) -> None:
+def test_a_stock_printer_executes_every_move_of_a_stream(tmp_path: Path, cache: Path) -> None:
     firmware = Marlin(
         steps_per_mm=PerAxis(x=80.0, y=80.0, z=400.0, e=93.0),
         planner=MarlinPlanner(
@@ -300,7 +300,7 @@ def test_a_stock_printer_executes_every_move_of_a_stream(tmp_path: Path) -> None
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     print_ = "\n".join([*polygon(6, 15), *polygon(4, 2, (113.0, 100.0), feed=1800)])
     source.write_text(HEAD + "G1 X115 Y100 F6000\n" + print_ + "\nG1 E-1 F2100\nG28 X\n")
-    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path / "cache")
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
     assert result.put_back == []
     assert result.emission_max_um < 60.0
     text = target.read_bytes()

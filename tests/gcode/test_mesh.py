@@ -78,12 +78,12 @@ def test_stream_limits_are_what_z_leaves() -> None:
     )
 
 
-def test_a_bed_too_crooked_for_z_is_refused(tmp_path) -> None:
+def test_a_bed_too_crooked_for_z_is_refused(tmp_path, cache) -> None:
     machine = crooked(0.02)
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_text(HEAD + BODY)
     with pytest.raises(ModelError, match=r"mesh_slope.*max_z_accel.*level the bed"):
-        compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+        compensate_file(source, target, machine, Options(), cache_dir=cache)
     assert not target.exists()
     assert list(tmp_path.iterdir()) == [source]
 

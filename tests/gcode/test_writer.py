@@ -35,11 +35,6 @@ def machine() -> Machine:
     return load_machine("ender3")
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 class Pipeline:
     def __init__(self, folder: Path, cache: Path, machine: Machine) -> None:
         self.folder, self.cache, self.machine = folder, cache, machine

@@ -7,7 +7,6 @@ import contextlib
 import io
 import json
 import shlex
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,8 +20,6 @@ from stillpath.cli.main import run
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.models.store import load_machine
-from stillpath.pipeline.files import default_cache_dir
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from tests.gcode.container_files import binary, package
 from tests.integrations.cura import Cura
 from tests.integrations.moonraker import Config, Server, ServerError, component_module
@@ -57,15 +54,8 @@ def file(tmp_path: Path) -> Iterator[Path]:
 def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A server with the real pipeline."""
     data = tmp_path_factory.mktemp("real")
-    # Tuning the reference shaper takes its seconds, and once is enough.
-    cached_shaper(load_machine("ender3"), default_cache_dir(), 1e-3)
-    shutil.copytree(default_cache_dir(), data / "cache", ignore=_other_than_shapers)
     with server(REAL, data) as (client, _):
         yield str(client.base_url).rstrip("/")
-
-
-def _other_than_shapers(folder: str, names: list[str]) -> list[str]:
-    return [name for name in names if not name.startswith("shaper-")]
 
 
 # On this computer. `compensate` with a method that needs no design: the file is looked at first.

@@ -83,20 +83,20 @@ def test_a_fast_corexy_is_driven_more_gently_where_its_motors_would_step_too_far
     assert bends_mm[1] <= 16e-3 * 1.001
 
 
-def test_what_climbs_too_fast_is_told(tmp_path: Path) -> None:
+def test_what_climbs_too_fast_is_told(tmp_path: Path, cache: Path) -> None:
     """Moves that keep their own lines because Z could not follow are no secret."""
     machine = load_machine("voron-v0")
     wall = "".join(f"G1 X{60 + 20 * (i % 2)} Z{6 + i} E1 F1200\n" for i in range(20))
     source = tmp_path / "climb.gcode"
     source.write_text(HEAD + wall)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert result.put_back == []
     assert any("climb faster than Z can follow" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize(("steps_per_mm", "told"), [(32.0, True), (400.0, False)])
 def test_where_the_shaper_would_serve_better_it_is_said(
-    steps_per_mm: float, told: bool, tmp_path: Path
+    steps_per_mm: float, told: bool, tmp_path: Path, cache: Path
 ) -> None:
     """Vertices on steps of .03 mm shake the printer more than the sliced file: that stays."""
     drive = Drive(steps_per_mm=steps_per_mm, max_speed_mm_s=300.0, max_accel_mm_s2=3000.0)
@@ -105,7 +105,7 @@ def test_where_the_shaper_would_serve_better_it_is_said(
     source = tmp_path / "ring.gcode"
     ring = "G1 X84 Y77 E1\nG1 X59 Y84 E1\nG1 X37 Y61 E1\nG1 X60 Y50 E1\n"
     source.write_text(HEAD + "G1 F6000\n" + 4 * ring)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert ["as sliced" in one.reason for one in result.put_back] == [True] * told
     assert any("shaper would serve this file better" in w for w in result.warnings) is told
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -16,17 +15,6 @@ from stillpath.pipeline.result import Result
 from tests.gcode.cutting import HEAD
 from tests.gcode.prints import polygon
 from tests.pipeline.test_compensate import check_file
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("cache")
-    # What tuning finds; a name of another version only makes it find that again.
-    found = {"type": "zv", "fx_hz": 45.9, "fy_hz": 32.2, "zeta": 0.1}
-    text = json.dumps({**found, "contour_rms_um": 0.0, "tracking_rms_um": 0.0})
-    revision = load_machine("ender3").revision
-    (folder / f"shaper-{revision}-1000us-v1.json").write_text(text)
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -74,13 +74,13 @@ def test_a_wide_set_asks_for_more_of_the_shaper(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["ender3", "voron-v24-250"])
-def test_no_member_fares_worse_than_with_the_shaper(name: str, tmp_path: Path) -> None:
+def test_no_member_fares_worse_than_with_the_shaper(name: str, cache: Path) -> None:
     """The promise, member by member, measured without the code that made the choice."""
     machine = load_machine(name)
-    best = cached_shaper(machine, tmp_path)
+    best = cached_shaper(machine, cache)
     options = Options()
     assert design_mode(machine, options) == "ensemble"
-    chosen = caution_for(machine, options, best, tmp_path, DT_S)
+    chosen = caution_for(machine, options, best, cache, DT_S)
     assert chosen is not None
     caution, choice = chosen
     assert f"({choice.worst:.2f} on the worst of them)" in prediction_note(machine, choice)

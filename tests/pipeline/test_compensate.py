@@ -41,11 +41,6 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "ps_ender3_pauses_hept24f.gco
 SMALL = (HEAD + "G1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\nG1 E-1 F2100\n").encode()
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def wide(machine: Machine) -> Machine:
     """The machine with room for files of other printers."""
     travel = {axis: AxisTravel(min_mm=-5000, max_mm=5000) for axis in ("x", "y", "z")}

@@ -24,11 +24,6 @@ TEXT = b"".join(line for line in TEXT.splitlines(keepends=True) if line.strip())
 
 
 @pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="session")
 def compensated(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> bytes:
     """What the plain text becomes."""
     return compensate(tmp_path_factory.mktemp("plain"), cache, "part.gcode", TEXT)

@@ -63,11 +63,6 @@ def test_refused_before_it_is_computed(tmp_path: Path, cache: Path, method: str)
     assert [path.name for path in tmp_path.iterdir()] == ["in.gcode"]
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def test_long_stands_cost_no_figures(tmp_path: Path, cache: Path) -> None:
     """Forty hours of dwells: the time is told, the figures are those of short ones."""
     source, machine = tmp_path / "in.gcode", load_machine("ender3")

@@ -18,7 +18,9 @@ TINY = "G1 X50.0001 Y50.0001 E.00001\nG1 X50.0002 E.00001\nG1 X50 Y50 E.00001\n"
 STOP = "M400\nG4 P10\n"
 
 
-def test_a_fault_of_ours_costs_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_of_ours_costs_one_piece(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole, calls = PieceCompensator.compensate, []
 
     def faulty(self: PieceCompensator, *given: object) -> object:
@@ -32,7 +34,7 @@ def test_a_fault_of_ours_costs_one_piece(tmp_path: Path, monkeypatch: pytest.Mon
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(data)
     machine = load_machine("ender3")
-    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
     (fault,) = result.put_back
     assert "internal error (IndexError: index 3 is out of bounds)" in fault.reason
     assert fault.reason.startswith(f"line {fault.line_first}:")
@@ -41,11 +43,11 @@ def test_a_fault_of_ours_costs_one_piece(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", ["ender3", "generic-corexy"])
-def test_moves_below_the_grid_of_a_file(name: str, tmp_path: Path) -> None:
+def test_moves_below_the_grid_of_a_file(name: str, tmp_path: Path, cache: Path) -> None:
     data = (HEAD + SQUARE + STOP + TINY + STOP + SQUARE).encode()
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_bytes(data)
     machine = load_machine(name)
-    result = compensate_file(source, target, machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, target, machine, Options(), cache_dir=cache)
     assert all("internal error" not in piece.reason for piece in result.put_back)
     check_file(data, target.read_bytes(), machine)

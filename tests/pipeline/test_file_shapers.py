@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
 from tests.gcode.prints import polygon
@@ -52,23 +50,10 @@ def machine_with(kind: str, **firmware: object) -> Machine:
     return Machine.model_validate(document | {"firmware": section})
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-def tuned_for(machine: Machine, cache: Path) -> None:
-    """Let a machine of the same plants have the same best shaper: tuning takes its seconds."""
-    best = cached_shaper(load_machine("ender3"), cache)
-    name = f"shaper-{machine.revision}-1000us-v1.json"
-    (cache / name).write_text(json.dumps(asdict(best)))
-
-
 def compensated(text: str, machine: Machine, folder: Path, cache: Path) -> tuple[Result, list[str]]:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_text(text)
     options = Options(method="zpetc")
-    tuned_for(machine, cache)
     result = compensate_file(source, target, machine, options, cache_dir=cache)
     return result, target.read_text().splitlines()
 

@@ -42,11 +42,6 @@ def body(kind: str) -> bytes:
     return BODY.format(limits=LIMITS[kind], relative=relative).encode()
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_compensated(kind: str, tmp_path: Path, cache: Path) -> None:
     machine = machine_with(kind)

@@ -39,11 +39,6 @@ SMALL = (
 )
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def with_modes(f_hz: tuple[float, float], zeta: float) -> Machine:
     machine = load_machine("ender3")
     axes = {

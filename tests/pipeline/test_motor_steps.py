@@ -41,16 +41,14 @@ def rms_um(result: Result) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("kind", ["marlin", "reprapfirmware"])
-def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path) -> None:
+def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path, cache: Path) -> None:
     machine = machine_with(kind)
     source = tmp_path / "lines.gcode"
     source.write_text(LINES)
-    seen = rms_um(simulate_file(source, machine, cache_dir=tmp_path))
+    seen = rms_um(simulate_file(source, machine, cache_dir=cache))
     for method in ("none", "fbf"):
         options = Options(method=method)
-        result = compensate_file(
-            source, tmp_path / "out.gcode", machine, options, cache_dir=tmp_path
-        )
+        result = compensate_file(source, tmp_path / "out.gcode", machine, options, cache_dir=cache)
         found = rms_um(result)
         assert found["before"] == pytest.approx(5.0, abs=0.3)
         assert found["before"] == pytest.approx(seen["before"], abs=0.05)
@@ -58,7 +56,7 @@ def test_rounding_to_steps_is_an_error(kind: str, tmp_path: Path) -> None:
         assert found["after"] <= found["before"] + 0.1
 
 
-def test_a_wipe_on_the_spot_may_wait(tmp_path: Path) -> None:
+def test_a_wipe_on_the_spot_may_wait(tmp_path: Path, cache: Path) -> None:
     """What is too short for Marlin waits for the next move: the piece is good without it."""
     wipe = "G1 Z5.2 F600\nG1 E1 F2100\nG1 F8640\n" + "".join(
         f"G1 X110 Y60.{y} E-.01\n" for y in ("080", "043", "005")
@@ -66,7 +64,7 @@ def test_a_wipe_on_the_spot_may_wait(tmp_path: Path) -> None:
     source = tmp_path / "wipe.gcode"
     source.write_text(f"{LINES}{wipe}G4 P500\nG1 E-.8 F2100\nG1 X60 Y60 F6000\n")
     machine = machine_with("marlin")
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert result.put_back == []
     written = tmp_path / "out.gcode"
     assert "Y60.043" not in written.read_text()
@@ -75,7 +73,7 @@ def test_a_wipe_on_the_spot_may_wait(tmp_path: Path) -> None:
 @pytest.mark.parametrize("junction", ["classic_jerk", "deviation"])
 @pytest.mark.parametrize("y_steps", [(0, 0), (0, 1), (0, 1, 0, -1)])
 def test_moves_of_single_steps_lose_no_time(
-    junction: str, y_steps: tuple[int, ...], tmp_path: Path
+    junction: str, y_steps: tuple[int, ...], tmp_path: Path, cache: Path
 ) -> None:
     """To and fro, in stairs, in a meander: slower than the firmware steps, it ran ahead."""
     document = machine_with("marlin").model_dump(mode="json")
@@ -90,11 +88,11 @@ def test_moves_of_single_steps_lose_no_time(
     source = tmp_path / "steps.gcode"
     source.write_text("\n".join([*lines, "G1 X110 E1 F3000", "G1 Y90 E1", ""]))
     machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert not [one.reason for one in result.put_back if "from its command" in one.reason]
 
 
-def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
+def test_sudden_corners_are_rounded(tmp_path: Path, cache: Path) -> None:
     """Marlin passes these corners without slowing down: no command follows all of them at once."""
     document = machine_with("marlin").model_dump(mode="json")
     document["firmware"]["min_steps_per_segment"] = 1
@@ -114,13 +112,13 @@ def test_sudden_corners_are_rounded(tmp_path: Path) -> None:
     source = tmp_path / "rings.gcode"
     source.write_text("\n".join(lines) + "\n")
     machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert result.put_back == []
     found = rms_um(result)
     assert found["after"] < 0.5 * found["shaper"] < 0.5 * found["before"]
 
 
-def test_marlin_follows_travel_as_fast_as_commands_may_be(tmp_path: Path) -> None:
+def test_marlin_follows_travel_as_fast_as_commands_may_be(tmp_path: Path, cache: Path) -> None:
     """Along an axis at the command's highest speed, and along a diagonal faster than that."""
     document = machine_with("marlin").model_dump(mode="json")
     planner = document["firmware"]["planner"]
@@ -132,7 +130,7 @@ def test_marlin_follows_travel_as_fast_as_commands_may_be(tmp_path: Path) -> Non
     head = "G28\nG90\nM83\nM204 P8000 T8000\nG1 X20 Y60 Z5 F6000\n"
     source.write_text(head + 4 * (fast + "G1 X40 Y70 E1 F6000\nG1 X20 Y60 E1\n"))
     machine = Machine.model_validate(document)
-    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=tmp_path)
+    result = compensate_file(source, tmp_path / "out.gcode", machine, Options(), cache_dir=cache)
     assert result.put_back == []
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stillpath.models.reference_motion import reference_motion
+from stillpath.models.machine import Machine
+from stillpath.models.reference_motion import reference_motion, reference_motion_of
 from stillpath.models.store import builtin_machines, load_machine
 from stillpath.pipeline.measuring import reference_shaper
 from stillpath.pipeline.measuring.reference_shaper import (
@@ -17,7 +18,14 @@ from stillpath.pipeline.measuring.reference_shaper import (
     cached_shaper,
     evaluate_shaper,
     tune_shaper,
+    tuning_digest,
 )
+
+
+def changed(machine: Machine) -> Machine:
+    """Return a machine whose X and Y have each other's plants."""
+    axes = {"x": machine.axes["y"], "y": machine.axes["x"]}
+    return machine.model_copy(update={"axes": axes})
 
 
 def test_reference_motion_is_a_planner_s() -> None:
@@ -86,13 +94,15 @@ def test_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return BestShaper("mzv", 40.0, 50.0, 0.1, 1.5, 20.0)
 
     monkeypatch.setattr(reference_shaper, "tune_shaper", tune)
-    machine = load_machine("ender3").model_copy(update={"title": "Mine"})
+    machine = changed(load_machine("ender3"))
     folder = tmp_path / "cache"
     first = cached_shaper(machine, folder)
     assert cached_shaper(machine, folder) == first
     assert len(calls) == 1
     (file,) = folder.iterdir()
-    assert machine.revision in file.name
+    # What the best shaper does not depend on.
+    assert cached_shaper(machine.model_copy(update={"title": "Mine"}), folder) == first
+    assert len(calls) == 1
     for broken in ("", "{", "[]", json.dumps({"type": "mzv"}), '{"type": 1}'):
         file.write_text(broken)
         assert cached_shaper(machine, folder) == first
@@ -108,10 +118,20 @@ def test_that_of_a_built_in_machine_comes_with_the_program(name: str, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+def test_what_it_depends_on() -> None:
+    machine = load_machine("ender3")
+    firmware = machine.firmware
+    slow = firmware.planner.model_copy(update={"max_velocity_mm_s": 150.0})
+    limited = machine.model_copy(update={"firmware": firmware.model_copy(update={"planner": slow})})
+    others = {tuning_digest(other) for other in (limited, changed(machine))}
+    assert len(others | {tuning_digest(machine)}) == 3
+    assert tuning_digest(machine.model_copy(update={"title": "Mine"})) == tuning_digest(machine)
+
+
 def test_what_comes_with_the_program_is_what_is_found(tmp_path: Path) -> None:
     machine = load_machine("voron-v0")
     shipped = cached_shaper(machine, tmp_path)
-    found = cached_shaper(machine.model_copy(update={"title": "Mine"}), tmp_path)
+    y_d, extruding = reference_motion_of(machine)
+    found = tune_shaper(machine, y_d, 1e-3, extruding)
     assert (found.type, found.fx_hz, found.fy_hz) == (shipped.type, shipped.fx_hz, shipped.fy_hz)
     assert found.contour_rms_um == pytest.approx(shipped.contour_rms_um, rel=1e-9)

@@ -35,13 +35,13 @@ def rippled() -> Machine:
 
 
 @pytest.mark.slow
-def test_nine_tenths_are_gone_from_the_written_file(tmp_path: Path) -> None:
+def test_nine_tenths_are_gone_from_the_written_file(tmp_path: Path, cache: Path) -> None:
     source, target = tmp_path / "in.gcode", tmp_path / "out.gcode"
     source.write_text(print_file())
     left = {}
     for method in ("fbf", "fbf+ripple"):
         options = Options(method=method, tolerance_um=1.0)
-        result = compensate_file(source, target, rippled(), options, cache_dir=tmp_path)
+        result = compensate_file(source, target, rippled(), options, cache_dir=cache)
         assert result.put_back == []
         left[method] = next(
             c.extruding.tracking_rms_um for c in result.channels if c.name == "after"
@@ -50,7 +50,7 @@ def test_nine_tenths_are_gone_from_the_written_file(tmp_path: Path) -> None:
     assert left["fbf+ripple"] < 0.1 * left["fbf"]
 
 
-def test_a_machine_without_ripple_says_so(tmp_path: Path) -> None:
+def test_a_machine_without_ripple_says_so(tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_text(print_file())
     machine = load_machine("ender3")
@@ -60,7 +60,7 @@ def test_a_machine_without_ripple_says_so(tmp_path: Path) -> None:
             tmp_path / "out.gcode",
             machine,
             Options(method="none+ripple"),
-            cache_dir=tmp_path,
+            cache_dir=cache,
         )
     assert not (tmp_path / "out.gcode").exists()
 

@@ -20,7 +20,6 @@ from stillpath.models.schedule import AxisSchedule, GridNode, GridSchedule, Mass
 from stillpath.models.store import load_machine
 from stillpath.pipeline.band import NOTABLE_UM, BandContent
 from stillpath.pipeline.compensate import compensate_file, simulate_file
-from stillpath.pipeline.measuring.reference_shaper import cached_shaper
 from stillpath.pipeline.operating_point import Operation
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Result
@@ -29,22 +28,6 @@ ROOT = Path(__file__).resolve().parents[2]
 KG_PER_MM = 1e-6 * 1.24 * 0.25 * math.pi * 1.75**2
 
 HEAD = "G28\nG90\nM83\nM204 S1500\n"
-
-
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the reference shaper of the plain machine is known."""
-    folder = tmp_path_factory.mktemp("cache")
-    cached_shaper(bedslinger(None), folder)
-    return folder
-
-
-def with_reference_shaper(machine: Machine, cache: Path) -> Machine:
-    """Spare a machine the tuning of its own: its reference shaper is the plain machine's."""
-    plain = bedslinger(None).revision
-    for known in cache.glob(f"*{plain}*"):
-        (cache / known.name.replace(plain, machine.revision)).write_bytes(known.read_bytes())
-    return machine
 
 
 def bedslinger(moving_kg: float | None = 0.8, density: float = 1.24) -> Machine:
@@ -119,7 +102,6 @@ def compensated(
 ) -> tuple[Result, list[bytes]]:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_text(text)
-    with_reference_shaper(machine, cache)
     result = compensate_file(source, target, machine, Options(**options), cache_dir=cache)
     return result, target.read_bytes().splitlines()
 
@@ -159,7 +141,7 @@ def test_follows_the_print(tmp_path: Path, cache: Path) -> None:
 def test_prediction_follows_too(tmp_path: Path, cache: Path) -> None:
     source = tmp_path / "in.gcode"
     source.write_text(block(16))
-    heavy = with_reference_shaper(bedslinger(0.05, density=12.4), cache)
+    heavy = bedslinger(0.05, density=12.4)
     result, plain = (simulate_file(source, m, cache_dir=cache) for m in (heavy, bedslinger(None)))
     assert "kg at the end" in result.notes[0]
     both = zip(result.layers, plain.layers, strict=True)

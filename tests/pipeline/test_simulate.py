@@ -16,13 +16,15 @@ LINES = "G1 X20 Y20 F6000\nG1 X100 Y20 E5 F3000\nG1 X100 Y60 E2\n"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("between", ["G28 X Y\n", "PAUSE\n", "T1\nT0\n", "G4 P300\n", ""])
-def test_where_the_machine_is_lost_nothing_is_measured(tmp_path: Path, between: str) -> None:
+def test_where_the_machine_is_lost_nothing_is_measured(
+    tmp_path: Path, cache: Path, between: str
+) -> None:
     """The nozzle does not jump to where homing leaves it, nor ring from it."""
     source, machine = tmp_path / "in.gcode", load_machine("ender3")
     source.write_text(HEAD + LINES + between + LINES + between * 2 + LINES)
-    simulated = simulate_file(source, machine, cache_dir=tmp_path)
+    simulated = simulate_file(source, machine, cache_dir=cache)
     kept = compensate_file(
-        source, tmp_path / "out.gcode", machine, Options(method="none"), cache_dir=tmp_path
+        source, tmp_path / "out.gcode", machine, Options(method="none"), cache_dir=cache
     )
     for name in ("extruding", "all_motion"):
         one, other = (getattr(r.channels[0], name).model_dump() for r in (simulated, kept))

@@ -22,11 +22,6 @@ TEXT = (
 ).encode()
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def compensated(folder: Path, cache: Path, **options: object) -> tuple[Result, list[bytes]]:
     source, target = folder / "in.gcode", folder / "out.gcode"
     source.write_bytes(TEXT)

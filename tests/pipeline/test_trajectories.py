@@ -23,11 +23,6 @@ from tests.gcode.prints import polygon
 SMALL = HEAD + ";LAYER_CHANGE\n;Z:0.2\nG1 X120 Y100 F6000\n" + "\n".join(polygon(6, 15)) + "\n"
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.fixture
 def source(tmp_path: Path) -> Path:
     path = tmp_path / "in.gcode"

@@ -69,11 +69,6 @@ MODES = (b"M82\n", b"M83\n", b"G90\n", b"G91\n")
 KINDS = ("klipper", "marlin", "reprapfirmware")
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
 def make(
     data: bytes, machine: Machine, folder: Path, cache: Path, method: str = "shaper:mzv"
 ) -> tuple[Result, bytes]:
