@@ -129,11 +129,9 @@ def left_alone(result: Result) -> str:
 
 def budget_line(budget: BudgetFigures) -> str:
     """Return what a budget of contour error bought, and at which accelerations."""
-    share = budget.saved_share_against_shaper
     against = (
-        f"{100 * abs(share):.1f} % {'less' if share >= 0 else 'more'} than with the best shaper "
-        f"within it ({budget.shaper_time_s:.1f} s)"
-        if share is not None
+        f"{budget.against_shaper} with the best shaper within it ({budget.shaper_time_s:.1f} s)"
+        if budget.shaper_time_s is not None
         else "the best shaper cannot keep it"
     )
     classes = ", ".join(

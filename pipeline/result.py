@@ -183,6 +183,15 @@ class BudgetFigures(_Figures):
     classes: list[BudgetClass]
     """By class of moves."""
 
+    @property
+    def against_shaper(self) -> str:
+        """How the time compares with that of the best shaper, in words."""
+        percent = f"{100 * abs(self.saved_share_against_shaper or 0.0):.1f}"
+        if percent == "0.0":
+            return "the same as"
+        less = (self.saved_share_against_shaper or 0.0) > 0
+        return f"{percent} % {'less' if less else 'more'} than"
+
 
 class AdvisedShaper(_Figures):
     """A firmware shaper that is advised."""

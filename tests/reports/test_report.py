@@ -140,7 +140,11 @@ def test_a_budget_says_whether_the_shaper_is_quicker(result: Result):
         saved_share_against_shaper=-0.018,
         classes=[],
     )
-    for share, words in ((-0.018, "1.8 % more than with"), (0.018, "1.8 % less than with")):
+    for share, words in (
+        (-0.018, "1.8 % more than with"),
+        (0.018, "1.8 % less than with"),
+        (-0.0002, "the same as with"),
+    ):
         found = budget.model_copy(update={"saved_share_against_shaper": share})
         assert words in render_report(result.model_copy(update={"budget": found}))
         assert words in budget_line(found)

@@ -96,8 +96,10 @@ function budget(report) {
   const found = report.budget;
   if (!found) return null;
   const saved = (/** @type {number} */ share) => `${(100 * share).toFixed(1)} %`;
+  const against = saved(Math.abs(found.saved_share_against_shaper ?? 0));
+  const compared = against === saved(0) ? "the same as" : `${against} ${found.saved_share_against_shaper > 0 ? "less" : "more"} than`;
   const shaper = found.shaper_time_s === null ? "; the best-tuned shaper cannot keep it"
-    : `, and ${saved(Math.abs(found.saved_share_against_shaper))} ${found.saved_share_against_shaper >= 0 ? "less" : "more"} than with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
+    : `, and ${compared} with the best-tuned shaper at the same budget (${duration(found.shaper_time_s)}, predicted)`;
   return section("Speed budget",
     h("p", null, `Within a contour error of ${um(found.budget_um)} µm (rms of the worst plant of the machine's set, for every feature) the print takes ${saved(found.saved_share)} less time than the sliced file${shaper}.`),
     longTable("Accelerations by class of moves", [{ title: "Moves", text: true }, { title: "Accelerations" }, { title: "With the shaper", wide: true }, { title: "Contour, rms of the worst plant, µm" }], found.classes, (c) => [
