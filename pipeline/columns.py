@@ -34,26 +34,24 @@ def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
     Parameters
     ----------
     target : Path
-        Columns wait in a folder beside it.
+        Columns wait in unnamed files beside it.
     types : mapping
         Names of the columns and their types, as ``<f8``.
     """
-    with (
-        replacing(target) as temporary,
-        tempfile.TemporaryDirectory(dir=target.parent, prefix=".stillpath-table-") as folder,
-    ):
-        paths = {name: Path(folder, name) for name in types}
-        with contextlib.ExitStack() as stack:
-            files = {name: stack.enter_context(path.open("wb")) for name, path in paths.items()}
-            table = _Npz(files, types)
-            yield table
+    with replacing(target) as temporary, contextlib.ExitStack() as stack:
+        columns = {
+            name: stack.enter_context(tempfile.TemporaryFile(dir=target.parent)) for name in types
+        }
+        table = _Npz(columns, types)
+        yield table
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name, path in paths.items():
+            for name, column in columns.items():
                 # A date of its own would make equal tables unequal files.
                 entry = zipfile.ZipInfo(f"{name}.npy")
-                with archive.open(entry, "w", force_zip64=True) as out, path.open("rb") as column:
+                with archive.open(entry, "w", force_zip64=True) as out:
                     header = {"descr": types[name], "fortran_order": False, "shape": (table.rows,)}
                     np.lib.format.write_array_header_1_0(out, header)
+                    column.seek(0)
                     shutil.copyfileobj(column, out, 1 << 20)
 
 

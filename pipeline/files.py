@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +29,9 @@ class Discarding:
 def replacing(target: Path) -> Iterator[Path]:
     """Yield a temporary file beside `target` that takes its place when the block ends well.
 
+    On Linux it has no name until it is complete, and nothing is left of a process that is killed:
+    its path leads there through ``/proc``. Elsewhere a hidden ``.part`` file may be left.
+
     Raises
     ------
     OSError
@@ -35,10 +40,8 @@ def replacing(target: Path) -> Iterator[Path]:
     """
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "is no regular file; name one to write", str(target))
-    prefix = f".{target.name[:_NAME_PART]}."
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
-    os.close(handle)
-    temporary = Path(name)
+    handle = _open_unnamed(target.parent)
+    temporary = _named(target) if handle is None else _path_of(handle)
     try:
         yield temporary
         mode = target.stat().st_mode if target.exists() else 0o666 & ~_umask()
@@ -46,12 +49,51 @@ def replacing(target: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         with contextlib.suppress(OSError):  # file systems of memory cards know no modes
             temporary.chmod(mode & 0o7777)
+        if handle is not None:
+            temporary = _link(handle, target)
         temporary.replace(target)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what has no name cannot be removed, and need not be
+            temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is None:
             error.filename = str(target)  # a full disk does not say which
         raise
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
+def _named(target: Path) -> Path:
+    prefix = f".{target.name[:_NAME_PART]}."
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
+    os.close(handle)
+    return Path(name)
+
+
+def _open_unnamed(folder: Path) -> int | None:
+    """Open a file without a name; None where the system or the file system has none."""
+    if sys.platform != "linux":
+        return None
+    try:
+        handle = os.open(folder, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return None
+    if _path_of(handle).exists():
+        return handle
+    os.close(handle)  # no /proc
+    return None
+
+
+def _path_of(handle: int) -> Path:
+    return Path(f"/proc/{os.getpid()}/fd/{handle}")
+
+
+def _link(handle: int, target: Path) -> Path:
+    """Give an unnamed file a name beside `target`: a link cannot replace what is there."""
+    name = target.with_name(f".{target.name[:_NAME_PART]}.{secrets.token_hex(4)}.part")
+    # With a folder's handle, which an absolute path does not use, Python follows links.
+    os.link(_path_of(handle), name, src_dir_fd=handle, follow_symlinks=True)
+    return name
 
 
 def default_cache_dir() -> Path:

@@ -159,8 +159,8 @@ def rewriting(
     target : Path
         Is written in place: guard it.
     name : Path
-        What the target will be called. A name of plain G-code, where the source has another,
-        asks for plain G-code.
+        Where the target will stand; what must wait, waits there. A name of plain G-code, where the
+        source has another, asks for plain G-code.
     progress : callable, optional
 
     Raises
@@ -173,7 +173,7 @@ def rewriting(
         with target.open("wb") as text:
             yield text
         return
-    with tempfile.TemporaryFile(dir=target.parent) as spool:
+    with tempfile.TemporaryFile(dir=name.parent) as spool:
         yield spool
         if plain:
             container.write_plain(spool, target)

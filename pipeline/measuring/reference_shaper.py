@@ -17,8 +17,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
-import tempfile
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -31,6 +29,7 @@ from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
 from stillpath.models.reference_motion import reference_limits, reference_motion_of
+from stillpath.pipeline.files import replacing
 from stillpath.simulation.measures import PathDistances, Tally, contour_error, tracking_error
 from stillpath.simulation.response import response
 
@@ -167,14 +166,8 @@ def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> Best
     y_d, extruding = reference_motion_of(machine, dt_s)
     best = tune_shaper(machine, y_d, dt_s, extruding)
     directory.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=directory, prefix=path.stem, suffix=".tmp")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(asdict(best), file)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(asdict(best)), encoding="utf-8")
     return best
 
 
