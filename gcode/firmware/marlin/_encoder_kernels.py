@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from stillpath.gcode.firmware._vertex_kernels import hop
 from stillpath.gcode.firmware._writing_kernels import printed_feedrate
-from stillpath.gcode.firmware.marlin._vertex_kernels import hop
 from stillpath.models.jit import kernel
 
 __all__ = ["assign_rates", "bend_reversals", "spread_advance", "thin"]

@@ -40,8 +40,8 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
 )
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
-from stillpath.gcode.firmware.marlin.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.firmware.planning import join_phases
+from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
@@ -67,6 +67,8 @@ _MOST_FEED = 3.0
 _ROOM, _DIAGONAL = 1.05, 1.5
 """So much faster than a command may be: an axis between vertices on whole steps, and the way that
 X and Y make together."""
+_CALM = 0.6
+"""Of the motors' step of speed: what makes up for lost time comes on top."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
@@ -165,7 +167,8 @@ class MarlinEncoder:
             high=np.floor(high_mm * self._scale[:2] + 1e-6).astype(np.int64),
             least=firmware.min_steps_per_segment,
             corexy=corexy,
-            speed_step_mm_s=command.speed_step_mm_s,
+            speed_step_mm_s=_CALM * command.speed_step_mm_s,
+            spare_steps=1.0,
             accel_mm_s2=command.accel_mm_s2,
             moves_per_s=rate,
         )

@@ -86,7 +86,8 @@ class RepRapAdapter:
     def encoder(self) -> RepRapEncoder:
         """Return an encoder of the stream."""
         machine = self._machine
-        return RepRapEncoder(self._firmware, machine.kinematics, self._stream)
+        travel_mm = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
+        return RepRapEncoder(self._firmware, machine.kinematics, self._stream, travel_mm)
 
     def stream_commands(self) -> RepRapStreamCommands:
         """Return RepRapFirmware's words."""

@@ -3,7 +3,7 @@
 The speed along the path is continuous in this firmware: a step of it costs time, a step of
 direction costs none within the jerk limits. The stream runs under what the motors bear, so that it
 may break off at any line; what ramps cost is foreseen to the clock. Places are whole motor steps,
-reached when the command is nearest to them. Pressure advance is written into the filament
+chosen by the printer's response. Pressure advance is written into the filament
 (docs/reprapfirmware.md).
 """
 
@@ -29,7 +29,8 @@ from stillpath.gcode.firmware.encoding import (
 )
 from stillpath.gcode.firmware.reprapfirmware._encoder_kernels import assign_speeds, keep_apart
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
-from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner, on_steps
+from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
+from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.pieces import Piece
 from stillpath.gcode.segments import Segments
 from stillpath.gcode.timeline import Group, Timeline
@@ -56,8 +57,6 @@ _PASSES = 4
 _EXACT_S = 2e-6
 _POLL_S = 2e-3
 """The firmware looks every 2 ms whether moves are to be frozen."""
-_SHIFT = 0.3
-"""The end of a segment is moved in time by at most so much of its neighbours."""
 _SPARSE = 1.3
 """Half a ring is made to last so much longer than it must."""
 _SLOW_MM_S, _SLOW_MM = 10.0, 0.1
@@ -122,17 +121,41 @@ class RepRapEncoder:
     kinematics : {"cartesian", "corexy"}
     limits : RepRapLimits
         What the stream runs under.
+    travel_mm : sequence of (float, float), optional
+        Least and largest X, and Y.
     """
 
     grid_mm = 1e-3
+    """Much finer than a step, on which the encoder puts the vertices itself."""
 
-    def __init__(self, firmware: RepRapFirmware, kinematics: str, limits: RepRapLimits) -> None:
+    def __init__(
+        self,
+        firmware: RepRapFirmware,
+        kinematics: str,
+        limits: RepRapLimits,
+        travel_mm: Sequence[tuple[float, float]] = ((-1e6, 1e6), (-1e6, 1e6)),
+    ) -> None:
         self._firmware = firmware
         self._kinematics = kinematics
         self._half_ring = firmware.ring_length // 2 - 1
         self._half_ring_s = firmware.prepare_least_s + _POLL_S
         """What so many moves must last, or the firmware freezes the next one too late."""
         self._limits = limits
+        per_mm = np.array([drive.steps_per_mm for drive in firmware.drives])
+        low_mm, high_mm = np.transpose(travel_mm)
+        self._lattice = Lattice(
+            per_mm=per_mm,
+            # The ends of the travel, but for the rounding of decimals.
+            low=np.ceil(low_mm * per_mm[:2] - 1e-6).astype(np.int64),
+            high=np.floor(high_mm * per_mm[:2] + 1e-6).astype(np.int64),
+            least=1,
+            # Jerk limits the axes of a CoreXY, too; and what steps of X and Y add to it counts.
+            corexy=False,
+            speed_step_mm_s=min(limits.jerk_x_mm_s, limits.jerk_y_mm_s),
+            spare_steps=0.0,
+            accel_mm_s2=limits.print_accel_mm_s2,
+            moves_per_s=self._half_ring / (_SPARSE * self._half_ring_s),
+        )
 
     def rest_durations(self, piece: Piece, groups: Sequence[Group]) -> NDArray[np.float64]:
         """First guess of the rests' durations: those of the original plan."""
@@ -146,8 +169,9 @@ class RepRapEncoder:
         GcodeError
             When the segments come faster than the firmware's queue can take them.
         """
-        segments = self._advanced(piece, timeline, self._sparse(timeline, segments))
-        segments = self._on_steps(timeline, _split_slow(timeline, segments))
+        segments = self._sparse(timeline, _split_slow(timeline, segments))
+        segments = self._sparse(timeline, self._on_steps(timeline, segments))
+        segments = self._advanced(piece, timeline, segments)
         moves = interleave(piece, timeline, segments, 1)
         rows = moves.row
         places_mm = moves.places_mm()
@@ -195,7 +219,12 @@ class RepRapEncoder:
             return segments
         keep = np.ones(len(segments), np.bool_)
         keep_apart(segments.end_s, crowded, final, begin_s, wanted_s / half, keep)
-        return Segments(segments.end_s[keep], segments.end_mm[:, keep], segments.group[keep])
+        return replace(
+            segments,
+            end_s=segments.end_s[keep],
+            end_mm=segments.end_mm[:, keep],
+            group=segments.group[keep],
+        )
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Segments with pressure advance in their filament."""
@@ -207,26 +236,14 @@ class RepRapEncoder:
         return replace(segments, end_mm=end_mm)
 
     def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
-        """Segments that end on steps, each when the command is nearest to there."""
-        end_mm, end_s = segments.end_mm.copy(), segments.end_s.copy()
-        if len(end_s) == 0:
+        """Put the vertices on whole steps of X and Y.
+
+        Not of Z: the firmware limits speeds at corners by directions as they are written, and a
+        slow climb, a vase's, in steps is flat and then too steep.
+        """
+        if len(segments) == 0:
             return segments
-        final = final_segments(segments)
-        # Not Z: the firmware limits speeds at corners by directions as they are written, and a slow
-        # climb, a vase's, in steps is flat and then too steep.
-        end_mm[:2] = on_steps(end_mm[:3].T, self._firmware, self._kinematics)[:, :2].T
-        end_mm[:, final] = segments.end_mm[:, final]
-        start_s, start_mm = _starts(timeline, segments)
-        # The command's velocity where two segments meet.
-        way = np.roll(segments.end_mm[:2], -1, axis=1) - start_mm[:2]
-        lasts = np.roll(end_s, -1) - start_s
-        velocity = way[:, ~final] / lasts[~final]
-        off = (end_mm - segments.end_mm)[:2, ~final]
-        speed2 = np.sum(velocity**2, axis=0)
-        later = np.sum(off * velocity, axis=0) / np.maximum(speed2, 1e-9)
-        room = _SHIFT * np.minimum(end_s - start_s, np.roll(end_s, -1) - end_s)[~final]
-        end_s[~final] += np.clip(later, -room, room)
-        return Segments(end_s, end_mm, segments.group)
+        return vertices_on_steps(self._lattice, timeline, segments)
 
     def _motion(
         self,
@@ -310,4 +327,4 @@ def _split_slow(timeline: Timeline, segments: Segments) -> Segments:
     left = 1.0 - (number + 1.0) / parts[of]
     end_s = segments.end_s[of] - left * lasts[of]
     end_mm = segments.end_mm[:, of] - left * way_mm[:, of]
-    return Segments(end_s, end_mm, segments.group[of])
+    return replace(segments, end_s=end_s, end_mm=end_mm, group=segments.group[of])

@@ -174,6 +174,7 @@ def choose_vertices(
     least: int,
     unit: Any,
     step: Any,
+    spare: float,
     bend: float,
     corexy: bool,
     pole: Any,
@@ -198,7 +199,9 @@ def choose_vertices(
         How long a step of X and one of Y are, in steps of X.
     step : ndarray, shape (2,)
         By how much the step rates of X and Y (of a CoreXY's motors), in steps per sample, may step
-        at a vertex, beyond what rounding brings; more is made to cost much.
+        at a vertex; more is made to cost much.
+    spare : float
+        How many steps within a segment rounding may add to that.
     bend : float
         Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
         shorter of two segments; what does not fit is made to cost as much.
@@ -238,6 +241,7 @@ def choose_vertices(
         least,
         unit,
         step,
+        spare,
         bend,
         corexy,
         pole,
@@ -268,6 +272,7 @@ def _follow(
     least: int,
     unit: Any,
     step: Any,
+    spare: float,
     bend: float,
     corexy: bool,
     pole: Any,
@@ -351,14 +356,14 @@ def _follow(
                         continue
                     some = True
                     per = 1.0 / span
-                    jump = per + rounding
+                    jump = spare * (per + rounding)
                     dx, dy = bx * per - rate_x, by * per - rate_y
                     total += _jolt(dx, dy, jump, step, corexy)
                     # From a stand the mean speed of a ramp is half of what it reaches.
                     room = bend * (min(span, lasts) if i >= 0 else 0.5 * span)
                     total += _crowded(dx * unit[0], dy * unit[1], room)
                     if last:
-                        total += _jolt(bx * per, by * per, per, step, corexy)
+                        total += _jolt(bx * per, by * per, spare * per, step, corexy)
                         total += _crowded(bx * per * unit[0], by * per * unit[1], 0.5 * bend * span)
                     for q in range(width):
                         x[q] = states[j, d, q]

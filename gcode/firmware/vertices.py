@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode._segment_kernels import path_directions
-from stillpath.gcode.firmware.marlin._vertex_kernels import (
+from stillpath.gcode.firmware._vertex_kernels import (
     MOST_PLACES,
     choose_vertices,
     list_places,
@@ -24,8 +24,6 @@ __all__ = ["Lattice", "vertices_on_steps"]
 
 _FILAMENT_MM = 0.01
 """An error of the filament that counts as much as a step of X."""
-_CALM = 0.6
-"""Of the machine's step of speed: what makes up for lost time comes on top."""
 _OFTEN_S = 4e-3
 """Straight lines get a vertex that often, to lie on the command in the mean."""
 
@@ -45,6 +43,8 @@ class Lattice:
     corexy : bool
     speed_step_mm_s : float
         Largest step of a motor's speed.
+    spare_steps : float
+        So many steps within a segment may rounding add to that.
     accel_mm_s2 : float
         That the moves are executed with.
     moves_per_s : float
@@ -57,6 +57,7 @@ class Lattice:
     least: int
     corexy: bool
     speed_step_mm_s: float
+    spare_steps: float
     accel_mm_s2: float
     moves_per_s: float
 
@@ -223,7 +224,8 @@ def _chosen(
         heading,
         lattice.least,
         scale[0] / scale[:2],
-        _CALM * lattice.speed_step_mm_s * scale[:2] * dt_s,
+        lattice.speed_step_mm_s * scale[:2] * dt_s,
+        lattice.spare_steps,
         lattice.accel_mm_s2 * scale[0] * dt_s**2,
         lattice.corexy,
         answers.pole,
