@@ -143,6 +143,52 @@ def test_a_budget_is_for_the_whole_print() -> None:
     assert "budget_um" in wrong_option(refused.value)
 
 
+@pytest.mark.parametrize("method", ["advise", "none"])
+def test_where_is_for_what_is_compensated(method: str) -> None:
+    from pydantic import ValidationError
+
+    with pytest.raises(ValidationError, match=rf"method {method} .*where") as refused:
+        Options(method=method, where="walls")
+    assert "leave where at all" in wrong_option(refused.value)
+    assert Options(method="none+ripple", where="walls").where == "walls"
+
+
+def test_a_file_that_stays_as_sliced_only_fits_or_not(gear: Path, tmp_path: Path) -> None:
+    machine, target = ender3_with("klipper"), tmp_path / "out.gcode"
+    found = run(gear, target, machine, method="none", max_mb=10)
+    assert target.read_bytes() == gear.read_bytes()
+    assert not any("max_mb" in note for note in found.notes)
+    with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.01, and method none") as refused:
+        run(gear, target, machine, method="none", max_mb=0.01)
+    assert "outer walls" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "chosen", "unused"),
+    [
+        ("none", {"tolerance_um": 5.0, "budget_um": 9.0, "basis": "dct"}, "basis, tolerance_um"),
+        ("shaper:zv", {"robust": "off", "along": 0.5, "tolerance_um": 5.0}, "robust, along. "),
+        ("advise", {"tolerance_um": 5.0, "budget_um": 90.0}, "tolerance_um. "),
+        ("fbf", {"basis": "dct", "robust": "off", "along": 0.5, "tolerance_um": 5.0}, ""),
+    ],
+)
+def test_what_has_no_effect_is_told(
+    method: str, chosen: dict[str, object], unused: str, gear: Path, tmp_path: Path
+) -> None:
+    short = tmp_path / "short.gcode"
+    short.write_bytes(b"G28\n" + b"G1 X60 Y60 F6000\nG1 X90 Y60 E1\nG1 X90 Y90 E2\n" * 4)
+    found = compensate_file(
+        short,
+        tmp_path / "out.gcode",
+        ender3_with("klipper"),
+        Options.model_validate({"method": method, **chosen}),
+        cache_dir=gear.parent / "cache",
+    )
+    told = [warning for warning in found.warnings if warning.startswith("Without effect: ")]
+    assert len(told) == bool(unused)
+    assert not unused or f"Without effect: {unused}" in told[0]
+
+
 def test_digests_of_older_options_stay() -> None:
     assert "where" not in Options().model_dump()
     assert "max_mb" not in Options().model_dump()
