@@ -15,6 +15,7 @@ from stillpath.pipeline.result import Result
 from stillpath.service.wrong_options import wrong_option
 from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import Firmware, read
+from tests.gcode.prints import small_arcs
 from tests.gcode.states import differences, tagged
 
 GEAR = Path(__file__).parents[2] / "examples" / "cura_ender3_gear24.gcode"
@@ -79,6 +80,19 @@ def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     assert selected.contour_range_um[0] <= selected.selected_rms_um
     assert selected.contour_range_um[1] < selected.extruding.contour_rms_um * 4
     assert not any("shaper would serve" in warning for warning in walls.warnings)
+
+
+def test_outer_walls_of_small_arcs(gear: Path, tmp_path: Path) -> None:
+    # Of a Marlin's arc some segments feed nothing: less than a step of E.
+    machine, source = ender3_with("marlin"), tmp_path / "arcs.gcode"
+    source.write_bytes(tagged(small_arcs().encode()))
+    target, options = tmp_path / "walls.gcode", Options(where="walls")
+    cache = gear.parent / "cache"
+    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    assert result.put_back == []
+    assert differences(source.read_bytes(), target.read_bytes(), machine) == []
+    outer = next(g.contour_rms_um for g in result.features if g.name == "WALL-OUTER")
+    assert outer["after"] < 0.5 * outer["before"]
 
 
 def test_the_firmwares_shaper_is_not_switched_between_walls(gear: Path, tmp_path: Path) -> None:
