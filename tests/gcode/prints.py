@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 
-__all__ = ["made_up_print", "polygon", "small_arcs"]
+__all__ = ["made_up_print", "polygon", "small_arcs", "vase"]
 
 
 def polygon(
@@ -189,4 +189,19 @@ def small_arcs(layers: int = 4) -> str:
         for line in range(6):
             e += 1.0
             lines.append(f"G1 X{78 + 30 * (line % 2)} Y{y + 4 + 0.4 * line:.1f} E{e:.5f}")
+    return "\n".join([*lines, "G4 P10", ""])
+
+
+def vase(speed_mm_s: float, *, turns: int = 2, lobes: int = 5) -> str:
+    """A wall that climbs by .2 mm a turn."""
+    lines = ["G28", "G90", "M83", "G1 Z.2 F600", "G1 X130 Y110 F6000", "G4 P10"]
+    lines += [";TYPE:WALL-OUTER", f"G1 F{60 * speed_mm_s:g}"]
+    x, y = 130.0, 110.0
+    for k in range(1, 120 * turns + 1):
+        angle = 2 * math.pi * k / 120
+        radius = 20 + 3 * math.sin(lobes * angle)
+        before = x, y
+        x, y = 110 + radius * math.cos(angle), 110 + radius * math.sin(angle)
+        e = 0.033 * math.hypot(x - before[0], y - before[1])
+        lines.append(f"G1 X{x:.3f} Y{y:.3f} Z{0.2 + k / 600:.3f} E{e:.5f}")
     return "\n".join([*lines, "G4 P10", ""])
