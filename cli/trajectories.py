@@ -66,6 +66,7 @@ def trajectories(
     found = open_machines().for_job(machine, files=True)
 
     from stillpath.cli.console import progress_shown
+    from stillpath.pipeline.options import unused
     from stillpath.pipeline.trajectories import write_trajectories
 
     with progress_shown() as progress:
@@ -78,6 +79,8 @@ def trajectories(
             window_s=(start, stop),
             progress=progress,
         )
+    for warning in unused(options):
+        typer.echo(f"stillpath: {warning}", err=True)
     typer.echo(f"{rows} rows, {rows / 1000:.3f} s")
 
 

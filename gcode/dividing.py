@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
-from stillpath.gcode.timeline import group_rows
 from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
 from stillpath.models.machine import Machine
 
@@ -26,7 +25,7 @@ def sections(piece: Piece) -> list[tuple[int, int]]:
     """Return runs of moves of X or Y between which a piece may be cut, in order.
 
     Between two of them lies a rest, or the machine is slow where printing begins or ends: it can
-    stand still there without losing time that counts.
+    stand still there without losing time that counts. No cut lies within a line.
 
     Returns
     -------
@@ -34,15 +33,15 @@ def sections(piece: Piece) -> list[tuple[int, int]]:
         First row and one past the last.
     """
     phases = piece.phases
-    feeds = phases.direction[:, 3] > 0.0
-    slow = (feeds[1:] != feeds[:-1]) & (phases.end_mm_s[:-1] <= _SLOW_MM_S)
-    found = []
-    for group in group_rows(phases):
-        if group.rest:
-            continue
-        inner = np.flatnonzero(slow[group.first : group.last - 1]) + group.first + 1
-        found += list(pairwise([group.first, *inner.tolist(), group.last]))
-    return found
+    # By line of the file: an arc is many moves, some of which feed less than a step.
+    starts = np.flatnonzero(np.diff(piece.moves.byte_start, prepend=-1))
+    moves_xy = np.logical_or.reduceat(np.any(phases.direction[:, :2] != 0.0, axis=1), starts)
+    feeds = np.logical_or.reduceat(phases.direction[:, 3] > 0.0, starts)
+    slow = (feeds[1:] != feeds[:-1]) & (phases.end_mm_s[starts[1:] - 1] <= _SLOW_MM_S)
+    edges = np.flatnonzero((moves_xy[1:] != moves_xy[:-1]) | slow) + 1
+    rows = [*starts.tolist(), len(phases)]
+    runs = pairwise([0, *edges.tolist(), len(starts)])
+    return [(rows[first], rows[last]) for first, last in runs if moves_xy[first]]
 
 
 def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterator[Piece | LeftOut]:

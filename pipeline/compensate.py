@@ -18,7 +18,7 @@ from stillpath.pipeline.job import Job
 from stillpath.pipeline.last_check.errors import LastCheckError
 from stillpath.pipeline.live_printing import keep_file, predict_live, simulate_live
 from stillpath.pipeline.measuring.tracing import Trace
-from stillpath.pipeline.options import Options
+from stillpath.pipeline.options import Options, unused
 from stillpath.pipeline.order import Order
 from stillpath.pipeline.pacing.budget import SpeedBudget
 from stillpath.pipeline.progress import ProgressCallback
@@ -73,21 +73,22 @@ def compensate_file(
         how.update(plate=options.plate, dialect=options.dialect)
         result = simulate_live(source, machine, **how, layers=layers, trace=trace)
         keep_file(source, target)
-        return result
-    if options.method == "advise":
+    elif options.method == "advise":
         if trace is not None:
             raise GcodeError(
-                "method advise gives the moves times of their own: ask for the trajectories of the "
-                "written file instead"
+                "method advise gives moves new times: ask for trajectories of the written file"
             )
         from stillpath.pipeline.advising.advise import advise_file
 
-        return advise_file(source, target, machine, options, **how, layers=layers)
-    # First, as the target may be the source.
-    live = predict_live(source, machine, options, **how) if options.compare_live else None
-    order = Order(machine, options, cache_dir, progress)
-    result = _rewrite(source, target, order, layers, trace)
-    return result if live is None else live.beside(result)
+        result = advise_file(source, target, machine, options, **how, layers=layers)
+    else:
+        # First, as the target may be the source.
+        live = predict_live(source, machine, options, **how) if options.compare_live else None
+        order = Order(machine, options, cache_dir, progress)
+        result = _rewrite(source, target, order, layers, trace)
+        result = live.beside(result) if live else result
+    result.warnings.extend(unused(options))
+    return result
 
 
 def _rewrite(
@@ -147,6 +148,11 @@ def _final_job(
 
 def _fitting(options: Options, name: str) -> Options:
     """Return options for a smaller file than those that made one too large."""
+    if options.method == "none":
+        raise GcodeError(
+            f"{name} exceeds max_mb {options.max_mb:g}, and method none writes it as sliced: "
+            "allow more"
+        )
     less = smaller(options)
     if less is None:
         raise GcodeError(

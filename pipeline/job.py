@@ -134,8 +134,6 @@ class Job:
         self._sum.written = sum(len(text) for text in ends)
         self.retiming = Retiming(*ends, keep_times=options.times == "kept" or not self._changes)
         self._sum.warnings += doubts(source, machine, options.dialect)
-        if options.budget_um is not None and not self._changes:
-            self._sum.warnings.append("The method none changes nothing: the budget was not used.")
 
     def _design(self, cache_dir: Path) -> None:
         """Tune the reference shaper and design the command."""

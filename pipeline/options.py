@@ -32,12 +32,19 @@ __all__ = [
     "RobustMode",
     "Where",
     "stamp",
+    "unused",
 ]
 
 DEFAULT_TOLERANCE_UM = 2.0
 _LATER = {"budget_um": None, "where": "all", "max_mb": None, "compare_live": False}
 
 _PLAIN = (*COMPENSATORS, "none")
+_AS_SLICED = {
+    "advise": "leaves every move as it is",
+    "live": "prints the file as sliced",
+    "none": "writes the file as sliced",
+}
+"""Methods that compensate no move in the file, and what they do instead."""
 _METHOD = rf"^(advise|live|({'|'.join(_PLAIN)})(\+ripple)?)$"
 
 
@@ -110,6 +117,11 @@ class Options(BaseModel):
                 "method live prints the file as sliced: it cannot be combined with where, max_mb "
                 "and budget_um, which are settings of a written file"
             )
+        if self.method in _AS_SLICED and self.where != "all":
+            raise ValueError(
+                f"method {self.method} {_AS_SLICED[self.method]}: it cannot be combined with "
+                "where, which says what is compensated; choose fbf, or leave where at all"
+            )
         return self
 
     @model_validator(mode="after")
@@ -129,6 +141,21 @@ class Options(BaseModel):
             if values.get(name) == unused:
                 values.pop(name, None)
         return values
+
+
+def unused(options: Options) -> list[str]:
+    """Return a sentence for the choices of a job that its method has no use for."""
+    method = options.method
+    names = [] if method.removesuffix("+ripple") == "fbf" else ["basis", "robust", "along"]
+    if method in _AS_SLICED:
+        names.append("tolerance_um")
+    if method == "none":
+        names.append("budget_um")
+    chosen = [n for n in names if getattr(options, n) != Options.model_fields[n].default]
+    if not chosen:
+        return []
+    does = _AS_SLICED.get(method, "has no such settings")
+    return [f"Without effect: {', '.join(chosen)}. The method {method} {does}."]
 
 
 def stamp(machine: Machine, options: Options) -> str:

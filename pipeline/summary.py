@@ -121,11 +121,11 @@ class Summary:
         yield from self.operation.notes()
         if self.writer is not None:
             yield from self.totals.left_out(self.options.where)
-        if self.options.max_mb is not None:
-            yield (
-                f"max_mb={self.options.max_mb:g}: written with where={self.options.where} and "
-                f"tolerance_um={self.options.tolerance_um:g}"
-            )
+            if self.options.max_mb is not None:
+                yield (
+                    f"max_mb={self.options.max_mb:g}: written with where={self.options.where} and "
+                    f"tolerance_um={self.options.tolerance_um:g}"
+                )
         if self.budget is not None:
             yield self.budget[1].note
 

@@ -14,7 +14,6 @@ import typer
 
 from stillpath.cli.arguments import CompensationOptions, KeyOption, ServerOption
 from stillpath.cli.option_groups import grouped
-from stillpath.models.errors import ModelError
 
 if TYPE_CHECKING:
     from stillpath.cli.batch.output import Outcome, OutputFolder
@@ -127,14 +126,13 @@ def watch(
 
     Why a file could not be done stands beside it, in NAME.error.txt.
     """
-    from stillpath.cli.batch.items import parse_map
+    from stillpath.cli.batch.items import check_apart, parse_map
     from stillpath.cli.batch.watching import Watcher, run_watch
     from stillpath.service.interruption import Interrupted
 
     options = how.chosen()
     group = parse_map(work.machine, work.machine_map or [])
-    if output.resolve() == folder.resolve():
-        raise ModelError(f"--output {output} is the watched folder; name one in it or elsewhere")
+    check_apart(folder, output)
     with _at_work(output, options, work) as (worker_pool, kept, check):
         watcher = Watcher(folder, group, worker_pool, kept, settle_s=settle_s, tell=_line)
         sys.stderr.write(f"stillpath: watching {folder}\n")

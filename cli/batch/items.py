@@ -9,7 +9,16 @@ from pathlib import Path
 
 from stillpath.models.errors import ModelError
 
-__all__ = ["Group", "Item", "is_print_file", "is_stamped", "items_of", "parse_map", "result_name"]
+__all__ = [
+    "Group",
+    "Item",
+    "check_apart",
+    "is_print_file",
+    "is_stamped",
+    "items_of",
+    "parse_map",
+    "result_name",
+]
 
 _SUFFIXES = (".gcode", ".gco", ".g", ".nc", ".bgcode", ".bgc", ".3mf")
 _STAMP = b"; Processed by stillpath "
@@ -94,7 +103,7 @@ def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Ite
     ------
     FileNotFoundError
     ModelError
-        Two files would have the same result.
+        Two files would have the same result, or a folder lies in the output folder.
     """
     items: list[Item] = []
     places: dict[str, Path] = {}
@@ -102,6 +111,8 @@ def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Ite
     for source in sources:
         if not source.exists():
             raise FileNotFoundError(2, "there is no such file or folder", str(source))
+        if source.is_dir():
+            check_apart(source, output)
         found = _below(source, output) if source.is_dir() else [(source, source.name)]
         for path, place in found:
             if path.resolve() in seen:
@@ -115,6 +126,20 @@ def items_of(sources: Sequence[Path], group: Group, *, output: Path) -> list[Ite
                 )
             items += [Item(path, place, machine) for machine in group.of(place)]
     return items
+
+
+def check_apart(folder: Path, output: Path) -> None:
+    """Refuse a folder that is the output folder or lies in it: nothing there is ever compensated.
+
+    Raises
+    ------
+    ModelError
+    """
+    if folder.resolve().is_relative_to(output.resolve()):
+        raise ModelError(
+            f"--output {output} is or holds the folder {folder}, and what lies in the output "
+            "folder is passed over; name an output folder in it or elsewhere"
+        )
 
 
 def is_print_file(path: Path) -> bool:

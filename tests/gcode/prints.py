@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 
-__all__ = ["made_up_print", "polygon"]
+__all__ = ["made_up_print", "polygon", "small_arcs", "vase"]
 
 
 def polygon(
@@ -173,3 +173,35 @@ class _Print:
 def made_up_print(seed: int, *, chapters: int = 2, wild: bool = False) -> bytes:
     """Return a print of some seconds; `wild` ones also change modes and leave the position."""
     return _Print(seed, wild=wild).make(chapters).encode()
+
+
+def small_arcs(layers: int = 4) -> str:
+    """Outer walls of arcs to and fro, whose segments feed less than a step each; inner walls."""
+    lines = ["G28", "G90", "M82", "G92 E0", "M204 P500 T500", "G1 Z.2 F600", "G1 X60 Y60 F6000"]
+    e = 0.0
+    for layer in range(layers):
+        y = 40 + 12 * layer
+        lines += [";TYPE:WALL-OUTER", f"G1 X60 Y{y} F9000"]
+        for arc in range(12):
+            e += 0.06 + 0.011 * layer
+            lines.append(f"G2 X{61.5 + 1.5 * arc} Y{y} I.75 J0 E{e:.5f} F2400")
+        lines.append(";TYPE:WALL-INNER")
+        for line in range(6):
+            e += 1.0
+            lines.append(f"G1 X{78 + 30 * (line % 2)} Y{y + 4 + 0.4 * line:.1f} E{e:.5f}")
+    return "\n".join([*lines, "G4 P10", ""])
+
+
+def vase(speed_mm_s: float, *, turns: int = 2, lobes: int = 5) -> str:
+    """A wall that climbs by .2 mm a turn."""
+    lines = ["G28", "G90", "M83", "G1 Z.2 F600", "G1 X130 Y110 F6000", "G4 P10"]
+    lines += [";TYPE:WALL-OUTER", f"G1 F{60 * speed_mm_s:g}"]
+    x, y = 130.0, 110.0
+    for k in range(1, 120 * turns + 1):
+        angle = 2 * math.pi * k / 120
+        radius = 20 + 3 * math.sin(lobes * angle)
+        before = x, y
+        x, y = 110 + radius * math.cos(angle), 110 + radius * math.sin(angle)
+        e = 0.033 * math.hypot(x - before[0], y - before[1])
+        lines.append(f"G1 X{x:.3f} Y{y:.3f} Z{0.2 + k / 600:.3f} E{e:.5f}")
+    return "\n".join([*lines, "G4 P10", ""])

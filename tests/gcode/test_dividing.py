@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from stillpath.gcode.dividing import divided, sections
 from stillpath.gcode.pieces import LeftOut, Piece
 from tests.gcode.cutting import ender3_with, pieces_of
+from tests.gcode.prints import small_arcs
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 KINDS = ("klipper", "marlin", "reprapfirmware")
@@ -53,6 +54,14 @@ def test_the_parts_are_the_piece(kind: str, data: st.DataObject) -> None:
         # Marlin and RepRapFirmware start and stop with a step of speed.
         assert part.phases.start_mm_s[0] <= (0.0 if kind == "klipper" else 20.0)
         assert part.phases.end_mm_s[-1] <= (0.0 if kind == "klipper" else 20.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_arc_is_not_cut(kind: str) -> None:
+    for piece in pieces_of(small_arcs(), ender3_with(kind)):
+        line = piece.moves.line
+        bounds = [bound for section in sections(piece) for bound in section]
+        assert all(line[b - 1] != line[b] for b in bounds if 0 < b < len(line))
 
 
 def test_all_of_a_piece_is_the_piece() -> None:

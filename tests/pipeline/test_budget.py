@@ -117,7 +117,7 @@ def test_without_a_method_it_is_not_used(tmp_path: Path, cache: Path, sliced: by
     result, written = compensated(sliced, tmp_path, cache, method="none", budget_um=10)
     assert written == sliced
     assert result.budget is None
-    assert any("the budget was not used" in warning for warning in result.warnings)
+    assert any("Without effect: budget_um" in warning for warning in result.warnings)
 
 
 def test_options_without_a_budget_are_those_of_before() -> None:

@@ -15,6 +15,7 @@ from stillpath.pipeline.result import Result
 from stillpath.service.wrong_options import wrong_option
 from tests.gcode.cutting import ender3_with
 from tests.gcode.plain_reader import Firmware, read
+from tests.gcode.prints import small_arcs
 from tests.gcode.states import differences, tagged
 
 GEAR = Path(__file__).parents[2] / "examples" / "cura_ender3_gear24.gcode"
@@ -81,6 +82,19 @@ def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     assert not any("shaper would serve" in warning for warning in walls.warnings)
 
 
+def test_outer_walls_of_small_arcs(gear: Path, tmp_path: Path) -> None:
+    # Of a Marlin's arc some segments feed nothing: less than a step of E.
+    machine, source = ender3_with("marlin"), tmp_path / "arcs.gcode"
+    source.write_bytes(tagged(small_arcs().encode()))
+    target, options = tmp_path / "walls.gcode", Options(where="walls")
+    cache = gear.parent / "cache"
+    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    assert result.put_back == []
+    assert differences(source.read_bytes(), target.read_bytes(), machine) == []
+    outer = next(g.contour_rms_um for g in result.features if g.name == "WALL-OUTER")
+    assert outer["after"] < 0.5 * outer["before"]
+
+
 def test_the_firmwares_shaper_is_not_switched_between_walls(gear: Path, tmp_path: Path) -> None:
     document = ender3_with("klipper").model_dump(mode="json")
     document["firmware"]["shaper"] = {"freq_x_hz": 45.0, "freq_y_hz": 35.0}
@@ -141,6 +155,52 @@ def test_a_budget_is_for_the_whole_print() -> None:
     with pytest.raises(ValidationError) as refused:
         Options(budget_um=10, where="walls")
     assert "budget_um" in wrong_option(refused.value)
+
+
+@pytest.mark.parametrize("method", ["advise", "none"])
+def test_where_is_for_what_is_compensated(method: str) -> None:
+    from pydantic import ValidationError
+
+    with pytest.raises(ValidationError, match=rf"method {method} .*where") as refused:
+        Options(method=method, where="walls")
+    assert "leave where at all" in wrong_option(refused.value)
+    assert Options(method="none+ripple", where="walls").where == "walls"
+
+
+def test_a_file_that_stays_as_sliced_only_fits_or_not(gear: Path, tmp_path: Path) -> None:
+    machine, target = ender3_with("klipper"), tmp_path / "out.gcode"
+    found = run(gear, target, machine, method="none", max_mb=10)
+    assert target.read_bytes() == gear.read_bytes()
+    assert not any("max_mb" in note for note in found.notes)
+    with pytest.raises(GcodeError, match=r"exceeds max_mb 0\.01, and method none") as refused:
+        run(gear, target, machine, method="none", max_mb=0.01)
+    assert "outer walls" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("method", "chosen", "unused"),
+    [
+        ("none", {"tolerance_um": 5.0, "budget_um": 9.0, "basis": "dct"}, "basis, tolerance_um"),
+        ("shaper:zv", {"robust": "off", "along": 0.5, "tolerance_um": 5.0}, "robust, along. "),
+        ("advise", {"tolerance_um": 5.0, "budget_um": 90.0}, "tolerance_um. "),
+        ("fbf", {"basis": "dct", "robust": "off", "along": 0.5, "tolerance_um": 5.0}, ""),
+    ],
+)
+def test_what_has_no_effect_is_told(
+    method: str, chosen: dict[str, object], unused: str, gear: Path, tmp_path: Path
+) -> None:
+    short = tmp_path / "short.gcode"
+    short.write_bytes(b"G28\n" + b"G1 X60 Y60 F6000\nG1 X90 Y60 E1\nG1 X90 Y90 E2\n" * 4)
+    found = compensate_file(
+        short,
+        tmp_path / "out.gcode",
+        ender3_with("klipper"),
+        Options.model_validate({"method": method, **chosen}),
+        cache_dir=gear.parent / "cache",
+    )
+    told = [warning for warning in found.warnings if warning.startswith("Without effect: ")]
+    assert len(told) == bool(unused)
+    assert not unused or f"Without effect: {unused}" in told[0]
 
 
 def test_digests_of_older_options_stay() -> None:

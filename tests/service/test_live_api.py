@@ -85,6 +85,7 @@ def test_what_makes_no_sense_together_is_refused_before_the_body(client: TestCli
     for query, reason in (
         ("method=none&compare_live=true", "method none writes none"),
         ("method=live&where=walls", "method live prints the file as sliced"),
+        ("method=advise&where=walls", "method advise leaves every move as it is"),
         ("budget_um=5&where=walls", "cannot be combined"),
     ):
         answer = client.post(f"/v1/jobs?machine=ender3&{query}", content=b"G1 X1\n")

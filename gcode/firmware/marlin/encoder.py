@@ -38,6 +38,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
     spread_advance,
     thin,
 )
+from stillpath.gcode.firmware.marlin.climbing import climb_in_long_moves
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.planning import join_phases
@@ -190,7 +191,8 @@ class MarlinEncoder:
         """
         own = cast(MarlinLimits, piece.limits_before)
         limits = stream_limits(own, self._command, self._mesh_slope)
-        segments = self._advanced(piece, timeline, self._on_steps(timeline, segments))
+        on_steps = self._on_steps(timeline, segments, limits)
+        segments = self._advanced(piece, timeline, on_steps)
         moves = interleave(piece, timeline, segments, 1)
         moves = self._where_the_file_says(piece, timeline, moves)
         rows = moves.row
@@ -293,7 +295,7 @@ class MarlinEncoder:
         position[last] = np.where(same, to_units(ends), position[last])
         return replace(moves, position=position, begin=to_units(piece.moves.start_mm[0]))
 
-    def _on_steps(self, timeline: Timeline, segments: Segments) -> Segments:
+    def _on_steps(self, timeline: Timeline, segments: Segments, limits: MarlinLimits) -> Segments:
         """Put the vertices on whole steps, and leave out those that would be swallowed."""
         if len(segments) == 0:
             # X and Y of the whole piece move by less than a step.
@@ -321,7 +323,9 @@ class MarlinEncoder:
             bend_reversals(steps, begin, group, places, self._lattice.least, self._corexy)
         last = np.append(group[1:] != group[:-1], True)
         end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
-        return Segments(wish.end_s[keep], end_mm, group)
+        chosen = Segments(wish.end_s[keep], end_mm, group)
+        classic = self._firmware.junction == "classic_jerk"
+        return climb_in_long_moves(chosen, timeline, scale[2], limits, classic_jerk=classic)
 
     def _blocks(
         self, start_mm: NDArray[np.float64], end_mm: NDArray[np.float64]

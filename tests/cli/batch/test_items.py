@@ -40,6 +40,16 @@ def test_two_files_of_one_name_are_refused(tmp_path):
     assert len(items_of([tmp_path], Group(("m",)), output=tmp_path / "out")) == 2
 
 
+@pytest.mark.parametrize("output", ["plates", "plates/../plates/.", "."])
+def test_a_folder_within_the_output_is_refused(tmp_path, output):
+    fill(tmp_path, "plates/a.gcode")
+    with pytest.raises(ModelError, match=r"--output .*plates.*; name an output folder in it"):
+        items_of([tmp_path / "plates"], Group(("m",)), output=tmp_path / output)
+    # A file that was named is done all the same.
+    named = items_of([tmp_path / "plates/a.gcode"], Group(("m",)), output=tmp_path / output)
+    assert [item.place for item in named] == ["a.gcode"]
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.gcode"):
         items_of([tmp_path / "nothing.gcode"], Group(("m",)), output=tmp_path / "out")

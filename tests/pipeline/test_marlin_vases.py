@@ -1,0 +1,49 @@
+"""Marlin slows short moves that climb by a step of Z; vases are compensated all the same."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stillpath.models.machine import Machine
+from stillpath.pipeline.compensate import compensate_file
+from stillpath.pipeline.options import Options
+from tests.gcode.cutting import ender3_with
+from tests.gcode.prints import vase
+
+Z_STEPS_PER_MM = 400.0
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.mark.parametrize("junction", ["deviation", "classic_jerk"])
+@pytest.mark.parametrize("speed_mm_s", [60.0, 80.0])
+@pytest.mark.parametrize("turns", [2, -2])
+def test_a_vase_is_compensated(
+    junction: str, speed_mm_s: float, turns: int, tmp_path: Path, cache: Path
+) -> None:
+    document = ender3_with("marlin").model_dump(mode="json")
+    document["firmware"]["junction"] = junction
+    text = vase(speed_mm_s, turns=abs(turns))
+    if turns < 0:  # it sinks
+        text = re.sub(r"(?<= Z)[\d.]+", lambda z: f"{2.0 - float(z[0]):.3f}", text)
+    source, target = tmp_path / "vase.gcode", tmp_path / "out.gcode"
+    source.write_text(text)
+    machine, options = Machine.model_validate(document), Options()
+    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    assert result.put_back == []
+    rms_um = result.features[0].contour_rms_um
+    assert rms_um["after"] < rms_um["shaper"] < rms_um["before"]
+    assert rms_um["after"] < (3.0 if junction == "deviation" else 5.0)
+
+    # Z climbs evenly, by a step at a time, and comes to where the file says.
+    stream = target.read_text().split("stillpath: stream on\n")[1].split("stream off")[0]
+    z_steps = Z_STEPS_PER_MM * np.array([float(z) for z in re.findall(r"G1.* Z([\d.]+)", stream)])
+    assert np.abs(np.diff(z_steps)).max() < 1.01
+    assert z_steps[-1] == pytest.approx(Z_STEPS_PER_MM * float(re.findall(r" Z([\d.]+)", text)[-1]))
