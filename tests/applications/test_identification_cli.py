@@ -141,6 +141,7 @@ def test_a_new_machine_needs_a_base(store: MachineStore, folder: Path, capsys) -
     assert identify(file, "-m", "new", "--base", "ender3", "--title", "New one") == 0
     machine = store.current("new").machine
     assert (machine.name, machine.title) == ("new", "New one")
+    assert machine.source == "travel, limits, axis Y of Creality Ender 3 (ender3)"
     assert machine.firmware == load_machine("ender3").firmware
 
 
