@@ -104,13 +104,15 @@ class Summary:
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
+        if self.writer is not None:
+            # First, as it says that the file had better not be printed.
+            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
         yield from self.totals.warnings
         yield from passed_over(self.reader)
         yield from self.measurement.warnings()
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
             yield from self.totals.left_alone()
-            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
         if self.budget is not None:
             budget, pairs = self.budget
             yield from budget.warnings(pairs.sums(), self.reader.feature_names)
