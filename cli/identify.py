@@ -297,6 +297,10 @@ def _start(machines: Resolver, name: str | None, base: str | None) -> tuple[Mach
             )
         current = machines.store.current(name)
         return current.machine, current.number
+    if name is not None:
+        from stillpath.applications.machines.store import check_name
+
+        check_name(name)  # before the work, not after it
     if base is None and name is not None:
         raise ModelError(
             f"there is no machine {name!r} yet: say by --base what it starts from (a machine of "

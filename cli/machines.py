@@ -359,7 +359,9 @@ def check(
 
 def _stated(made: NewMachine) -> StatedMachine:
     from stillpath.applications.machines.checks import StatedMachine
+    from stillpath.applications.machines.store import check_name
 
+    check_name(made.name)
     return StatedMachine(made.name, made.title, (made.fx, made.fy), made.zeta)
 
 

@@ -16,7 +16,7 @@ from stillpath.models.provenance import SourceFile
 if TYPE_CHECKING:
     from stillpath.models.machine import Machine
 
-__all__ = ["Confirmation", "confirmation_text", "plants_digest"]
+__all__ = ["Confirmation", "confirmation_text", "plants_digest", "um_text"]
 
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{12}$")]
 
@@ -85,10 +85,12 @@ def _axis_text(machine: Machine, axis: Literal["x", "y"]) -> str:
         )
     low, high = found.predicted_um
     return (
-        f"{found.verdict} on {found.tested_on}: predicted {_um(low)} to {_um(high)} um, measured "
-        f"{_um(found.measured_um)} um"
+        f"{found.verdict} on {found.tested_on}: predicted {um_text(low)} to {um_text(high)} um, "
+        f"measured {um_text(found.measured_um)} um"
     )
 
 
-def _um(value: float) -> str:
-    return f"{value:.2g}" if value < 10.0 else f"{value:.0f}"
+def um_text(value: float, digits: int = 2) -> str:
+    """Return micrometres with so many significant digits, but never with an exponent of ten."""
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e+" in text else text

@@ -56,16 +56,19 @@ def names_a_file(text: str) -> bool:
     return text.endswith(".json") or "/" in text or "\\" in text
 
 
-def no_such_machine(name: str, own: Sequence[str] = ()) -> ModelError:
-    """Return the error for a name that neither the library nor the user's store (`own`) knows."""
+def no_such_machine(name: str, own: Sequence[str] = (), *, files: bool = True) -> ModelError:
+    """Return the error for a name that neither the library nor the user's store (`own`) knows.
+
+    With `files` it says that a path would do as well.
+    """
     names = builtin_machines()
     wanted = name.lower().replace("_", "-")
     near = difflib.get_close_matches(wanted, [*own, *names], n=3, cutoff=0.5)
     hint = f"did you mean {', '.join(near)}? " if near else ""
     yours = f"your own are {', '.join(own)}; " if own else ""
+    path = "; a file of your own is given by its path, ending in .json" if files else ""
     return ModelError(
-        f"no machine is called {name!r:.80}; {hint}{yours}built in are {', '.join(names)}; "
-        "a file of your own is given by its path, ending in .json"
+        f"no machine is called {name!r:.80}; {hint}{yours}built in are {', '.join(names)}{path}"
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.models.confirmation import confirmation_text
+from stillpath.models.confirmation import confirmation_text, um_text
 from stillpath.models.machine import Machine
 from stillpath.pipeline.caution import Choice, prediction_note
 from stillpath.pipeline.clock import StageClock
@@ -104,13 +104,15 @@ class Summary:
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
+        if self.writer is not None:
+            # First, as it says that the file had better not be printed.
+            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
         yield from self.totals.warnings
         yield from passed_over(self.reader)
         yield from self.measurement.warnings()
         if self.writer is not None:
             yield from self.writer.shaper_warnings()
             yield from self.totals.left_alone()
-            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
         if self.budget is not None:
             budget, pairs = self.budget
             yield from budget.warnings(pairs.sums(), self.reader.feature_names)
@@ -135,8 +137,8 @@ class Summary:
         compared = self.budget is None and not self.options.method.startswith("shaper:")
         if compared and ours >= max(shaper, NEGLIGIBLE_UM):
             yield (
-                f"{SHAPER_IS_BETTER}: {self.shaper.label} "
-                f"alone would leave {shaper:.2g} um rms of contour error, this file {ours:.2g} um. "
+                f"{SHAPER_IS_BETTER}: {self.shaper.label} alone would leave {um_text(shaper)} um "
+                f"rms of contour error, this file {um_text(ours)} um. "
                 "Print it as sliced with that shaper, or let --method advise write the commands"
             )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
@@ -17,7 +18,7 @@ from jinja2 import Environment, StrictUndefined, Template
 
 from stillpath.pipeline.files import replacing
 
-__all__ = ["asset", "content_hash", "rendered", "style_of", "write_texts"]
+__all__ = ["asset", "content_hash", "rendered", "style_of", "thousands", "um_text", "write_texts"]
 
 
 def write_texts(directory: Path, texts: Mapping[str, str]) -> None:
@@ -67,6 +68,20 @@ def rendered(
     """
     page = _compiled(package, template, tuple(filters.items()))
     return page.render(style=style, style_hash=content_hash(style), **values)
+
+
+def um_text(value: float | None) -> str:
+    """Return micrometres with three significant digits at most, as `lib/format.js` shows them."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value >= 99.95:
+        return thousands(value)
+    return f"{value:.1f}" if value >= 9.995 else f"{value:.2f}"
+
+
+def thousands(value: float) -> str:
+    """Return a whole number with a thin no-break space between thousands, as SI writes them."""
+    return f"{value:,.0f}".replace(",", "\u202f")
 
 
 def content_hash(text: str) -> str:

@@ -38,7 +38,7 @@
     const count = Math.max(...shown.map((name) => chart.series[name].length));
     const peak = Math.max(1e-3, ...shown.map((name) =>
       chart.series[name].reduce((a, v) => (v !== null && v > a ? v : a), 0)));
-    const resting = readout.textContent = "Point at the curve to read it.";
+    const resting = readout.textContent = "Point at the curve, or tap it, to read it.";
     function draw() {
       box.replaceChildren();
       const width = box.clientWidth, height = Math.min(260, Math.max(180, width * .3));
@@ -211,7 +211,7 @@
         return tick;
       }));
     }
-    const resting = "Point at the path to read line and error. The arrow keys move the slider.";
+    const resting = "Point at the path, or tap it, to read line and error. The arrow keys move the slider.";
     function draw() {
       const view = views[slider.value];
       $("layer-name").textContent = `${view.layer}, z ${view.z} mm`;

@@ -17,7 +17,7 @@ import numpy as np
 
 from stillpath.pipeline.result import Channel, GroupFigures, Result
 from stillpath.reports.figures import spectrum_figures
-from stillpath.reports.pages import asset, content_hash, rendered, write_texts
+from stillpath.reports.pages import asset, content_hash, rendered, thousands, um_text, write_texts
 
 __all__ = ["headline_figures", "render_report", "write_report"]
 
@@ -57,13 +57,13 @@ def render_report(result: Result) -> str:
         "report.html.j2",
         asset(_PACKAGE, "report.css"),
         {
-            "um": _um,
+            "um": um_text,
             "short": _short,
             "plain": _plain,
             "duration": _duration,
             "share": _share,
             "megabytes": _megabytes,
-            "number": _number,
+            "number": thousands,
         },
         result=result,
         channels=channels,
@@ -196,12 +196,6 @@ def _mapped(values: dict[str, float]) -> dict[str, float | None]:
     return {k: round(v, 2) if math.isfinite(v) else None for k, v in values.items()}
 
 
-def _um(value: float | None) -> str:
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
-
-
 def _short(label: str) -> str:
     """Drop what a label says in brackets: the headline tells it once."""
     return label.split(" (")[0]
@@ -225,8 +219,3 @@ def _share(part: float, whole: float) -> str:
 
 def _megabytes(size: int) -> str:
     return f"{size / 1e6:.2f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
-
-
-def _number(value: float) -> str:
-    # A thin no-break space between thousands, as SI writes them.
-    return f"{value:,.0f}".replace(",", "\u202f")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
 import sys
 import time
@@ -72,12 +73,11 @@ def serve_forever(
         h11_max_incomplete_event_size=_LONGEST_HEADERS_BYTES,
         timeout_graceful_shutdown=_GOODBYE_S,
     )
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     quiet_tracker()
     with (
         _alone(settings),
         _database(settings),
-        socket.create_server((host, port), family=family, backlog=_BACKLOG) as listener,
+        _listening(host, port) as listener,
     ):
         log = structlog.get_logger("serve")
         log.info("data directory", folder=str(settings.data_dir.resolve()))
@@ -85,6 +85,17 @@ def serve_forever(
             sys.stdout.write(f"stillpath: {address}\n")
         sys.stdout.flush()
         uvicorn.Server(config).run(sockets=[listener])
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        if error.errno != errno.EADDRINUSE:
+            raise
+        taken = f"another program listens on {host}:{port}; stop it, or choose another --port"
+        raise OSError(error.errno, f"{taken} (0: any)") from None
 
 
 def _addresses(host: str, port: int) -> list[str]:

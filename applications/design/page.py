@@ -20,7 +20,7 @@ from stillpath.applications.design.summary import Summary, modes_text, zero_text
 from stillpath.compensation.basis import ZERO
 from stillpath.compensation.preview import MAX_CONDITION, MAX_SPECTRAL_RADIUS
 from stillpath.reports.charts import Band, Chart, Line, Mark, draw
-from stillpath.reports.pages import rendered, style_of, write_texts
+from stillpath.reports.pages import rendered, style_of, thousands, um_text, write_texts
 
 __all__ = ["render_design", "write_design"]
 
@@ -67,8 +67,8 @@ def render_design(report: DesignReport) -> str:
         "design.html.j2",
         style_of(),
         {
-            "um": _um,
-            "number": _number,
+            "um": um_text,
+            "number": thousands,
             "power": _power,
             "figures": _figures,
             "modes": modes_text,
@@ -264,15 +264,6 @@ def _model(metric: RobustMetric) -> str:
 def _nonzero(singular_values: Sequence[float]) -> list[float | None]:
     """Leave out what is zero but for rounding."""
     return [s if s > ZERO * singular_values[0] else None for s in singular_values]
-
-
-def _um(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
-
-
-def _number(value: float) -> str:
-    # A thin no-break space between thousands, as SI writes them.
-    return f"{value:,.0f}".replace(",", "\u202f")
 
 
 def _power(value: float) -> str:

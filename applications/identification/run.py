@@ -183,7 +183,12 @@ def _with_plants(
         if one.schedule is not None:
             document["schedules"][axis] = one.schedule.model_dump()
     if name is not None and name != base.name:
-        document.update(name=name, title=title or f"{base.title}, measured")
+        kept = ", ".join(f"axis {axis.upper()}" for axis in sorted(base.axes.keys() - found.keys()))
+        document.update(
+            name=name,
+            title=title or f"{base.title}, measured",
+            source=f"travel, limits{kept and f', {kept}'} of {base.title} ({base.name})",
+        )
     elif title is not None:
         document["title"] = title
     try:

@@ -112,6 +112,6 @@ class Resolver:
         if name in builtin_machines() or (files and names_a_file(name)):
             return PinnedMachine(machine=load_machine(name))
         if name not in self.store:
-            raise UnknownMachine(str(no_such_machine(name, self.store.names())))
+            raise UnknownMachine(str(no_such_machine(name, self.store.names(), files=files)))
         revision = self.store.usable(name, require_approval=approved)
         return PinnedMachine(machine=revision.machine, number=revision.number)

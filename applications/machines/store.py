@@ -37,7 +37,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import builtin_machines, explain
 
-__all__ = ["MachineStore"]
+__all__ = ["MachineStore", "check_name"]
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 _REVISION = re.compile(r"(\d{6})\.json")
@@ -242,7 +242,7 @@ class MachineStore:
         Conflict
             If there is a machine of that name, or the revisions are not those of one machine.
         """
-        _check_name(name)
+        check_name(name)
         if [r.number for r in revisions] != [*range(1, len(revisions) + 1)] or not revisions:
             raise Conflict("the revisions of a history must count from 1 without gaps")
         for revision in revisions:
@@ -270,7 +270,7 @@ class MachineStore:
         Conflict
             If there is a machine of that name again.
         """
-        _check_name(name)
+        check_name(name)
         trash = f"{_TRASH}/{name}"
         found = self._documents.folders(trash)
         if not found:
@@ -294,7 +294,7 @@ class MachineStore:
         expected: int | None = None,
     ) -> Revision:
         """Write the revision that `change` makes of the current one, once more if it is late."""
-        _check_name(name)
+        check_name(name)
         for _ in range(_ATTEMPTS):
             numbers = self._revision_numbers(name)
             last = numbers[-1] if numbers else 0
@@ -396,7 +396,16 @@ def _approval_file(name: str, number: int) -> str:
     return f"{name}/{number:06d}.approved.json"
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str) -> None:
+    """Refuse what cannot be the name of a user's machine.
+
+    Raises
+    ------
+    Conflict
+        If a built-in machine is called so.
+    ModelError
+        If no machine may be.
+    """
     if not _NAME.fullmatch(name):
         raise ModelError(
             f"{name!r:.80} cannot be a machine's name: up to 64 of a-z 0-9 _ -, the first a letter "

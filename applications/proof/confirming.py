@@ -38,7 +38,7 @@ from stillpath.applications.proof.ring_motion import (
     read_ring_motion,
 )
 from stillpath.applications.proof.ring_test import AXES, Axis
-from stillpath.models.confirmation import Confirmation, plants_digest
+from stillpath.models.confirmation import Confirmation, plants_digest, um_text
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.types import AccelerationLog
@@ -306,14 +306,16 @@ class _Axis:
     ) -> tuple[Verdict, str]:
         low, high = compensated.predicted_um
         said = (
-            f"measured {compensated.measured_um:.2g} ± {compensated.scatter_um:.1g} um after "
-            f"{compensated.stops} compensated stops, predicted {low:.2g} to {high:.2g}; "
-            f"{planned.measured_um:.2g} um as planned"
+            f"measured {um_text(compensated.measured_um)} ± "
+            f"{um_text(compensated.scatter_um, 1)} um after "
+            f"{compensated.stops} compensated stops, predicted {um_text(low)} to "
+            f"{um_text(high)}; "
+            f"{um_text(planned.measured_um)} um as planned"
         )
         if off.rms < _ABOVE_FLOOR * noise_um:
             return "says nothing", (
-                f"{said}: the noise of the log is {noise_um:.2g} um, too much for this ringing; "
-                "take a better sensor, or fix it better"
+                f"{said}: the noise of the log is {um_text(noise_um)} um, too much for this "
+                "ringing; take a better sensor, or fix it better"
             )
         least, most = on.reaches(-_SIGMAS), on.reaches(_SIGMAS)
         moved = self._moved()

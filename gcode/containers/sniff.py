@@ -35,6 +35,9 @@ _FOREIGN = {
     b"Rar!": "a RAR archive",
     b"\x7fELF": "a program",
 }
+_STL_HEAD_BYTES = 84
+"""Of a binary STL model: a text that may be anything, and the number of facets, four bytes."""
+_STL_FACET_BYTES = 50
 _SUFFIXES = {
     ".gcode": Kind.TEXT,
     ".gco": Kind.TEXT,
@@ -60,7 +63,12 @@ def kind_of(head: bytes) -> Kind:
 def foreign(path: Path) -> str | None:
     """Return what a file is that is known and certainly no print file; None of any other."""
     with path.open("rb") as file:
-        head = file.read(max(map(len, _FOREIGN)))
+        head = file.read(_STL_HEAD_BYTES)
+    size = path.stat().st_size
+    if size == 0:
+        return "empty"
+    if size == _STL_HEAD_BYTES + _STL_FACET_BYTES * int.from_bytes(head[-4:], "little"):
+        return _FOREIGN[b"solid"]
     return next((what for magic, what in _FOREIGN.items() if head.startswith(magic)), None)
 
 

@@ -98,7 +98,12 @@ Line = Annotated[str, AfterValidator(_is_line)]
 
 
 class JobQuery(BaseModel):
-    """Parameters of a job, beside the file."""
+    """Parameters of a job, beside the file.
+
+    A name that is not known is refused: a misspelt `budget_um` must not become a job without one.
+    """
+
+    model_config = ConfigDict(extra="forbid")
 
     machine: Line = Field(
         max_length=255, description="A name from `/v1/machines`.", examples=["ender3"]

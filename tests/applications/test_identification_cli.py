@@ -136,11 +136,15 @@ def test_a_new_machine_needs_a_base(store: MachineStore, folder: Path, capsys) -
     (file,) = placed([quick_raw("x")], folder)
     assert identify(file, "-m", "new") == 2
     assert "--base" in one_line(capsys)
+    for name, why in (("My Ender", "a-z 0-9"), ("ender3", "built-in")):
+        assert identify(file, "-m", name, "--base", "ender3") == 2
+        assert why in one_line(capsys)
     assert identify(file, "-m", "mine", "--base", "ender3") == 2
     assert "leave out --base" in one_line(capsys)
     assert identify(file, "-m", "new", "--base", "ender3", "--title", "New one") == 0
     machine = store.current("new").machine
     assert (machine.name, machine.title) == ("new", "New one")
+    assert machine.source == "travel, limits, axis Y of Creality Ender 3 (ender3)"
     assert machine.firmware == load_machine("ender3").firmware
 
 

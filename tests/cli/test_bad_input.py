@@ -22,7 +22,7 @@ START = "G28\nG1 X10 Y10 F6000\n"
 JUNK = random.Random(1).randbytes(20_000)
 
 BAD = {
-    "empty": (b"", ["no moves"]),
+    "empty": (b"", ["is empty"]),
     "junk": (JUNK, []),
     "binary": (b"GCDE\x01\x00\x00\x00\x01\x00" + JUNK, []),
     "zeros": (bytes(5000), []),

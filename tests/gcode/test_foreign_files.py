@@ -16,6 +16,7 @@ from stillpath.gcode.errors import GcodeError
         (b"\x89PNG\r\n\x1a\n", "PNG"),
         (b"\xff\xd8\xff\xe0", "JPEG"),
         (b"solid cube\n facet normal 0 0 1\n", "STL"),
+        (b"a cube".ljust(80) + b"\1\0\0\0".ljust(48), "STL"),
         (b"\x1f\x8b\x08\x00", "gzip"),
     ],
 )
@@ -26,7 +27,14 @@ def test_it_says_what_the_file_is(tmp_path: Path, head: bytes, word: str) -> Non
         pass
 
 
-@pytest.mark.parametrize("text", [b"", b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n"])
+def test_an_empty_file_is_called_so(tmp_path: Path) -> None:
+    path = tmp_path / "part.gcode"
+    path.touch()
+    with pytest.raises(GcodeError, match=r"the file is empty.*slicer"), open_text(path):
+        pass
+
+
+@pytest.mark.parametrize("text", [b"\n", b"%\nG28\n", b";solid\nG28\n", b"G28", b"<x\n"])
 def test_gcode_is_not_taken_for_it(tmp_path: Path, text: bytes) -> None:
     path = tmp_path / "part.gcode"
     path.write_bytes(text)

@@ -121,6 +121,7 @@ def test_a_form_brings_the_same_bytes(client: TestClient):
         ("machine=ender3&robust=yes", ["robust"]),
         ("machine=ender3&along=0", ["along"]),
         ("machine=ender3&tolerance_um=0", ["tolerance_um: must be at least 0.5 µm (given: '0')"]),
+        ("machine=ender3&budgetum=10", ["budgetum: is not known here"]),
         ("machine=ender3&tolerance_um=nan", ["tolerance_um"]),
         ("machine=ender3&tolerance_um=wide", ["tolerance_um"]),
         ("machine=%00", ["machine"]),

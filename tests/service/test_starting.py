@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import psutil
 import pytest
+
+from stillpath.service.server import serve_forever
+from stillpath.service.settings import Settings
 
 pytestmark = pytest.mark.slow
 
@@ -55,6 +59,13 @@ def test_a_service_that_cannot_start_says_why_in_one_line(
     assert errors.startswith("stillpath: error: ")
     assert said in errors
     assert errors.count("\n") == 1
+
+
+def test_a_taken_port_is_named_with_the_remedy(tmp_path: Path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"{port}; .*--port"):
+            serve_forever(Settings(data_dir=tmp_path), "127.0.0.1", port)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends signals")

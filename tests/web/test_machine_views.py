@@ -8,6 +8,7 @@ from pathlib import Path
 from playwright.sync_api import expect
 
 from stillpath.applications.identification.page import interval_text
+from stillpath.reports.pages import um_text
 from tests.applications.test_machine_m503 import M503
 from tests.models.identification.recordings import QUICK_QUERY, quick_raw
 from tests.web.machines import put
@@ -109,6 +110,17 @@ def test_intervals_are_those_of_the_command_line(visitor: Visitor):
         [f"/{module.replace('app.js', 'lib/format.js')}", cases],
     )
     assert shown == [interval_text(*case) for case in cases]
+
+
+def test_micrometres_are_those_of_the_reports(visitor: Visitor):
+    page = visitor.open()
+    module = page.locator("script[type=module]").get_attribute("src") or ""
+    cases = [0.0, 0.994, 9.994, 9.996, 10.04, 99.94, 99.96, 100.4, 1234.6]
+    shown = page.evaluate(
+        "async ([from, cases]) => { const { um } = await import(from); return cases.map(um); }",
+        [f"/{module.replace('app.js', 'lib/format.js')}", cases],
+    )
+    assert shown == [um_text(case) for case in cases]
 
 
 def test_a_measurement_that_cannot_be_used_is_named(visitor: Visitor, tmp_path: Path):

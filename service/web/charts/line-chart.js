@@ -46,7 +46,7 @@ export function lineChart(chart) {
   const xText = chart.x.text ?? ((/** @type {number} */ v) => number(v, 4));
   const yText = chart.y.text ?? ((/** @type {number} */ v) => number(v));
   const plot = h("div.plot", { tabindex: "0", role: "group", "aria-label": `${chart.title}. Left and right arrow keys read the curves.` });
-  const resting = "Point at the curves, or use the arrow keys, to read them.";
+  const resting = "Point at the curves, tap them, or use the arrow keys, to read them.";
   const readout = h("p.readout", { "aria-live": "polite" }, resting);
   const legend = h("ul.legend", null, told.map((s) => h("li", null, swatch(s), s.label)));
   /** @type {any} */

@@ -10,7 +10,7 @@ import { NAME } from "./name.js";
 import { fitPlots } from "./plots.js";
 
 const TEST = [
-  ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "133.3"], ["hz_per_sec", "Hz per second", "1"],
+  ["min_freq", "From, Hz", "5"], ["max_freq", "To, Hz", "135"], ["hz_per_sec", "Hz per second", "1"],
   ["accel_per_hz", "Acceleration per Hz, mm/s", "60"], ["sweeping_accel", "Sweeping acceleration, mm/s²", "400"],
 ];
 
@@ -32,7 +32,7 @@ export function measurementPanel({ machines, base, own = false, signal }) {
     event.preventDefault();
     send(chosen(), true);
   } },
-    dropZone({ label: "Drop measurements here, or choose them", hint: "Klipper's raw_data_*.csv or resonances_*.csv, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.npz,.gz,text/*", multiple: true,
+    dropZone({ label: "Choose measurements, or drop them here", hint: "Klipper's raw_data_*.csv or resonances_*.csv, frequency responses, recordings; several at once", accept: ".csv,.txt,.json,.npz,.gz,text/*", multiple: true,
       onChoose: (chosen) => {
         files = chosen;
         look.disabled = false;

@@ -9,10 +9,11 @@ const HZ = { label: "frequency, Hz", text: (/** @type {number} */ v) => `${numbe
 
 /**
  * @param {any[]} responses Of both axes, from the service.
+ * @param {any} machine Its document.
  * @param {AbortSignal} signal
  * @returns {HTMLElement}
  */
-export function responsePlots(responses, signal) {
+export function responsePlots(responses, machine, signal) {
   return h("div.pair", null, responses.map((axis) => h("div", null,
     h("h3", null, `${axis.axis.toUpperCase()} axis`),
     lineChart({
@@ -21,7 +22,15 @@ export function responsePlots(responses, signal) {
       series: [...members(axis.members, "magnitude", axis.nominal.f_hz.length), { label: axis.members.length ? "Nominal (thin: its set)" : "Nominal", values: axis.nominal.magnitude, colour: "--after", width: 2.2 }],
     }),
     modeTable(axis),
-    h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "The machine's document names no measurement of this axis: frequencies and damping may be typed in or typical."))));
+    h("p.hint", null, axis.band_hz ? `Measured from ${number(axis.band_hz[0])} to ${number(axis.band_hz[1])} Hz; outside, the model is a guess.` : "The machine's document names no measurement of this axis: frequencies and damping may be typed in or typical."),
+    trust(machine.axes[axis.axis].provenance))));
+}
+
+/** Where the model may be far off although it fits. @param {any} provenance */
+function trust(provenance) {
+  if (!provenance?.trust_below_hz) return null;
+  const why = provenance.kind === "spectrum" ? "the phase was not measured. A raw accelerometer log would tell it." : "its phase is not certain there.";
+  return h("p.hint", null, `Do not trust it above ${number(provenance.trust_below_hz)} Hz: ${why}`);
 }
 
 /**
@@ -66,7 +75,7 @@ export function fitPlots(axis, signal) {
 function modeTable(axis) {
   if (axis.modes.length === 0) return h("p.hint", null, "No resonances.");
   const modes = table(`Modes of the ${axis.axis.toUpperCase()} axis`, [{ title: "Mode", text: true }, { title: "Frequency, Hz" }, { title: "Damping ratio" }],
-    axis.modes.map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), interval(m.f_hz, m.f_sd_hz, 2), interval(m.zeta, m.zeta_sd, 4)]));
+    [...axis.modes].sort((/** @type {any} */ a, /** @type {any} */ b) => a.f_hz - b.f_hz).map((/** @type {any} */ m, /** @type {number} */ k) => [String(k + 1), interval(m.f_hz, m.f_sd_hz, 2), interval(m.zeta, m.zeta_sd, 4)]));
   return axis.modes.some((/** @type {any} */ m) => m.f_sd_hz) ? h("div", null, modes, h("p.hint", null, "± is 95 %, from the fit's own scatter.")) : modes;
 }
 

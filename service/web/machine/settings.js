@@ -34,8 +34,8 @@ export function settingsPanel({ machine, signal }) {
     send();
   } },
     dropZone(machine
-      ? { label: "Drop Marlin's answer to M503 here, or choose it", hint: "What it does not say stays as it is", accept: ".txt,.log,.gcode,text/*", onChoose }
-      : { label: "Drop printer.cfg or Marlin's answer to M503 here", hint: "Klipper: printer.cfg. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.txt,.log,text/*", onChoose }),
+      ? { label: "Choose Marlin's answer to M503, or drop it here", hint: "What it does not say stays as it is", accept: ".txt,.log,.gcode,text/*", onChoose }
+      : { label: "Choose printer.cfg or Marlin's answer to M503, or drop it here", hint: "Klipper: printer.cfg. Marlin: send M503 from a host, and save all of the answer as a text file", accept: ".cfg,.txt,.log,text/*", onChoose }),
     machine ? null : [
       h("div.fields", null,
         field("settings-name", "Name of your machine", name, "Small letters, digits, - and _."),

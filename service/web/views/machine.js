@@ -48,7 +48,7 @@ export async function show({ main, signal, setTitle, params: [name] }) {
   draw(plots, async () => {
     const responses = await getJson(`${where}/response`, { signal });
     const found = isOwn ? await identification(where, signal) : null;
-    return [responsePlots(responses, signal), ...(found ? [identifiedPlots(found, signal)] : [])];
+    return [responsePlots(responses, machine, signal), ...(found ? [identifiedPlots(found, signal)] : [])];
   });
   if (isOwn) draw(history, () => revisionPanel(where, machine.name, signal));
 }

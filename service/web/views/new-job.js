@@ -57,7 +57,7 @@ export async function show({ main, signal, setTitle }) {
     submit();
   } },
     dropZone({
-      label: "Drop a G-code file here, or choose one", hint: ".gcode, .bgcode or sliced .3mf", accept: FILES,
+      label: "Choose a G-code file, or drop it here", hint: ".gcode, .bgcode or sliced .3mf", accept: FILES,
       onChoose: ([chosen]) => {
         file = chosen;
         ready();
