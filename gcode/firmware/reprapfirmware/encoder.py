@@ -153,7 +153,7 @@ class RepRapEncoder:
             corexy=False,
             speed_step_mm_s=min(limits.jerk_x_mm_s, limits.jerk_y_mm_s),
             spare_steps=0.0,
-            accel_mm_s2=limits.print_accel_mm_s2,
+            accel_mm_s2=min(limits.accel_x_mm_s2, limits.accel_y_mm_s2),
             moves_per_s=self._half_ring / (_SPARSE * self._half_ring_s),
         )
 
