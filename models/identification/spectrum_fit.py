@@ -67,8 +67,9 @@ _BEYOND = 0.6
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above so many times the highest bin were not seen, and damping that they may have."""
 _PEAKS = 4
-_FRAME_LIKELY = 0.5
-"""That a weak mode far below the strongest is the frame's: a table hardly shows one."""
+_FRAME_LIKELY = 0.8
+"""That a weak mode far below the strongest is the frame's, as with logs: designed for the nozzle,
+what the frame does makes prints worse by more than it can win (docs/tried.md)."""
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
 _PER_PARAMETER = 2.0
