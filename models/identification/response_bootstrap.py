@@ -33,6 +33,9 @@ _DRAWS = 32
 _POINTS = 120
 _LEAST_SD = 0.005
 """Relative; no axis is more linear than that."""
+_LOST, _NOTHING = 3.0, 0.9
+"""Times the usual residual of a draw, and of what there is to explain: a fit that leaves more has
+lost its way."""
 _FRAME_LIKELY = 0.8
 """That a weak mode far below the strongest is the frame's: a response shows it, but may be wrong
 about whose it is."""
@@ -74,15 +77,19 @@ def explain_response(
     crowd: list[PlantSpec] = [prompt(fit), *map(prompt, others)]
     delays_s = [delay_of(one.spec) for one in (fit, *others)]
     rng = np.random.default_rng(_SEED)
+    drawn: list[tuple[Fit, PlantSpec]] = []
     for k in range(_DRAWS):
         # Every second one from another structure, as nobody knows which is right.
         like = others[k // 2 % len(others)] if others and k % 2 else fit
-        drawn = refit(draws.draw(rng), like)
+        found = refit(draws.draw(rng), like)
         f, zeta = 1 + np.array(_RUN_TO_RUN) * np.clip(rng.standard_normal(2), -2.0, 2.0)
-        crowd.append(advanced(_moved(drawn.spec, float(f), float(zeta))))
-        delays_s.append(delay_of(drawn.spec))
+        drawn.append((found, _moved(found.spec, float(f), float(zeta))))
         if progress:
             progress((k + 1) / _DRAWS)
+    most = min(_LOST * float(np.median([found.residual for found, _ in drawn])), _NOTHING)
+    explaining = [(found, moved) for found, moved in drawn if found.residual <= most]
+    crowd += [advanced(moved) for _, moved in explaining]
+    delays_s += [delay_of(found.spec) for found, _ in explaining]
     centres = [prompt(fit)]
     if not frame_firm:
         crowd = shaken(crowd, rng, _FRAME_LIKELY)
