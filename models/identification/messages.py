@@ -11,6 +11,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.identification.estimation import plateau_gain
 from stillpath.models.identification.nozzle import Frame
 from stillpath.models.identification.types import Excitation, Fit, FrequencyResponse, Spectrum
+from stillpath.models.plants import RelativeModesSpec
 
 __all__ = [
     "apart_warning",
@@ -18,6 +19,7 @@ __all__ = [
     "by_file",
     "cross_axis_warning",
     "fit_warnings",
+    "frame_mode_notes",
     "level_warnings",
     "mounting_notes",
     "parted",
@@ -81,6 +83,20 @@ def body_notes(friction_mm: float, frame: Frame | None) -> list[str]:
             "does not, so the response is freed of it (frame_firm leaves it in)"
         )
     return notes
+
+
+def frame_mode_notes(felt: RelativeModesSpec, kept: RelativeModesSpec) -> list[str]:
+    """Say which modes of a table are left out as the frame's."""
+    known_hz = {mode.f_hz for mode in kept.modes}
+    left_out = [f"{mode.f_hz:.1f} Hz" for mode in felt.modes if mode.f_hz not in known_hz]
+    if not left_out:
+        return []
+    note = (
+        f"what shakes weakly at {' and '.join(left_out)}, far below the strongest resonance, is "
+        "taken to be the frame on its feet: the sensor feels it, the nozzle over the bed does not "
+        "(frame_firm leaves it in; raw logs would tell)"
+    )
+    return [note]
 
 
 def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

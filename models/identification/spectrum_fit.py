@@ -23,6 +23,7 @@ from stillpath.models.identification.frame import shaken, without_frame
 from stillpath.models.identification.messages import (
     apart_warning,
     cross_axis_warning,
+    frame_mode_notes,
     spectrum_level_warning,
 )
 from stillpath.models.identification.modal_structure import ModalStructure
@@ -112,8 +113,8 @@ def explain_spectra(
     column : str, optional
         Default: the one that follows the drive from 8 to 15 Hz.
     frame_firm : bool
-        Whether the frame is known to stand firm; else half of the plants are without what may be
-        its mode.
+        Whether the frame is known to stand firm; else four fifths of the plants are without what
+        may be its mode.
     max_order : int
         Most modes to try.
     progress : callable, optional
@@ -139,6 +140,7 @@ def explain_spectra(
         *spectrum_level_warning(gain, excitation),
         *cross_axis_warning(*cross_axis_share(single, name, search.model.band_hz), name),
         *apart_warning(spectra, search.repeats),
+        *frame_mode_notes(chosen.structure.spec(chosen.theta), population.members[0]),
     )
     fit = Fit(
         spec=population.members[0],

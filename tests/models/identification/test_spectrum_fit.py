@@ -138,6 +138,21 @@ def test_a_frame_is_taken_out_where_it_may_be_one() -> None:
     assert firm.fit.order >= 2
 
 
+def test_most_plants_are_without_a_mode_that_may_be_the_frame_s() -> None:
+    """Unless the frame stands firm; which mode that is, is said."""
+    spectrum = simulated(((14.0, 0.1), (45.0, 0.06)), (0.1, 0.9), LEGACY)
+    found = explain_spectra([spectrum], LEGACY)
+    weights = found.population.weights
+    without = [min(m.f_hz for m in plant.modes) > 25.0 for plant in found.population.members]
+    assert without[0]
+    assert 0.6 < sum(w for w, free in zip(weights, without, strict=True) if free) < 0.95
+    (note,) = (text for text in found.fit.notes if "frame on its feet" in text)
+    assert "at 14." in note or "at 13." in note
+    firm = explain_spectra([spectrum], LEGACY, frame_firm=True)
+    assert not any("frame on its feet" in text for text in firm.fit.notes)
+    assert min(m.f_hz for m in firm.population.members[0].modes) == pytest.approx(14.0, rel=0.1)
+
+
 def test_forward_model_is_what_klipper_would_print() -> None:
     """Drive, plant and window against Klipper's estimate of the exact response."""
     plant = modal(NARROW, (0.7, 0.3))
