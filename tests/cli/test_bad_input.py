@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import contextlib
+import json
 import os
 import random
 import signal
@@ -94,7 +94,7 @@ def writes_into(folder: Path, pid: int) -> bool:
     links = []
     for handle in Path("/proc").glob(f"{pid}/fd/*"):
         with contextlib.suppress(OSError):  # closed meanwhile
-            links.append(os.readlink(handle))
+            links.append(str(handle.readlink()))
     return any(folder.iterdir()) or any(link.startswith(f"{folder}/") for link in links)
 
 
