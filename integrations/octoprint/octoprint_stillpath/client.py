@@ -195,7 +195,11 @@ class Service:
                 if error.midway and goes:
                     deadline, goes = time.monotonic() + self._timeout_s, goes - 1
                 if time.monotonic() + pause_s > deadline:
-                    raise Failure(f"no answer from {self._address}: {error}", 1) from None
+                    raise Failure(
+                        f"no answer from {self._address}: {error}; is the service running there "
+                        "(`stillpath serve`), and is the address right (--server)?",
+                        1,
+                    ) from None
             self._tell("the server does not answer; trying again", None)
             time.sleep(pause_s)
             pause_s = min(2 * pause_s, self._LONGEST_PAUSE_S)
