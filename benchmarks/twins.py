@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
+from builtin_machines import TABLES
 from quality import FILES, Task, best_shaper
 from readback import (
     Aligned,
@@ -35,6 +36,8 @@ from readback import (
     shared_folder,
 )
 
+from stillpath.applications.identification.run import InputFile, identify_files
+from stillpath.models.identification.readers import ReadSettings
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, RelativeModesSpec
 from stillpath.models.store import load_machine
@@ -80,6 +83,12 @@ def main() -> int:
     parser.add_argument("files", nargs="*", default=list(FILES), help="paths, or corpus names")
     parser.add_argument("--machines", nargs="+", default=list(MACHINES), choices=list(MACHINES))
     parser.add_argument("--robust", default="auto")
+    parser.add_argument(
+        "--identified",
+        action="store_true",
+        help="machines as identify makes them of the same tables, in place of those that are "
+        "shipped (whose frames are taken to stand firm)",
+    )
     parser.add_argument("--tolerance-um", type=float, default=Options().tolerance_um)
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--cache", type=Path, default=default_cache_dir() / "benchmarks")
@@ -91,6 +100,9 @@ def main() -> int:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     options = Options(robust=given.robust, tolerance_um=given.tolerance_um)
+    machines = {name: load_machine(MACHINES[name]) for name in given.machines}
+    if given.identified:
+        machines = {name: from_tables(machine, shared) for name, machine in machines.items()}
     head = f"{'file':26}{'machine':15}{'twin':5}{'none':>7}{'shaper':>8}{'ours':>7}{'max':>6}"
     print(f"{head}{'/shaper':>9}{'/none':>7}  tuned shaper of the twin", flush=True)
     rows: list[Row] = []
@@ -98,9 +110,9 @@ def main() -> int:
         files = [plain_copy(find_input(name, shared), Path(folder)) for name in given.files]
         with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
             waiting = [
-                pool.submit(judged, file, name, shared, options, given.cache)
+                pool.submit(judged, file, name, machine, shared, options, given.cache)
                 for file in files
-                for name in given.machines
+                for name, machine in machines.items()
             ]
             for done in waiting:
                 rows += done.result()
@@ -135,9 +147,17 @@ def twin_of(shipped: Machine, name: str, twin: str, shared: Path) -> Machine:
     return shipped.model_copy(update={"axes": axes, "name": f"{shipped.name}-{twin}"})
 
 
-def judged(file: Path, name: str, shared: Path, options: Options, cache: Path) -> list[Row]:
-    """Compensate a file for a machine as shipped and let both twins print it."""
-    shipped = load_machine(MACHINES[name])
+def from_tables(shipped: Machine, shared: Path) -> Machine:
+    """Return the machine that `identify` makes of the tables that the shipped one was made of."""
+    paths = [shared / "measurements" / table for table in TABLES[shipped.name]]
+    files = [InputFile(path.name, path.read_bytes()) for path in paths]
+    return identify_files(files, shipped, ReadSettings()).machine
+
+
+def judged(
+    file: Path, name: str, shipped: Machine, shared: Path, options: Options, cache: Path
+) -> list[Row]:
+    """Compensate a file for a machine and let both twins print it."""
     own = read_motion(file, shipped)
     with tempfile.TemporaryDirectory(prefix="stillpath-twins-") as folder:
         target = Path(folder) / "out.gcode"

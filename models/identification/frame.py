@@ -8,19 +8,27 @@ zeros, far below the mode that rings most.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeVar, cast
 
 import numpy as np
 
 from stillpath.models.plants import PairsSpec, PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["shaken", "without_frame"]
+__all__ = ["LIKELY", "frame_hz_of", "likely_of", "shaken", "without_frame"]
 
 P = TypeVar("P", bound=PlantSpec)
 
 _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
 """What may be a frame: no higher, well below the strongest mode, of no more share."""
+LIKELY = 0.8
+"""That a weak mode far below the strongest is the frame's. A response shows it, but may be wrong
+about whose it is. Designed for the nozzle, what the frame does makes prints worse by more than it
+can win (docs/tried.md)."""
+_UNLIKE, _UNLIKE_LIKELY = 1.4, 0.3
+"""A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.3
+times in spectra of virtual printers. What lies further apart is not one frame, and rather something
+that the nozzle feels."""
 _BESIDE = 0.25
 """Logarithm of the ratio of a pair of zeros to the pair of poles that it belongs to."""
 
@@ -29,6 +37,22 @@ def shaken(crowd: Sequence[P], rng: np.random.Generator, likely: float) -> list[
     """Take the frame out of a share `likely` of plants, as the nozzle over the bed feels none."""
     frame = rng.random(len(crowd)) < likely
     return [without_frame(p) if shakes else p for p, shakes in zip(crowd, frame, strict=True)]
+
+
+def frame_hz_of(crowd: Sequence[PlantSpec]) -> float | None:
+    """Return where most plants have a weak mode that may be the frame's, if they do."""
+    lowest = [
+        min(mode.f_hz for mode in plant.modes)
+        for plant in crowd
+        if isinstance(plant, RelativeModesSpec) and without_frame(plant) != plant
+    ]
+    return float(np.median(lowest)) if 2 * len(lowest) > len(crowd) else None
+
+
+def likely_of(frames_hz: Iterable[float | None]) -> float:
+    """Return how likely such modes are the frame's, from where each axis has one."""
+    seen = [f_hz for f_hz in frames_hz if f_hz is not None]
+    return LIKELY if not seen or max(seen) < _UNLIKE * min(seen) else _UNLIKE_LIKELY
 
 
 def without_frame(plant: P) -> P:

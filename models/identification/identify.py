@@ -20,6 +20,7 @@ from stillpath.models.identification.estimation import (
     estimate_driven,
     estimate_response,
 )
+from stillpath.models.identification.frame import LIKELY, likely_of
 from stillpath.models.identification.friction import dry_friction, freed
 from stillpath.models.identification.messages import (
     body_notes,
@@ -27,6 +28,7 @@ from stillpath.models.identification.messages import (
     fit_warnings,
     level_warnings,
     mounting_notes,
+    no_frame_note,
     parted,
     scale_warnings,
 )
@@ -46,7 +48,11 @@ from stillpath.models.identification.sets import (
     spectrum_set,
     typed_in_set,
 )
-from stillpath.models.identification.spectrum_fit import refit_spectrum
+from stillpath.models.identification.spectrum_fit import (
+    Explanations,
+    explanations,
+    refit_spectrum,
+)
 from stillpath.models.identification.trust import check_axes, check_informative, keeps_time
 from stillpath.models.identification.types import (
     AccelerationLog,
@@ -120,10 +126,16 @@ def identify(
     if not groups:
         raise ModelError("nothing to identify: give at least one measurement")
     steps = _Steps(progress, len(measured) + len(groups))
-    found = {
-        axis: _AxisWork(axis, groups[axis], settings, sources, max_order, steps).identified()
+    works = {
+        axis: _AxisWork(axis, groups[axis], settings, sources, max_order, steps)
         for axis in sorted(groups)
     }
+    frames_hz = {axis: work.frame_hz() for axis, work in works.items()}
+    frame_likely = 0.0 if settings.frame_firm else likely_of(frames_hz.values())
+    found = {axis: work.identified(frame_likely) for axis, work in works.items()}
+    if 0.0 < frame_likely < LIKELY:
+        note = no_frame_note(frames_hz)
+        found = {axis: replace(one, notes=(*one.notes, note)) for axis, one in found.items()}
     if not settings.sensor_turned:
         _check_directions(found)
     check_axes(list(found.values()))
@@ -165,6 +177,8 @@ class _AxisWork:
         self._max_order = max_order
         self._aligned: list[AlignedLog] = []
         """Of the raw logs that are used."""
+        self._spectra: list[tuple[Spectrum, Excitation, Condition]] = []
+        self._explanations: Explanations | None = None
         kind = next(k for k in _BEST_FIRST if any(isinstance(m.measurement, k) for m in measured))
         self._used = [m for m in measured if isinstance(m.measurement, kind)]
         self._left_out = [m for m in measured if not isinstance(m.measurement, kind)]
@@ -175,12 +189,34 @@ class _AxisWork:
             measured_on=max(filter(None, map(date_in_name, names)), default=None),
         )
 
-    def identified(self) -> AxisIdentification:
-        """Return the axis with the notes of its files."""
+    def frame_hz(self) -> float | None:
+        """Return where a weak mode may be the frame's: of spectra, where nothing else tells."""
+        if self._kind != "spectrum":
+            return None
+        self._spectra = [self._spectrum(one) for one in self._used]
+        common = usual([c for _, _, c in self._spectra], self._axis)
+        chosen = [(s, e) for s, e, c in self._spectra if c in common]
+        self._explanations = explanations(
+            [s for s, _ in chosen],
+            [e for _, e in chosen],
+            column=self._settings.sensor_axis,
+            max_order=self._max_order,
+            progress=self._steps.within(f"axis {self._axis}: fitting"),
+        )
+        return self._explanations.frame_hz
+
+    def identified(self, frame_likely: float) -> AxisIdentification:
+        """Return the axis with the notes of its files.
+
+        Parameters
+        ----------
+        frame_likely : float
+            That a weak mode in spectra is the frame's.
+        """
         if self._kind == "model file":
             found = self._from_model()
         elif self._kind == "spectrum":
-            found = self._from_spectra()
+            found = self._from_spectra(frame_likely)
         else:
             found = self._from_responses()
         self._steps.stepped(f"axis {self._axis}: fitted")
@@ -257,27 +293,21 @@ class _AxisWork:
         )
         return scheduled(found, nominal, fits, self._kind)
 
-    def _from_spectra(self) -> AxisIdentification:
-        spectra: list[tuple[Spectrum, Excitation, Condition]] = []
-        notes: list[tuple[str, str]] = []
-        for one in self._used:
-            spectrum = one.measurement
-            assert isinstance(spectrum, Spectrum)
-            spectra.append((spectrum, excitation_for(spectrum, self._settings), one.condition))
-            assumed = excitation_notes(spectrum, self._settings)
-            notes += [(spectrum.source, note) for note in assumed]
-            self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
+    def _spectrum(self, one: Measured) -> tuple[Spectrum, Excitation, Condition]:
+        spectrum = one.measurement
+        assert isinstance(spectrum, Spectrum)
+        self._steps.stepped(f"axis {self._axis}: {spectrum.source}")
+        return spectrum, excitation_for(spectrum, self._settings), one.condition
+
+    def _from_spectra(self, frame_likely: float) -> AxisIdentification:
+        assert self._explanations is not None
+        spectra = self._spectra
+        notes = [
+            (s.source, note) for s, _, _ in spectra for note in excitation_notes(s, self._settings)
+        ]
         common = usual([c for _, _, c in spectra], self._axis)
-        chosen = [(s, e) for s, e, c in spectra if c in common]
         found = spectrum_set(
-            [s for s, _ in chosen],
-            [e for _, e in chosen],
-            axis=self._axis,
-            column=self._settings.sensor_axis,
-            frame_firm=self._settings.frame_firm,
-            max_order=self._max_order,
-            origin=self._origin,
-            progress=self._steps.within(f"axis {self._axis}: fitting"),
+            self._explanations, axis=self._axis, frame_likely=frame_likely, origin=self._origin
         )
         nominal = found.fit
         assert nominal is not None

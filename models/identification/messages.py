@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ __all__ = [
     "frame_mode_notes",
     "level_warnings",
     "mounting_notes",
+    "no_frame_note",
     "parted",
     "scale_warnings",
     "spectrum_level_warning",
@@ -97,6 +99,15 @@ def frame_mode_notes(felt: RelativeModesSpec, kept: RelativeModesSpec) -> list[s
         "(frame_firm leaves it in; raw logs would tell)"
     )
     return [note]
+
+
+def no_frame_note(frames_hz: Mapping[Literal["x", "y"], float | None]) -> str:
+    """Say why weak modes are kept: a frame's would be alike in X and Y."""
+    seen = " and ".join(f"{f:.1f} Hz in {a.upper()}" for a, f in sorted(frames_hz.items()) if f)
+    return (
+        f"what shakes weakly at {seen} lies too far apart to be one frame on its feet, so most "
+        "plants keep it (frame_firm: all of them; raw logs would tell)"
+    )
 
 
 def parted(told: Iterable[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.models.identification.averaging import aligned_to, mean_response, on_grid
-from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.frame import LIKELY, shaken, without_frame
 from stillpath.models.identification.modal_fit import alternatives, refit
 from stillpath.models.identification.mode_estimates import correlation_factor
 from stillpath.models.identification.prompt import advanced, delay_of, prompt
@@ -36,9 +36,6 @@ _LEAST_SD = 0.005
 _LOST, _NOTHING = 3.0, 0.9
 """Times the usual residual of a draw, and of what there is to explain: a fit that leaves more has
 lost its way."""
-_FRAME_LIKELY = 0.8
-"""That a weak mode far below the strongest is the frame's: a response shows it, but may be wrong
-about whose it is."""
 _RUN_TO_RUN = (0.007, 0.12)
 """Relative standard deviation of frequencies and damping within a session, on real axes."""
 
@@ -92,7 +89,7 @@ def explain_response(
     delays_s += [delay_of(found.spec) for found, _ in explaining]
     centres = [prompt(fit)]
     if not frame_firm:
-        crowd = shaken(crowd, rng, _FRAME_LIKELY)
+        crowd = shaken(crowd, rng, LIKELY)
         centres.append(without_frame(centres[0]))
     population = representatives(centres, crowd)
     return population, (float(min(delays_s)), float(max(delays_s)))

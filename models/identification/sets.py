@@ -15,17 +15,16 @@ from numpy.typing import NDArray
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_response
+from stillpath.models.identification.frame import LIKELY
 from stillpath.models.identification.modal_fit import fit_modes, refit
 from stillpath.models.identification.prompt import delay_of, prompt
 from stillpath.models.identification.response_bootstrap import explain_response
 from stillpath.models.identification.response_data import coherent_part
-from stillpath.models.identification.spectrum_fit import explain_spectra
+from stillpath.models.identification.spectrum_fit import Explanations
 from stillpath.models.identification.types import (
     AxisIdentification,
-    Excitation,
     Fit,
     FrequencyResponse,
-    Spectrum,
 )
 from stillpath.models.plants import (
     ParametricMembers,
@@ -149,47 +148,20 @@ def response_set(
 
 
 def spectrum_set(
-    spectra: Sequence[Spectrum],
-    excitation: Excitation | Sequence[Excitation],
+    explanations: Explanations,
     *,
     axis: str,
-    column: str | None = None,
-    frame_firm: bool = False,
-    max_order: int = 4,
+    frame_likely: float = LIKELY,
     origin: Origin = _UNKNOWN,
-    progress: Callable[[float], None] | None = None,
 ) -> AxisIdentification:
-    """Identify an axis from one or more spectra of the same test.
-
-    Nominal and members explain them all, within their scatter and that of such tables
-    (`spectrum_fit.explain_spectra`).
+    """Identify an axis from what explains its spectra, within their scatter.
 
     Parameters
     ----------
-    excitation : Excitation, or one per spectrum
-        The mean of spectra of different tests cannot be taken.
-    frame_firm : bool
-        What the sensor feels is what prints (`ReadSettings.frame_firm`).
-
-    Raises
-    ------
-    ModelError
-        If there is no spectrum, the tests differ, or a spectrum cannot be fitted.
+    frame_likely : float
+        That a weak mode far below the strongest is the frame's (`frame.likely_of`).
     """
-    tests = [excitation] if isinstance(excitation, Excitation) else list(excitation)
-    if any(test != tests[0] for test in tests):
-        raise ModelError(
-            f"axis {axis}: the spectra come from different tests (accel_per_hz, range or "
-            "direction), so they have no mean; identify from those of one test"
-        )
-    found = explain_spectra(
-        spectra,
-        tests[0],
-        column=column,
-        frame_firm=frame_firm,
-        max_order=max_order,
-        progress=progress,
-    )
+    found = explanations.explained(frame_likely)
     fit, population = found.fit, found.population
     members = _with_delays(population.members)
     plants = PlantSetSpec(
@@ -204,7 +176,7 @@ def spectrum_set(
         ),
     )
     return AxisIdentification(
-        axis=axis, plants=plants, fit=fit, measured=tuple(spectra), warnings=fit.notes
+        axis=axis, plants=plants, fit=fit, measured=explanations.spectra, warnings=fit.notes
     )
 
 

@@ -11,6 +11,7 @@ rest, weighted by how many they stand for.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,12 @@ from scipy.optimize import least_squares
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
-from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.frame import (
+    LIKELY,
+    frame_hz_of,
+    shaken,
+    without_frame,
+)
 from stillpath.models.identification.messages import (
     apart_warning,
     cross_axis_warning,
@@ -43,7 +49,7 @@ from stillpath.models.identification.types import (
 )
 from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
 
-__all__ = ["Explained", "explain_spectra", "refit_spectrum"]
+__all__ = ["Explained", "Explanations", "explain_spectra", "explanations", "refit_spectrum"]
 
 Array = NDArray[np.float64]
 
@@ -68,9 +74,6 @@ _BEYOND = 0.6
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
 """Modes above so many times the highest bin were not seen, and damping that they may have."""
 _PEAKS = 4
-_FRAME_LIKELY = 0.8
-"""That a weak mode far below the strongest is the frame's, as with logs: designed for the nozzle,
-what the frame does makes prints worse by more than it can win (docs/tried.md)."""
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
 _PER_PARAMETER = 2.0
@@ -95,26 +98,86 @@ class Explained:
     population: Population[RelativeModesSpec]
 
 
-def explain_spectra(
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanations:
+    """Fits that explain spectra of an axis; which of them count depends on its frame.
+
+    Attributes
+    ----------
+    frame_hz : float or None
+        Where most of them have a weak mode that may be the frame's.
+    """
+
+    spectra: tuple[Spectrum, ...]
+    excitation: Excitation
+    column: str
+    search: _Search
+    found: tuple[_Candidate, ...]
+    """From many starts, the best first."""
+    accepted: tuple[_Candidate, ...]
+    drawn: tuple[_Candidate, ...]
+    frame_hz: float | None
+
+    def explained(self, frame_likely: float = LIKELY) -> Explained:
+        """Return a plant in the middle and the set that stands for all.
+
+        Parameters
+        ----------
+        frame_likely : float
+            Share of the plants that are without what may be the frame's mode.
+        """
+        search, found = self.search, self.found
+        least_db = min(c.residual_db for c in self.accepted)
+        good = [c for c in self.accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
+        centres = [c.structure.spec(c.theta) for c in good]
+        crowd = [c.structure.spec(c.theta) for c in (*self.accepted, *self.drawn)]
+        if frame_likely:
+            crowd = shaken(crowd, deepcopy(search.rng), frame_likely)
+            centres += [without_frame(plant) for plant in centres]
+        population = representatives(centres, crowd)
+        chosen = good[population.middle % len(good)]
+        gain = float(np.exp(chosen.vector[0]))
+        best = {
+            n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders
+        }
+        cross = cross_axis_share(mean_spectrum(self.spectra), self.column, search.model.band_hz)
+        notes = (
+            *spectrum_level_warning(gain, self.excitation),
+            *cross_axis_warning(*cross, self.column),
+            *apart_warning(self.spectra, search.repeats),
+            *frame_mode_notes(chosen.structure.spec(chosen.theta), population.members[0]),
+        )
+        fit = Fit(
+            spec=population.members[0],
+            residual=chosen.residual_db,
+            gain=gain,
+            delay_s=0.0,
+            band_hz=search.model.band_hz,
+            modes=mode_spread(population),
+            trials=tuple(OrderTrial(n, db) for n, db in best.items()),
+            magnitude_only=True,
+            trust_below_hz=min(population.agree_below_hz(), search.model.band_hz[1]),
+            notes=notes,
+        )
+        return Explained(fit, population)
+
+
+def explanations(
     spectra: Sequence[Spectrum],
-    excitation: Excitation,
+    excitation: Excitation | Sequence[Excitation],
     *,
     column: str | None = None,
-    frame_firm: bool = False,
     max_order: int = 4,
     progress: Callable[[float], None] | None = None,
-) -> Explained:
-    """Find the plants that explain one or more spectra of an axis, all of one test.
+) -> Explanations:
+    """Find what explains one or more spectra of an axis, all of one test.
 
     Parameters
     ----------
-    excitation : Excitation
-        The test that made them.
+    excitation : Excitation, or one per spectrum
+        The test that made them: the mean of spectra of different tests cannot be taken.
     column : str, optional
         Default: the one that follows the drive from 8 to 15 Hz.
-    frame_firm : bool
-        Whether the frame is known to stand firm; else four fifths of the plants are without what
-        may be its mode.
     max_order : int
         Most modes to try.
     progress : callable, optional
@@ -123,38 +186,44 @@ def explain_spectra(
     Raises
     ------
     ModelError
-        If the column does not exist or is dead, or too few bins are left.
+        If there is no spectrum, the tests differ, the column does not exist or is dead, or too few
+        bins are left.
     """
+    tests = [excitation] if isinstance(excitation, Excitation) else list(excitation)
+    if any(test != tests[0] for test in tests):
+        raise ModelError(
+            f"{', '.join(s.source for s in spectra)}: the spectra come from different tests "
+            "(accel_per_hz, range or direction), so they have no mean; identify from those of one "
+            "test"
+        )
     single = mean_spectrum(spectra)
     name = _column(single, column)
-    search = _Search(single, name, excitation, spectra, max_order)
+    search = _Search(single, name, tests[0], spectra, max_order)
     found = search.candidates(progress)
     accepted, drawn = _explanations(search, found, progress)
-    least_db = min(c.residual_db for c in accepted)
-    good = [c for c in accepted if c.residual_db <= max(_GOOD_DB, _NO_WORSE * least_db)]
-    population = _population(search, good, (*accepted, *drawn), frame_firm=frame_firm)
-    chosen = good[population.middle % len(good)]
-    gain = float(np.exp(chosen.vector[0]))
-    best = {n: min(c.residual_db for c in found if c.structure.modes == n) for n in search.orders}
-    notes = (
-        *spectrum_level_warning(gain, excitation),
-        *cross_axis_warning(*cross_axis_share(single, name, search.model.band_hz), name),
-        *apart_warning(spectra, search.repeats),
-        *frame_mode_notes(chosen.structure.spec(chosen.theta), population.members[0]),
+    return Explanations(
+        spectra=tuple(spectra),
+        excitation=tests[0],
+        column=name,
+        search=search,
+        found=tuple(found),
+        accepted=tuple(accepted),
+        drawn=tuple(drawn),
+        frame_hz=frame_hz_of([c.structure.spec(c.theta) for c in (*accepted, *drawn)]),
     )
-    fit = Fit(
-        spec=population.members[0],
-        residual=chosen.residual_db,
-        gain=gain,
-        delay_s=0.0,
-        band_hz=search.model.band_hz,
-        modes=mode_spread(population),
-        trials=tuple(OrderTrial(n, db) for n, db in best.items()),
-        magnitude_only=True,
-        trust_below_hz=min(population.agree_below_hz(), search.model.band_hz[1]),
-        notes=notes,
-    )
-    return Explained(fit, population)
+
+
+def explain_spectra(
+    spectra: Sequence[Spectrum],
+    excitation: Excitation,
+    *,
+    column: str | None = None,
+    frame_likely: float = LIKELY,
+    max_order: int = 4,
+) -> Explained:
+    """Find the plants that explain spectra of an axis: `explanations`, and the set of them."""
+    found = explanations(spectra, excitation, column=column, max_order=max_order)
+    return found.explained(frame_likely)
 
 
 def _explanations(
@@ -170,18 +239,6 @@ def _explanations(
         if progress:
             progress(0.5 + 0.5 * (k + 1) / len(SCATTERS))
     return accepted, drawn
-
-
-def _population(
-    search: _Search, good: Sequence[_Candidate], some: Sequence[_Candidate], *, frame_firm: bool
-) -> Population[RelativeModesSpec]:
-    """Return the good plant in the middle, and what stands for all."""
-    centres = [c.structure.spec(c.theta) for c in good]
-    crowd = [c.structure.spec(c.theta) for c in some]
-    if not frame_firm:
-        crowd = search.shaken(crowd)
-        centres += [without_frame(plant) for plant in centres]
-    return representatives(centres, crowd)
 
 
 def refit_spectrum(
@@ -265,7 +322,7 @@ class _Search:
                 for s in repeats
             ]
         )
-        self._rng = np.random.default_rng(_SEED)
+        self.rng = np.random.default_rng(_SEED)
         self._unit_hz = float(np.sqrt(model.f_hz[0] * model.f_hz[-1]))
         most = max(1, min(max_order, len(model.f_hz) // 12))
         self.orders = tuple(range(1, most + 1))
@@ -293,7 +350,7 @@ class _Search:
         whitening = _whitening(SCATTERS[0].covariance(self.model))
         # More of the larger ones: they have more ways to explain a spectrum.
         likely = [n for n in self.orders for _ in range(n * n)]
-        counts = [*self.orders, *self._rng.choice(likely, _STARTS - len(self.orders)).tolist()]
+        counts = [*self.orders, *self.rng.choice(likely, _STARTS - len(self.orders)).tolist()]
         found = []
         for k, modes in enumerate(counts):
             found.append(self.polished(self._start(int(modes)), whitening, self.model.log_psd, 40))
@@ -324,23 +381,19 @@ class _Search:
         likely = np.exp(-0.25 * (np.array([c.cost for c in accepted]) - accepted[0].cost))
         out = []
         for _ in range(_DRAWS):
-            start = accepted[int(self._rng.choice(len(accepted), p=likely / likely.sum()))]
+            start = accepted[int(self.rng.choice(len(accepted), p=likely / likely.sum()))]
             # Which of the repeats happen to be there (Bayesian bootstrap, Rubin 1981).
-            weights = self._rng.dirichlet(np.ones(len(self.repeats)))
-            log_psd = weights @ self.repeats + root @ self._rng.standard_normal(len(root))
+            weights = self.rng.dirichlet(np.ones(len(self.repeats)))
+            log_psd = weights @ self.repeats + root @ self.rng.standard_normal(len(root))
             out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
         return out
-
-    def shaken(self, crowd: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
-        """Take the frame out of some plants."""
-        return shaken(crowd, self._rng, _FRAME_LIKELY)
 
     def _rung(self, fit: _Candidate) -> _Candidate:
         """Give modes beyond the band any damping: of them only a flank was seen."""
         n, vector = fit.structure.modes, fit.vector.copy()
         beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]
         low, high = np.log(_UNSEEN_ZETA)
-        vector[2 + n : 2 + 2 * n][beyond] = self._rng.uniform(low, high, np.count_nonzero(beyond))
+        vector[2 + n : 2 + 2 * n][beyond] = self.rng.uniform(low, high, np.count_nonzero(beyond))
         return replace(fit, vector=vector)
 
     def _whitening(self, fits: Sequence[_Candidate], scatter: Scatter) -> Array:
@@ -355,7 +408,7 @@ class _Search:
 
     def _start(self, modes: int) -> _Candidate:
         """Return a random start: modes at peaks, elsewhere in the band, perhaps one beyond it."""
-        rng, model = self._rng, self.model
+        rng, model = self.rng, self.model
         structure = ModalStructure(modes, self._unit_hz)
         size = model.log_psd - model.log_drive
         inner = np.arange(2, len(size) - 2)

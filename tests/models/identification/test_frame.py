@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stillpath.models.identification.frame import shaken, without_frame
+from stillpath.models.identification.frame import (
+    LIKELY,
+    frame_hz_of,
+    likely_of,
+    shaken,
+    without_frame,
+)
 from stillpath.models.plants import (
     PairsSpec,
     PolePair,
@@ -62,3 +68,24 @@ def test_half_of_a_crowd_is_without() -> None:
     found = shaken([felt] * 200, np.random.default_rng(0), 0.5)
     assert 70 < found.count(ALONE) < 130
     assert found.count(ALONE) + found.count(felt) == 200
+
+
+def test_a_frame_is_seen_where_most_plants_have_it() -> None:
+    def felt(f_hz: float) -> RelativeModesSpec:
+        low = RelativeMode(f_hz=f_hz, zeta=0.1, share=0.1)
+        return RelativeModesSpec(modes=(low, RelativeMode(f_hz=45.0, zeta=0.06, share=0.9)))
+
+    alone = RelativeModesSpec(modes=(RelativeMode(f_hz=45.0, zeta=0.06, share=1.0),))
+    assert frame_hz_of([felt(13.0), felt(14.0), felt(15.0), alone]) == pytest.approx(14.0)
+    assert frame_hz_of([felt(14.0), alone]) is None
+
+
+@pytest.mark.parametrize(
+    ("x_hz", "y_hz", "one_frame"),
+    [(14.0, 17.0, True), (None, 17.0, True), (None, None, True), (28.9, 17.9, False)],
+)
+def test_a_frame_shakes_alike_in_x_and_y(
+    x_hz: float | None, y_hz: float | None, one_frame: bool
+) -> None:
+    """The last pair are those of a Voron V0, whose tables its owner published."""
+    assert (likely_of([x_hz, y_hz]) == LIKELY) == one_frame

@@ -19,6 +19,7 @@ from stillpath.models.identification.sets import (
     spectrum_set,
     typed_in_set,
 )
+from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.types import Excitation, FrequencyResponse, Spectrum
 from stillpath.models.plants import (
@@ -130,7 +131,7 @@ def test_a_set_has_at_most_fifteen_plants() -> None:
 
 @pytest.mark.slow
 def test_spectra_make_a_set_of_what_explains_them() -> None:
-    one = spectrum_set([spectrum(plant())], TEST, axis="x")
+    one = spectrum_set(explanations([spectrum(plant())], TEST), axis="x")
     assert one.plants.provenance is not None
     assert one.plants.provenance.magnitude_only
     assert one.plants.provenance.trust_below_hz == one.fit.trust_below_hz  # type: ignore[union-attr]
@@ -141,9 +142,8 @@ def test_spectra_make_a_set_of_what_explains_them() -> None:
     assert len(delays) == len(listed)
     assert delays[0] == 0.0
     assert 0.0 < max(delays) < 2 * 0.08 / (2 * np.pi * 47.0)
-    several = spectrum_set(
-        [spectrum(plant(f), i) for i, f in enumerate((0.99, 1.0, 1.02))], TEST, axis="x"
-    )
+    repeats = [spectrum(plant(f), i) for i, f in enumerate((0.99, 1.0, 1.02))]
+    several = spectrum_set(explanations(repeats, TEST), axis="x")
     assert several.fit is not None
     assert several.fit.modes[0].f_hz == pytest.approx(47.0, rel=0.01)
 
@@ -151,7 +151,7 @@ def test_spectra_make_a_set_of_what_explains_them() -> None:
 def test_spectra_of_different_tests_have_no_mean() -> None:
     pair = [spectrum(plant(), 0), spectrum(plant(), 1)]
     with pytest.raises(ModelError, match="different tests"):
-        spectrum_set(pair, [TEST, replace(TEST, accel_per_hz_mm_s=60.0)], axis="x")
+        explanations(pair, [TEST, replace(TEST, accel_per_hz_mm_s=60.0)])
 
 
 def test_typed_in_is_trusted_least() -> None:

@@ -134,7 +134,7 @@ def test_a_frame_is_taken_out_where_it_may_be_one() -> None:
         }
     )
     assert without_frame(heavy).modes[0].f_hz == 14.0
-    firm = explain_spectra([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY, frame_firm=True)
+    firm = explain_spectra([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY, frame_likely=0.0)
     assert firm.fit.order >= 2
 
 
@@ -148,7 +148,7 @@ def test_most_plants_are_without_a_mode_that_may_be_the_frame_s() -> None:
     assert 0.6 < sum(w for w, free in zip(weights, without, strict=True) if free) < 0.95
     (note,) = (text for text in found.fit.notes if "frame on its feet" in text)
     assert "at 14." in note or "at 13." in note
-    firm = explain_spectra([spectrum], LEGACY, frame_firm=True)
+    firm = explain_spectra([spectrum], LEGACY, frame_likely=0.0)
     assert not any("frame on its feet" in text for text in firm.fit.notes)
     assert min(m.f_hz for m in firm.population.members[0].modes) == pytest.approx(14.0, rel=0.1)
 

@@ -1,6 +1,6 @@
 """Identify the built-in machines from the tables that their owners published.
 
-    python benchmarks/builtins.py [--write]
+    python benchmarks/builtin_machines.py [--write]
 
 Prints, axis by axis, what the fit leaves, its modes and its members, and whether the machine that
 is shipped says the same; exits with 1 if one does not. With `--write` the documents are made anew:
