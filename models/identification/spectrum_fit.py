@@ -4,19 +4,18 @@ The drive is known, so |G| is absolute; the phase is not. What is fitted are mod
 (`modal_structure`), seen through the window's bandwidth, with errors that bins share (`scatter`).
 One fit says little: others with more or fewer modes, with shares of other signs or modes beyond the
 band explain the same table. They are looked for from many starts, drawn anew from spectra as they
-might have come out (bootstrap), and the result is all of them: some that differ most stand for the
-rest, weighted by how many they stand for.
+might have come out (bootstrap; `spectrum_search`), and the result is all of them: some that differ
+most stand for the rest, weighted by how many they stand for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
@@ -32,53 +31,25 @@ from stillpath.models.identification.messages import (
     frame_mode_notes,
     spectrum_level_warning,
 )
-from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.representatives import Population, mode_spread, representatives
-from stillpath.models.identification.scatter import SCATTERS, Scatter
+from stillpath.models.identification.scatter import SCATTERS
 from stillpath.models.identification.spectrum_model import (
     cross_axis_share,
     driven_column,
-    spectrum_model,
 )
+from stillpath.models.identification.spectrum_search import Candidate, Search, whitening_of
 from stillpath.models.identification.types import (
     Excitation,
     Fit,
-    ModeEstimate,
     OrderTrial,
     Spectrum,
 )
-from stillpath.models.plants import PlantSpec, RelativeModesSpec, frequency_response
+from stillpath.models.plants import RelativeModesSpec
 
 __all__ = ["Explained", "Explanations", "explain_spectra", "explanations", "refit_spectrum"]
 
 Array = NDArray[np.float64]
 
-_DB = 10 / np.log(10)
-_SEED = 20
-_STARTS, _KEPT_STARTS = 48, 12
-_DRAWS = 16
-"""Per kind of scatter."""
-_LEVEL, _LEVEL_SPREAD = np.log(0.92), 0.13
-"""Of log gain. In 109 real tables the level implied accel_per_hz = 69 mm/s (57 to 88) where 75 were
-stated (reference notes on identification); sensors read up to 15 % wrong."""
-_MISSTATED = 0.3
-"""A plateau this far off (log) means other settings of the test: it is taken as the level."""
-_ZETA, _ZETA_SPREAD = 0.08, 0.5
-"""Damping where a spectrum does not tell it, and the standard deviation of its logarithm."""
-_SHARE_SPREAD = 0.6
-_ZETA_BAND, _SHARE_BAND = (0.008, 0.4), (-2.0, 2.5)
-_MODES_BAND = (1.1, 2.4)
-"""Modes lie above the lowest bin and below so many times the highest, by these factors."""
-_BEYOND = 0.6
-"""Share of the starts with a mode beyond the band."""
-_SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
-"""Modes above so many times the highest bin were not seen, and damping that they may have."""
-_PEAKS = 4
-_MUCH_WORSE = 14.0
-"""Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
-_PER_PARAMETER = 2.0
-"""Cost of a parameter (Akaike 1974): a mode must explain more than three numbers of noise."""
-_SAME = 0.03
 _GOOD_DB, _NO_WORSE = 1.0, 1.1
 
 
@@ -111,11 +82,11 @@ class Explanations:
     spectra: tuple[Spectrum, ...]
     excitation: Excitation
     column: str
-    search: _Search
-    found: tuple[_Candidate, ...]
+    search: Search
+    found: tuple[Candidate, ...]
     """From many starts, the best first."""
-    accepted: tuple[_Candidate, ...]
-    drawn: tuple[_Candidate, ...]
+    accepted: tuple[Candidate, ...]
+    drawn: tuple[Candidate, ...]
     frame_hz: float | None
 
     def explained(self, frame_likely: float = LIKELY) -> Explained:
@@ -198,7 +169,7 @@ def explanations(
         )
     single = mean_spectrum(spectra)
     name = _column(single, column)
-    search = _Search(single, name, tests[0], spectra, max_order)
+    search = Search(single, name, tests[0], spectra, max_order)
     found = search.candidates(progress)
     accepted, drawn = _explanations(search, found, progress)
     return Explanations(
@@ -227,11 +198,11 @@ def explain_spectra(
 
 
 def _explanations(
-    search: _Search, found: Sequence[_Candidate], progress: Callable[[float], None] | None
-) -> tuple[list[_Candidate], list[_Candidate]]:
+    search: Search, found: Sequence[Candidate], progress: Callable[[float], None] | None
+) -> tuple[list[Candidate], list[Candidate]]:
     """Return the candidates that explain the spectra, and draws around them."""
-    accepted: list[_Candidate] = []
-    drawn: list[_Candidate] = []
+    accepted: list[Candidate] = []
+    drawn: list[Candidate] = []
     for k, scatter in enumerate(SCATTERS):
         some = search.accepted(found, scatter)
         accepted += some
@@ -252,8 +223,8 @@ def refit_spectrum(
         As `explain_spectra`.
     """
     name = _column(spectrum, column)
-    search = _Search(spectrum, name, excitation, [spectrum], len(like.modes))
-    whitening = _whitening(SCATTERS[0].covariance(search.model))
+    search = Search(spectrum, name, excitation, [spectrum], len(like.modes))
+    whitening = whitening_of(SCATTERS[0].covariance(search.model))
     fitted = search.polished(search.like(like.spec), whitening, search.model.log_psd, 40)
     return Fit(
         spec=fitted.structure.spec(fitted.theta),
@@ -265,234 +236,6 @@ def refit_spectrum(
         trials=(OrderTrial(fitted.structure.modes, fitted.residual_db),),
         magnitude_only=True,
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """Parameters [log gain, log noise, modes ...] of a structure, and what they leave.
-
-    `cost` is twice the negative log of likelihood times prior, and what parameters cost;
-    `covariance` that of the vector where both are taken to be normal around the fit (Laplace).
-    """
-
-    structure: ModalStructure
-    vector: Array
-    residual_db: float = np.inf
-    cost: float = np.inf
-    covariance: Array | None = None
-
-    @property
-    def theta(self) -> Array:
-        return self.vector[2:]
-
-    def mode_estimates(self) -> tuple[ModeEstimate, ...]:
-        """Return the modes, rising in frequency."""
-        assert self.covariance is not None
-        n, spec = self.structure.modes, self.structure.spec(self.theta)
-        sd = np.sqrt(np.diag(self.covariance))[2 : 2 + 2 * n]
-        order = np.argsort(self.theta[:n])
-        return tuple(
-            ModeEstimate(
-                f_hz=mode.f_hz,
-                zeta=mode.zeta,
-                f_sd_hz=mode.f_hz * float(sd[i]),
-                zeta_sd=mode.zeta * float(sd[n + i]),
-                peak=float(abs(frequency_response(spec, mode.f_hz)[0])),
-            )
-            for i, mode in zip(order, spec.modes, strict=True)
-        )
-
-
-class _Search:
-    """The spectra of an axis, and the ways to explain them."""
-
-    def __init__(
-        self,
-        single: Spectrum,
-        column: str,
-        excitation: Excitation,
-        repeats: Sequence[Spectrum],
-        max_order: int,
-    ) -> None:
-        self.model = model = spectrum_model(single, column, excitation)
-        tiny = np.finfo(float).tiny
-        self.repeats = np.array(
-            [
-                np.interp(model.f_hz, s.f_hz, np.log(np.maximum(s.psd[column], tiny)))
-                for s in repeats
-            ]
-        )
-        self.rng = np.random.default_rng(_SEED)
-        self._unit_hz = float(np.sqrt(model.f_hz[0] * model.f_hz[-1]))
-        most = max(1, min(max_order, len(model.f_hz) // 12))
-        self.orders = tuple(range(1, most + 1))
-        plateau = float(np.log(model.gain_of_plateau()))
-        self._level = plateau if abs(plateau - _LEVEL) > _MISSTATED else float(_LEVEL)
-
-    def like(self, plant: PlantSpec) -> _Candidate:
-        """Return a start from a plant with modes.
-
-        Raises
-        ------
-        ModelError
-            If it is of another kind.
-        """
-        if not isinstance(plant, RelativeModesSpec):
-            raise ModelError("a plant of relative modes is needed to start from; fit one first")
-        f_hz, zeta, share = np.array([[m.f_hz, m.zeta, m.share] for m in plant.modes]).T
-        structure = ModalStructure(len(plant.modes), self._unit_hz)
-        theta = structure.parameters(f_hz, zeta, share)
-        quiet = float(self.model.log_psd.min())
-        return _Candidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
-
-    def candidates(self, progress: Callable[[float], None] | None) -> list[_Candidate]:
-        """Return fits from many starts, the best first."""
-        whitening = _whitening(SCATTERS[0].covariance(self.model))
-        # More of the larger ones: they have more ways to explain a spectrum.
-        likely = [n for n in self.orders for _ in range(n * n)]
-        counts = [*self.orders, *self.rng.choice(likely, _STARTS - len(self.orders)).tolist()]
-        found = []
-        for k, modes in enumerate(counts):
-            found.append(self.polished(self._start(int(modes)), whitening, self.model.log_psd, 40))
-            if progress:
-                progress(0.5 * (k + 1) / len(counts))
-        return sorted(found, key=lambda c: c.cost)
-
-    def accepted(self, found: Sequence[_Candidate], scatter: Scatter) -> list[_Candidate]:
-        """Return those of the fits, made anew with this scatter, that explain the spectrum."""
-        whitening = self._whitening(found, scatter)
-        log_psd = self.model.log_psd
-        again = [self.polished(c, whitening, log_psd, 25) for c in found[:_KEPT_STARTS]]
-        again.sort(key=lambda c: c.cost)
-        kept = [c for c in again if c.cost <= again[0].cost + _MUCH_WORSE]
-        distinct: list[_Candidate] = []
-        answers: list[NDArray[np.complex128]] = []
-        for one in kept:
-            answer = one.structure.response(one.theta, self.model.f_hz)
-            if all(np.max(np.abs(answer - other)) > _SAME for other in answers):
-                distinct.append(one)
-                answers.append(answer)
-        return distinct
-
-    def drawn(self, accepted: Sequence[_Candidate], scatter: Scatter) -> list[_Candidate]:
-        """Return fits to spectra as they might have come out."""
-        whitening = self._whitening(accepted, scatter)
-        root = np.linalg.inv(whitening)
-        likely = np.exp(-0.25 * (np.array([c.cost for c in accepted]) - accepted[0].cost))
-        out = []
-        for _ in range(_DRAWS):
-            start = accepted[int(self.rng.choice(len(accepted), p=likely / likely.sum()))]
-            # Which of the repeats happen to be there (Bayesian bootstrap, Rubin 1981).
-            weights = self.rng.dirichlet(np.ones(len(self.repeats)))
-            log_psd = weights @ self.repeats + root @ self.rng.standard_normal(len(root))
-            out.append(self._rung(self.polished(start, whitening, log_psd, 12)))
-        return out
-
-    def _rung(self, fit: _Candidate) -> _Candidate:
-        """Give modes beyond the band any damping: of them only a flank was seen."""
-        n, vector = fit.structure.modes, fit.vector.copy()
-        beyond = np.exp(fit.theta[:n]) * self._unit_hz > _SEEN * self.model.f_hz[-1]
-        low, high = np.log(_UNSEEN_ZETA)
-        vector[2 + n : 2 + 2 * n][beyond] = self.rng.uniform(low, high, np.count_nonzero(beyond))
-        return replace(fit, vector=vector)
-
-    def _whitening(self, fits: Sequence[_Candidate], scatter: Scatter) -> Array:
-        """Whiten errors; where even the best fit leaves more than that, there is more of them."""
-        covariance = scatter.covariance(self.model)
-        whitening = _whitening(covariance)
-        best = fits[0]
-        error = self.model.log_spectrum(best.structure, best.vector) - self.model.log_psd
-        freedom = len(error) - best.structure.size - 2
-        excess = float(np.sum((whitening @ error) ** 2)) / freedom
-        return np.asarray(whitening / np.sqrt(max(1.0, excess)))
-
-    def _start(self, modes: int) -> _Candidate:
-        """Return a random start: modes at peaks, elsewhere in the band, perhaps one beyond it."""
-        rng, model = self.rng, self.model
-        structure = ModalStructure(modes, self._unit_hz)
-        size = model.log_psd - model.log_drive
-        inner = np.arange(2, len(size) - 2)
-        peaks = inner[[size[i] == size[i - 2 : i + 3].max() for i in inner]]
-        highest = peaks[np.argsort(-size[peaks])][:_PEAKS]
-        if len(highest) == 0:
-            highest = np.array([int(np.argmax(size))])
-        beyond = int(modes > 1 and rng.random() < _BEYOND)
-        at_peaks = model.f_hz[[highest[0], *rng.permutation(highest[1:])]]
-        at_peaks = at_peaks[: modes - beyond] * np.exp(0.05 * rng.standard_normal())
-        low, high = model.band_hz
-        left = modes - beyond - len(at_peaks)
-        within = np.exp(rng.uniform(np.log(1.4 * low), np.log(high), left))
-        above = high * np.exp(rng.uniform(np.log(1.05), np.log(2.3), beyond))
-        zeta = np.exp(rng.uniform(np.log(0.03), np.log(0.3), modes))
-        share = 0.5 * rng.standard_normal(modes)
-        share[0] = abs(share[0])
-        theta = structure.parameters(np.concatenate([at_peaks, within, above]), zeta, share)
-        quiet = float(model.log_psd.min())
-        return _Candidate(structure, np.concatenate([[self._level, quiet - 3.0], theta]))
-
-    def polished(
-        self, start: _Candidate, whitening: Array, log_psd: Array, rounds: int
-    ) -> _Candidate:
-        """Minimise whitened errors and what is unlikely of the parameters."""
-        model, structure, n = self.model, start.structure, start.structure.modes
-        band_hz = (_MODES_BAND[0] * model.f_hz[0], _MODES_BAND[1] * model.f_hz[-1])
-        low, high = structure.bounds(band_hz, _ZETA_BAND, _SHARE_BAND)
-        quiet = float(log_psd.min())
-        low = np.append([self._level - 0.6, quiet - 12.0], low)
-        high = np.append([self._level + 0.6, quiet + 0.5], high)
-        unit = np.eye(len(low))
-        zetas, shares = unit[2 + n : 2 + 2 * n], unit[2 + 2 * n :]
-        # The last share is what the others leave.
-        prior = np.vstack(
-            [
-                unit[:1] / _LEVEL_SPREAD,
-                zetas / _ZETA_SPREAD,
-                shares / _SHARE_SPREAD,
-                -shares.sum(axis=0, keepdims=True) / _SHARE_SPREAD,
-            ]
-        )
-        usual = np.concatenate(
-            [
-                [self._level / _LEVEL_SPREAD],
-                np.full(n, np.log(_ZETA) / _ZETA_SPREAD),
-                np.zeros(n - 1),
-                [-1.0 / _SHARE_SPREAD],
-            ]
-        )
-        at: dict[bytes, tuple[Array, Array]] = {}
-
-        def known(vector: Array) -> tuple[Array, Array]:
-            key = vector.tobytes()
-            if key not in at:
-                at.clear()
-                at[key] = model.log_spectrum_and_gradient(structure, vector)
-            return at[key]
-
-        def residual(vector: Array) -> Array:
-            error = whitening @ (known(vector)[0] - log_psd)
-            return np.concatenate([error, prior @ vector - usual])
-
-        def jacobian(vector: Array) -> Array:
-            return np.vstack([whitening @ known(vector)[1], prior])
-
-        inside = np.clip(start.vector, low + 1e-6, high - 1e-6)
-        solution = least_squares(
-            residual, inside, jacobian, (low, high), x_scale="jac", max_nfev=rounds
-        )
-        vector = np.asarray(solution.x, np.float64)
-        error = known(vector)[0] - model.log_psd
-        slope = jacobian(vector)
-        return replace(
-            start,
-            vector=vector,
-            residual_db=float(_DB * np.std(error)),
-            cost=float(2 * solution.cost) + _PER_PARAMETER * structure.size,
-            covariance=np.asarray(np.linalg.pinv(slope.T @ slope, hermitian=True), np.float64),
-        )
-
-
-def _whitening(covariance: Array) -> Array:
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
 
 
 def _column(spectrum: Spectrum, column: str | None) -> str:
