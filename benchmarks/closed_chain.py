@@ -52,6 +52,7 @@ from stillpath.models.identification.types import AccelerationLog, Spectrum
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, ZpkSpec, plant_set
 from stillpath.models.store import load_machine
+from stillpath.models.typed_in import typed_in
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import tune_shaper
 from stillpath.pipeline.options import Options
@@ -68,7 +69,8 @@ FILES = ("ps_voron_klipper_ringing", "klipper_excludeobj_multi")
 BASES = {"bed slinger": "generic-bedslinger", "corexy": "generic-corexy"}
 _EVERY = 20
 _TUNE_S = 40.0
-_GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0)}
+_GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0), "typed": (1.0, 1.05)}
+_TYPED_ZETA = 0.07
 _NOTHING = 0.8
 
 
@@ -268,7 +270,8 @@ def identified(
 ) -> tuple[Machine | None, list[tuple[str, float]], str]:
     """Return the machine that the measurement leads to, and the shapers of X and Y.
 
-    A machine that is refused prints with the shaper.
+    Where resonances are typed in, they are those of ZV shapers that Klipper tunes. A machine that
+    is refused prints with the shaper.
     """
     sensor = drawn_sensor(rng)
     test = OLD_TEST if rng.random() < 0.5 else NEW_TEST
@@ -280,6 +283,7 @@ def identified(
         sweeping_accel_mm_s2=test.sweeping_accel_mm_s2,
     )
     measured, shapers = [], []
+    typed: dict[str, PlantSetSpec] = {}
     for axis in ("x", "y"):
         for run in range(3 if source == "raw" else 1):
             record = run_test(printer, axis, sensor, rng, test)
@@ -287,10 +291,15 @@ def identified(
             (table,) = read_content(record.resonances(), name, settings=settings)
             assert isinstance(table, Spectrum)
             if run == 0:
-                best = choose_shaper_of(table)[0]
+                best, every = choose_shaper_of(table)
+                if source == "typed":
+                    best = next(one for one in every if one.name == "zv")
+                    typed[axis] = typed_in(best.f_hz, _TYPED_ZETA)
                 shapers.append((best.name, best.f_hz))
             log = AccelerationLog(record.time_s, record.accel_mm_s2, axis, f"raw_{axis}_{run}.csv")
             measured.append(Measured(log if source == "raw" else table))
+    if typed:
+        return base.model_copy(update={"axes": typed, "name": printer.name}), shapers, ""
     try:
         found = identify(measured, settings)
     except ModelError as error:

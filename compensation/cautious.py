@@ -114,7 +114,7 @@ class CautiousFbf:
     ) -> Array:
         """See `compensation.base.Compensator.compensate`; both commands stand in the rests."""
         self._last = smooth = self._smoothing.compensate(y_d_mm, extruding, rests)
-        if not self._shaper_alone:
+        if not self._shaper_alone and self._shares.any():
             exact = self._inner.compensate(y_d_mm, extruding, rests)
             mixed = self._shares * exact + (1.0 - self._shares) * smooth
             # Bent into the machine's limits further than where the shares were chosen?

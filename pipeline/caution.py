@@ -28,6 +28,7 @@ from stillpath.models.friction import DryFriction
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
+from stillpath.models.typed_in import stated_hz
 from stillpath.pipeline.files import replacing
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
@@ -47,13 +48,14 @@ __all__ = [
     "most_share",
     "pair_weights",
     "prediction_note",
+    "stated_note",
 ]
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 8
+_VERSION = 9
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Most where the phase was not measured: what a set does not hold, it cannot warn of."""
@@ -68,6 +70,7 @@ _FRICTION_UNSURE = 0.25
 _LAG_UNSURE_S = 1.5e-4
 """Of one axis against the other: alignment sets both to 0, viscous guides may delay one of them."""
 _STRIDE = 5
+_NO_RESTS = np.zeros((0, 2), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,12 @@ class Choice:
 
     @property
     def fit_share(self) -> float:
-        """How much of the tolerance a fit to the command may use."""
+        """How much of the tolerance a fit to the command may use.
+
+        A shaper's command has more edges: fitted to 2 um it leaves up to 1.2 times its error.
+        """
+        if not any(self.shares):
+            return _LEAST_FIT
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
     def ranged(self, channel: Channel) -> Channel:
@@ -114,7 +122,8 @@ class Choice:
 
 def measured_set(axis: PlantSetSpec) -> bool:
     """Whether an axis has members that a measurement gave, each a plant of its own."""
-    return isinstance(axis.members, tuple) and len(axis.members) > 1
+    members = isinstance(axis.members, tuple) and len(axis.members) > 1
+    return members and stated_hz(axis) is None
 
 
 def design_mode(machine: Machine, options: Options) -> str:
@@ -142,9 +151,27 @@ def caution_for(
 ) -> tuple[Caution, Choice] | None:
     """Return what the default takes of the shaper, and why; None where it takes none."""
     vibration = options.method.removesuffix("+ripple")
-    if vibration != "fbf" or options.robust != "auto" or design_mode(machine, options) == "off":
+    if vibration != "fbf" or options.robust != "auto":
+        return None
+    measured = any(map(measured_set, machine.axes.values()))
+    # Who knows how a resonance moves during a print knows more of it than where it is.
+    stated = not machine.schedules and any(map(stated_hz, machine.axes.values()))
+    if not measured and not stated:
         return None
     return choose_caution(machine, shaper, directory, dt_s, options.basis)
+
+
+def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
+    """Say what a resonance that was only typed in is good for."""
+    typed = [axis.upper() for axis in ("x", "y") if stated_hz(machine.axes[axis]) is not None]
+    if not typed:
+        return None
+    return (
+        f"Of {' and '.join(typed)} only a resonance was typed in. It moves as through the shaper "
+        f"{shaper.label}, as a firmware that shapes would move it by itself: without a "
+        "measurement no better command is known. Figures are guesses for axes that ring there; "
+        "measure the machine (docs/identification.md)."
+    )
 
 
 def prediction_note(machine: Machine, choice: Choice) -> str:
@@ -195,17 +222,8 @@ def choose_caution(
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
     path, extruding = reference_motion_of(machine, dt_s)
-    no_rests = np.zeros((0, 2), np.int64)
-    exact = designed(
-        Options(),
-        "ensemble",
-        lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode),
-    )
-    exact.reset(path[:, 0])
-    smooth = ShaperCompensator(
-        machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz
-    )
-    commands = [one.compensate(path, extruding, no_rests) for one in (exact, smooth)]
+    most = [most_share(machine.axes[axis]) for axis in ("x", "y")]
+    commands = _commands(machine, shaper, basis, dt_s, fbf=any(most))
     at = np.flatnonzero(extruding).astype(np.int64)[::_STRIDE]
     distances = PathDistances(path, dt_s)
     answers = [
@@ -235,7 +253,6 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
             float(1e3 * np.exp(weights @ np.log(np.maximum(ours, 1e-12)))),
         )
 
-    most = [most_share(machine.axes[axis]) for axis in ("x", "y")]
     both = [tried((min(share, most[0]), min(share, most[1]))) for share in _SHARES]
     best = min(both, key=_rank)
     for i in (0, 1):
@@ -249,10 +266,32 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
     mixed = a * commands[0] + (1 - a) * commands[1]
     channels = {
         "before": path,
-        "after": against_friction(mixed, machine.friction_mm, no_rests, dt_s),
+        "after": against_friction(mixed, machine.friction_mm, _NO_RESTS, dt_s),
         "shaper": commands[1],
     }
     return replace(best, ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+
+
+def _commands(
+    machine: Machine, shaper: BestShaper, basis: str, dt_s: float, *, fbf: bool
+) -> tuple[Array, Array]:
+    """Return the commands of filtered basis functions and of the shaper on the reference motion.
+
+    Where the shaper alone comes into question (not `fbf`), it is both.
+    """
+    path, extruding = reference_motion_of(machine, dt_s)
+    smooth = ShaperCompensator(
+        machine, dt_s, shaper=shaper.type, fx_hz=shaper.fx_hz, fy_hz=shaper.fy_hz
+    ).compensate(path, extruding, _NO_RESTS)
+    if not fbf:
+        return smooth, smooth
+    exact = designed(
+        Options(),
+        "ensemble",
+        lambda mode: PreviewFbf(_strong(machine), dt_s, basis=basis, robust=mode),
+    )
+    exact.reset(path[:, 0])
+    return exact.compensate(path, extruding, _NO_RESTS), smooth
 
 
 def _strong(machine: Machine) -> Machine:
@@ -317,12 +356,15 @@ def _rank(choice: Choice) -> float:
 
 def most_share(axis: PlantSetSpec) -> float:
     """Return the largest share of a compensation that an axis bears beside a shaper's."""
+    if stated_hz(axis) is not None:
+        return 0.0
     return _UNSEEN_SHARE if _unseen(axis) else 1.0
 
 
 def _unseen(axis: PlantSetSpec) -> bool:
     """Whether the phase of an axis was not measured."""
-    return axis.provenance is None or axis.provenance.magnitude_only
+    about = axis.provenance
+    return about is None or about.magnitude_only or stated_hz(axis) is not None
 
 
 def pair_weights(machine: Machine, count: int) -> Array:

@@ -10,7 +10,7 @@ from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
 from stillpath.models.confirmation import confirmation_text, um_text
 from stillpath.models.machine import Machine
-from stillpath.pipeline.caution import Choice, prediction_note
+from stillpath.pipeline.caution import Choice, prediction_note, stated_note
 from stillpath.pipeline.clock import StageClock
 from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
@@ -118,7 +118,10 @@ class Summary:
             yield from budget.warnings(pairs.sums(), self.reader.feature_names)
 
     def _notes(self) -> Iterator[str]:
-        if self.choice is not None:
+        typed = stated_note(self.machine, self.shaper) if self.choice is not None else None
+        if typed is not None:
+            yield typed
+        elif self.choice is not None:
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
         if self.writer is not None:

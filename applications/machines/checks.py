@@ -14,6 +14,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.firmware.common import AxisAllowance
 from stillpath.models.machine import AxisLimits, CommandLimits, Machine, MotorLimits
 from stillpath.models.store import explain
+from stillpath.models.typed_in import typed_in
 
 __all__ = [
     "Difference",
@@ -25,14 +26,12 @@ __all__ = [
     "envelope_warnings",
     "machine_from_config",
     "not_followed",
-    "typed_in",
+    "stated_axis",
     "with_firmware",
 ]
 
 _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
-_FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
-_DAMPING_SCALE = (0.5, 1.0, 1.5)
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
 """What motors are taken to bear when nobody says: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
@@ -184,7 +183,7 @@ def machine_from_config(config: PrinterConfig, stated: StatedMachine) -> Machine
         "title": stated.title or stated.name,
         "source": config.name,
         "axes": {
-            axis: typed_in(
+            axis: stated_axis(
                 given or config.number("input_shaper", f"shaper_freq_{axis}", 0), stated.zeta
             )
             for axis, given in zip("xy", stated.f_hz, strict=True)
@@ -226,17 +225,9 @@ def not_followed(config: PrinterConfig) -> list[str]:
     ]
 
 
-def typed_in(f_hz: float, zeta: float) -> dict[str, Any]:
-    """Return an axis of one resonance with a wide set around it, which nobody measured.
-
-    Without a frequency (0) it is 50 Hz.
-    """
-    mode = {"f_hz": f_hz or _DEFAULT_HZ, "zeta": zeta}
-    return {
-        "nominal": {"kind": "modes", "modes": [mode]},
-        "members": {"frequency_scale": _FREQUENCY_SCALE, "damping_scale": _DAMPING_SCALE},
-        "provenance": {"kind": "typed in"},
-    }
+def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:
+    """Return an axis of one resonance that nobody measured; without a frequency (0) it is 50 Hz."""
+    return typed_in(f_hz or _DEFAULT_HZ, zeta).model_dump(mode="json", exclude_none=True)
 
 
 def derived_envelope(machine: Machine) -> CommandLimits:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from stillpath.applications.machines.checks import (
     StatedMachine,
     derived_envelope,
-    typed_in,
+    stated_axis,
     with_firmware,
 )
 from stillpath.models.errors import ModelError
@@ -161,7 +161,7 @@ def machine_from_m503(
         },
         "firmware": section,
         "axes": {
-            axis: typed_in(given or of_shaper, stated.zeta)
+            axis: stated_axis(given or of_shaper, stated.zeta)
             for axis, given, of_shaper in zip("xy", stated.f_hz, tuned, strict=True)
         },
     }

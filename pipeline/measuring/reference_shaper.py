@@ -29,6 +29,7 @@ from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
 from stillpath.models.reference_motion import reference_limits, reference_motion_of
+from stillpath.models.typed_in import stated_hz
 from stillpath.pipeline.files import replacing
 from stillpath.simulation.measures import PathDistances, Tally, contour_error, tracking_error
 from stillpath.simulation.response import response
@@ -152,9 +153,40 @@ def evaluate_shaper(
 def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> BestShaper:
     """Return the best shaper on the reference motion, tuned once for what it depends on.
 
+    Where nothing but a resonance was typed in, the shaper is at its frequency: of the type that
+    printer.cfg states, else ZV.
+
     The result is a small JSON file in `directory`, written whole or not at all. A file that
     cannot be read is made again. For the built-in machines it comes with the program.
     """
+    stated = [stated_hz(machine.axes[axis]) for axis in ("x", "y")]
+    if any(stated):
+        return _stated_shaper(machine, stated, directory, dt_s)
+    return _tuned_shaper(machine, directory, dt_s)
+
+
+def _stated_shaper(
+    machine: Machine, stated: list[float | None], directory: Path, dt_s: float
+) -> BestShaper:
+    kind, f_hz = _configured_type(machine), stated
+    if not all(stated):
+        tuned = _tuned_shaper(machine, directory, dt_s)
+        kind = tuned.type
+        f_hz = [given or f for given, f in zip(stated, (tuned.fx_hz, tuned.fy_hz), strict=True)]
+    y_d, extruding = reference_motion_of(machine, dt_s)
+    fx_hz, fy_hz = (float(f or 0.0) for f in f_hz)
+    return evaluate_shaper(machine, y_d, dt_s, extruding, kind, fx_hz, fy_hz)
+
+
+def _configured_type(machine: Machine) -> str:
+    """Return the type of shaper that the printer's own configuration states for both axes."""
+    own = machine.firmware.shaper if machine.firmware.kind == "klipper" else None
+    if own is None or own.type_x != own.type_y or min(own.freq_x_hz, own.freq_y_hz) == 0.0:
+        return "zv"
+    return own.type_x if own.type_x in SHAPERS else "zv"
+
+
+def _tuned_shaper(machine: Machine, directory: Path, dt_s: float) -> BestShaper:
     basis = tuning_digest(machine)
     if round(dt_s * 1e6) == _SHIPPED_US and basis in _shipped():
         return _shipped()[basis]

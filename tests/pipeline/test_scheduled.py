@@ -32,6 +32,9 @@ HEAD = "G28\nG90\nM83\nM204 S1500\n"
 
 def bedslinger(moving_kg: float | None = 0.8, density: float = 1.24) -> Machine:
     machine = load_machine("generic-bedslinger")
+    # Nobody says that its plants were typed in: they are designed for.
+    axes = {a: p.model_copy(update={"provenance": None}) for a, p in machine.axes.items()}
+    machine = machine.model_copy(update={"axes": axes})
     if moving_kg is None:
         return machine
     mass = MassSchedule(moving_mass_kg=moving_kg, filament_density_g_cm3=density)

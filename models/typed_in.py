@@ -1,0 +1,70 @@
+"""An axis of which somebody typed in one resonance, and what else such an axis may be.
+
+A ringing print or a tuned shaper says where an axis rings most, and nothing of its other modes,
+which sway the print as much. On virtual printers no command that is designed for that one mode
+prints better than the plain shaper at its frequency (`benchmarks/closed_chain.py --from typed`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stillpath.models.plants import (
+    ModesSpec,
+    PlantSetSpec,
+    RelativeMode,
+    RelativeModesSpec,
+    WeightedMember,
+)
+from stillpath.models.provenance import Provenance
+
+__all__ = ["stated_hz", "typed_in"]
+
+_OTHERS, _SEED = 14, 7
+_F_SPREAD, _ZETA_SPREAD, _SHARE_SPREAD = 0.12, 0.4, 0.35
+"""Standard deviations of the logarithm of frequency and damping, and of the share."""
+_SHARES = (0.4, 1.6)
+_SECOND, _SECOND_ZETA = (1.3, 3.5), 0.06
+"""Where the other mode lies, in frequencies of the stated one: tables of real printers."""
+
+
+def typed_in(f_hz: float, zeta: float) -> PlantSetSpec:
+    """Return an axis of one resonance, with what axes that ring there mostly are around it.
+
+    Parameters
+    ----------
+    f_hz, zeta : float
+        Where it rings most, and the damping ratio.
+    """
+    rng = np.random.default_rng(_SEED)
+    alone = RelativeModesSpec(modes=(RelativeMode(f_hz=f_hz, zeta=zeta, share=1.0),))
+    members = [alone]
+    for _ in range(_OTHERS):
+        main_hz, other_zeta = (
+            f_hz * _spread(rng, _F_SPREAD),
+            _SECOND_ZETA * _spread(rng, _ZETA_SPREAD),
+        )
+        share = float(np.clip(1.0 + _SHARE_SPREAD * rng.standard_normal(), *_SHARES))
+        other_hz = f_hz * float(np.exp(rng.uniform(*np.log(_SECOND))))
+        main = RelativeMode(f_hz=main_hz, zeta=zeta * _spread(rng, _ZETA_SPREAD), share=share)
+        other = RelativeMode(f_hz=other_hz, zeta=other_zeta, share=1.0 - share)
+        members.append(RelativeModesSpec(modes=(main, other)))
+    return PlantSetSpec(
+        nominal=alone,
+        members=tuple(WeightedMember(plant=plant) for plant in members),
+        provenance=Provenance(kind="typed in"),
+    )
+
+
+def _spread(rng: np.random.Generator, sd: float) -> float:
+    return float(np.exp(sd * rng.standard_normal()))
+
+
+def stated_hz(axis: PlantSetSpec) -> float | None:
+    """Return the resonance of an axis of which no more is known; None of one that was measured."""
+    about, plant = axis.provenance, axis.nominal
+    if about is None or about.kind != "typed in":
+        return None
+    if isinstance(plant, ModesSpec | RelativeModesSpec) and len(plant.modes) == 1:
+        return plant.modes[0].f_hz
+    return None
