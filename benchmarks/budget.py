@@ -44,7 +44,7 @@ from readback import (
 )
 
 from stillpath.gcode.sampler import sample_phases
-from stillpath.gcode.types import Phases
+from stillpath.gcode.types import Phases, rows_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
@@ -210,7 +210,7 @@ class Laid(Timed):
         self._reached = np.maximum.accumulate(reached)
         self._phases, self._first, self._last = written.phases, first, last
         self._begin_s = float(written.phases.t_s[first])
-        self._end_s = written.row_end_s()
+        self._end_s = written.phases.end_s
         self.samples = int(np.ceil((self._end_s[last - 1] - self._begin_s) / DT_S)) + 1
 
     @classmethod
@@ -236,10 +236,10 @@ class Laid(Timed):
         a = max(int(np.searchsorted(self._phases.t_s, t_s[0], "right")) - 1, self._first)
         b = max(int(np.searchsorted(self._phases.t_s, t_s[-1], "right")), a + 1)
         b = min(b, self._last)
-        position, row = sample_phases(_cut(self._phases, a, b), t_s)
+        position, row = sample_phases(rows_of(self._phases, slice(a, b)), t_s)
         row += a
         moving = t_s <= self._end_s[row]
-        return position, row, moving & _feeds(self._phases)[row]
+        return position, row, moving & self._phases.prints[row]
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,20 +257,9 @@ def _fed_rows(phases: Phases) -> _Fed:
         + 2.0 * phases.cruise_mm_s * phases.cruise_s
         + (phases.cruise_mm_s + phases.end_mm_s) * phases.decel_s
     )
-    row = np.flatnonzero(_feeds(phases))
+    row = np.flatnonzero(phases.prints)
     start = phases.start_mm[row]
     return _Fed(row, start, start + phases.direction[row] * length[row, None])
-
-
-def _feeds(phases: Phases) -> NDArray[np.bool_]:
-    direction = phases.direction
-    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
-    return np.asarray(moves_xy & (direction[:, 3] > 0.0))
-
-
-def _cut(phases: Phases, first: int, last: int) -> Phases:
-    names = Phases.__dataclass_fields__
-    return Phases(**{name: getattr(phases, name)[first:last] for name in names})
 
 
 def _worst_um(judge: Judge) -> float:

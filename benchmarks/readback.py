@@ -127,7 +127,7 @@ class Motion:
     def stretches(self) -> tuple[Ints, Ints]:
         """First and last row of `phases` of each unbroken motion in X and Y."""
         phases = self.phases
-        xy = _moves_xy(phases)
+        xy = phases.moves_xy
         stopped = np.searchsorted(self.stops, phases.move_index, "right")
         begins = xy & np.append(True, ~xy[:-1] | (np.diff(stopped) > 0))
         begins[self.jumps()] = xy[self.jumps()]
@@ -139,11 +139,6 @@ class Motion:
         before = self.end_mm[self.phases.move_index[:-1], :2]
         away = np.max(np.abs(self.phases.start_mm[1:, :2] - before), axis=1)
         return np.flatnonzero(away > _JUMP_MM) + 1
-
-    def row_end_s(self) -> Array:
-        """When each row of `phases` ends."""
-        phases = self.phases
-        return np.asarray(phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s)
 
 
 def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Motion:
@@ -237,7 +232,7 @@ class Own(Timed):
         self._phases = _rows(motion.phases, first_row, last_row)
         self._asked = _rows(motion.asked, first_row, last_row)
         self._start_s = float(self._phases.t_s[0])
-        self._end_s = motion.row_end_s()[first_row:last_row]
+        self._end_s = motion.phases.end_s[first_row:last_row]
         self.samples = int(np.ceil((self._end_s[-1] - self._start_s) / DT_S)) + 1
 
     @classmethod
@@ -251,7 +246,7 @@ class Own(Timed):
         phases, offset = _around(self._asked, t_s)
         position, row = sample_phases(phases, t_s)
         moving = t_s <= self._end_s[offset + row]
-        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+        return position[:2], moving & phases.moves_xy[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
@@ -283,7 +278,7 @@ class Aligned(Timed):
     def __init__(self, original: Motion, written: Motion) -> None:
         self._path, self._written = original.asked, written.phases
         self.original_rows, self.written_rows = _match(original, written)
-        ends = original.row_end_s()
+        ends = original.phases.end_s
         self._from_s = self._path.t_s[self.original_rows[0]]
         self._until_s = ends[self.original_rows[1]]
         self._begin_s = written.phases.t_s[self.written_rows[0]]
@@ -296,7 +291,7 @@ class Aligned(Timed):
         jumps = written.jumps()
         if len(jumps) != len(original.jumps()):
             raise ReadBackError("the written file loses its position elsewhere")
-        ends = written.row_end_s()
+        ends = written.phases.end_s
         bounds = [0, *jumps.tolist(), len(written.phases)]
         parts = []
         for a, b in pairwise(bounds):
@@ -323,7 +318,7 @@ class Aligned(Timed):
         wanted_s = np.maximum.accumulate(wanted_s)
         phases, _ = _around(self._path, wanted_s)
         position, row = sample_phases(phases, wanted_s)
-        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+        return position[:2], moving & phases.moves_xy[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
@@ -447,10 +442,6 @@ def _next_match(places: Array, wanted: Array, start: int) -> int | None:
 def _same(places: Array, wanted: Array) -> Mask:
     gap = np.abs(places - wanted)
     return np.asarray(np.all(gap[:, :3] < _SAME_MM, axis=1) & (gap[:, 3] < _SAME_E_MM))
-
-
-def _moves_xy(phases: Phases) -> Mask:
-    return np.asarray((phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0))
 
 
 def _around(phases: Phases, t_s: Array) -> tuple[Phases, int]:

@@ -35,7 +35,7 @@ def sections(piece: Piece) -> list[tuple[int, int]]:
     phases = piece.phases
     # By line of the file: an arc is many moves, some of which feed less than a step.
     starts = np.flatnonzero(np.diff(piece.moves.byte_start, prepend=-1))
-    moves_xy = np.logical_or.reduceat(np.any(phases.direction[:, :2] != 0.0, axis=1), starts)
+    moves_xy = np.logical_or.reduceat(phases.moves_xy, starts)
     feeds = np.logical_or.reduceat(phases.direction[:, 3] > 0.0, starts)
     slow = (feeds[1:] != feeds[:-1]) & (phases.end_mm_s[starts[1:] - 1] <= _SLOW_MM_S)
     edges = np.flatnonzero((moves_xy[1:] != moves_xy[:-1]) | slow) + 1

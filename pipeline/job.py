@@ -61,7 +61,7 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verbatim import plan_verbatim, switching_s, takes_s
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -362,8 +362,7 @@ class Job:
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece stay as sliced."""
         phases = piece.phases
-        row_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        extruding_s = float(np.sum(row_s[feeding(phases)]))
+        extruding_s = float(np.sum(phases.lasts_s[phases.prints]))
         self._sum.put_back.append(
             PutBack(
                 line_first=int(piece.moves.line[0]),

@@ -16,7 +16,6 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, as_executed
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import feeding
 from stillpath.pipeline.verifying import Verifier
 
 __all__ = ["MotionRecord"]
@@ -72,7 +71,7 @@ class MotionRecord:
         grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
         path, row = sample_phases(self._asked(piece, phases), grid)
         came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
-        return self._samples(piece, row, path, came, feeding(phases)[row], came)
+        return self._samples(piece, row, path, came, phases.prints[row], came)
 
     def pass_by(self, verbatim: VerbatimPart, part: Phases | float | None) -> None:
         """Measure what a verbatim part does: motion, standing [s], or (None) losing its place."""
@@ -98,8 +97,7 @@ class MotionRecord:
             self._observe(stood)
 
     def _move(self, verbatim: VerbatimPart, phases: Phases) -> None:
-        duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        until = np.where(feeding(phases), phases.t_s + duration_s, -np.inf)
+        until = np.where(phases.prints, phases.t_s + phases.lasts_s, -np.inf)
         asked = self._asked(verbatim, phases)
         samples = max(round(phases.duration_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):

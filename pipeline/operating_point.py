@@ -61,9 +61,7 @@ class Operation:
         known = np.flatnonzero((moves.known & _ALL_KNOWN) == _ALL_KNOWN)
         position = (self._point.x_mm, self._point.y_mm, self._point.z_mm)
         if len(known):
-            travel = moves.end_mm[known] - moves.start_mm[known]
-            prints = (travel[:, 3] > 0.0) & np.any(travel[:, :2] != 0.0, axis=1)
-            x, y, z = moves.start_mm[known[np.argmax(prints)], :3].tolist()
+            x, y, z = moves.start_mm[known[np.argmax(moves.prints[known])], :3].tolist()
             position = (x, y, z)
         laid_mm, _ = self._laid(moves)
         half_kg = 0.5 * self._kg_per_mm * laid_mm

@@ -358,8 +358,7 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     Klipper limits such moves by E per mm of X Y. The command stands where the plan creeps and the
     other way round; filament at the plan's times would then need impossible accelerations.
     """
-    direction = phases.direction
-    wipes = (direction[:, 3] < 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    wipes = phases.moves_xy & (phases.direction[:, 3] < 0.0)
     if not np.any(wipes):
         return
     inside = wipes[timeline.row] & timeline.moving
@@ -478,13 +477,10 @@ def as_executed(
     """
     dt_s = piece.timeline.dt_s
     origin = float(piece.timeline.start_s[0])
-    last = executed.accel_s[-1] + executed.cruise_s[-1] + executed.decel_s[-1]
+    last = executed.lasts_s[-1]
     n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
     moved = replace(phases, t_s=piece.encoded.row_start_s)
-    duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    direction = phases.direction
-    feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
-    until = np.where(feeds, moved.t_s + duration, -np.inf)
+    until = np.where(phases.prints, moved.t_s + phases.lasts_s, -np.inf)
     planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
     position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
     return planned, position, row, extruding

@@ -13,7 +13,6 @@ from stillpath.gcode.slicers.features import Feature, feature_of
 from stillpath.models.machine import Machine
 from stillpath.pipeline.options import Options, Where
 from stillpath.pipeline.result import GroupFigures
-from stillpath.pipeline.verbatim import feeding
 
 __all__ = ["Selection", "TooLarge", "smaller"]
 
@@ -95,7 +94,7 @@ class Selection:
 
     def _wanted(self, piece: Piece, names: Sequence[str]) -> NDArray[np.bool_]:
         """Mark the sections of a piece that are compensated."""
-        feeds, feature = feeding(piece.phases), piece.moves.feature
+        feeds, feature = piece.phases.prints, piece.moves.feature
         counts = np.array([self._shows(int(k), names) for k in feature])
         rows = sections(piece)
         prints = np.array([np.any(feeds[a:b]) for a, b in rows])

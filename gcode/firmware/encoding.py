@@ -186,7 +186,7 @@ def encoded_piece(
     phases: Phases,
 ) -> Encoded:
     """Return the encoded piece with the times that the firmware's plan of its moves gives."""
-    duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    duration_s = phases.lasts_s
     start_s = timeline.start_s[0] + phases.t_s
     group_start_s = _group_starts(timeline, moves.group, start_s, duration_s)
     own = moves.row >= 0
@@ -208,8 +208,8 @@ def encoded_piece(
 
 def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:
     """Return how long each group takes; `phases` has a row for every row of the piece."""
-    duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    return np.array([duration[g.first : g.last].sum() for g in groups])
+    lasts_s = phases.lasts_s
+    return np.array([lasts_s[g.first : g.last].sum() for g in groups])
 
 
 def to_units(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:

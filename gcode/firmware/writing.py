@@ -444,8 +444,7 @@ class StreamWriter:
         worth that: the next stream takes care of its vibration. Nor is what somebody chose to leave
         out, but its filament is the slicer's, and needs the firmware's pressure advance.
         """
-        travel = verbatim.moves.end_mm - verbatim.moves.start_mm
-        prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
+        prints = bool(np.any(verbatim.moves.prints))
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again

@@ -198,11 +198,9 @@ def _motion(
         phases = _planned(sample, advice, machine, adviser)
         if len(phases) == 0:
             continue
-        way = phases.direction
-        prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
         numbers = phases.move_index - phases.move_index[0]
-        feature = np.where(prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
-        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        feature = np.where(phases.prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
+        duration = phases.lasts_s
         for one in np.unique(feature).tolist():
             seconds[one] = seconds.get(one, 0.0) + float(np.sum(duration[feature == one]))
         total_s = float(phases.t_s[-1] + duration[-1] - phases.t_s[0])

@@ -167,10 +167,8 @@ def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
         position, row = sample_phases(phases, (0.0, DT_S, count))
         path = np.pad(position[:2], ((0, 0), (pad, pad)), mode="edge")
         command = [shape(p, DT_S, one) for p, one in zip(path, pulses, strict=True)]
-        direction = phases.direction[row]
-        prints = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
         classes = np.pad(sample.classes[row], pad, constant_values=AS_SLICED)
-        return path, np.stack(command), np.pad(prints, pad), classes
+        return path, np.stack(command), np.pad(phases.prints[row], pad), classes
 
     return motion
 

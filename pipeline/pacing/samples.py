@@ -130,8 +130,7 @@ def _items(
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
     """Return what is known of the first layer when these moves have come."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
-    way = moves.end_mm - moves.start_mm
-    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0) & (moves.layer >= 0)
+    prints = moves.prints & (moves.layer >= 0)
     if np.isfinite(known.z_mm) or not np.any(prints):
         return FirstLayer(below, known.z_mm)
     return FirstLayer(below, float(moves.end_mm[np.argmax(prints), 2]))
@@ -161,9 +160,7 @@ def _take(
 
 def _around(phases: Phases, row: int) -> tuple[int, int]:
     """Return rows [first, last) around one, from rest to rest if there are rests nearby."""
-    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
-    begin_s = phases.t_s
-    end_s = begin_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    xy, begin_s, end_s = phases.moves_xy, phases.t_s, phases.end_s
     starts = np.flatnonzero(xy & np.append(True, ~xy[:-1]))
     ends = np.flatnonzero(xy & np.append(~xy[1:], True))
     first = int(starts[np.searchsorted(starts, row, "right") - 1])

@@ -204,7 +204,7 @@ class MarlinEncoder:
         steps, path = self._blocks(start_mm, end_mm)
 
         phases = self._plan(start_mm, end_mm, speed, limits_id, table)
-        actual = phases.accel_s + phases.cruise_s + phases.decel_s
+        actual = phases.lasts_s
         correction, feedrate, predicted = (np.zeros(len(rows)) for _ in range(3))
         accel = self._command.accel_mm_s2
         floor_mm_s = np.sqrt(0.5 * accel * path / np.maximum(steps, 1.0))
@@ -230,7 +230,7 @@ class MarlinEncoder:
             )
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, table)
-            actual = phases.accel_s + phases.cruise_s + phases.decel_s
+            actual = phases.lasts_s
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
@@ -361,9 +361,8 @@ def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Enc
     """Begin stretches later by what their first step from rest takes too long."""
     ours, phases = moves.row < 0, encoded.phases
     first = ours & np.append(True, ~ours)[:-1]
-    duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
     delay_s = np.zeros(len(timeline.groups))
-    delay_s[moves.group[first]] = (duration_s - moves.planned_s)[first]
+    delay_s[moves.group[first]] = (phases.lasts_s - moves.planned_s)[first]
     counts = [group.last - group.first for group in timeline.groups]
     return replace(
         encoded,
@@ -378,7 +377,7 @@ def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.f
     own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
     which, direction = piece.moves.limits_id, piece.phases.direction
     xy = np.abs(direction[:, :2])
-    moves = np.any(xy > 0.0, axis=1) & (direction[:, 3] > 0.0) & (direction[:, 3] <= _MOST_FEED)
+    moves = piece.phases.prints & (direction[:, 3] <= _MOST_FEED)
     largest = np.min(own[which, :2] / np.maximum(xy, 1e-9), axis=1)
     accel = np.minimum(largest, own[which, 2])
     advance = np.where(moves, k_s[which] * direction[:, 3] * accel, 0.0)

@@ -193,7 +193,7 @@ class RepRapEncoder:
             phases = planner.plan_whole(written, limits)
             # Rests, whose moves brake for what comes later, are foreseen a little wrong; and a peak
             # of speed that is nearly cut off may be or not be, whatever was foreseen.
-            miss = phases.accel_s + phases.cruise_s + phases.decel_s - predicted
+            miss = phases.lasts_s - predicted
             wrong_s = float(np.max(np.abs(np.cumsum(miss)), initial=0.0))
             if wrong_s < least_s:
                 best, plan, least_s = feedrate.copy(), phases, wrong_s
@@ -284,7 +284,7 @@ class RepRapEncoder:
     def _check_rate(self, phases: Phases, piece: Piece) -> None:
         """Refuse what the firmware's queue could not keep up with."""
         half, least = self._half_ring, self._half_ring_s
-        lasts = phases.accel_s + phases.cruise_s + phases.decel_s
+        lasts = phases.lasts_s
         if len(lasts) <= half:
             return
         total = np.cumsum(np.append(0.0, lasts))
