@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.compensation.shapers import shape_xy, shaper_pulses
 from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -263,8 +263,7 @@ class Shaped(Own):
         reach = round(_SHAPER_REACH_S / DT_S)
         own = super().command(first - reach, last + reach)
         pulses = [shaper_pulses(kind, f, zeta) for f in (fx_hz, fy_hz)]
-        rows = [shape(row, DT_S, p) for row, p in zip(own, pulses, strict=True)]
-        return np.stack(rows)[:, reach:-reach]
+        return shape_xy(own, DT_S, pulses)[:, reach:-reach]
 
 
 class Aligned(Timed):

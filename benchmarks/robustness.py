@@ -25,7 +25,7 @@ from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_fold
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion
@@ -211,8 +211,7 @@ class Trial:
     def shaped(self, kind: str, i: int, j: int) -> Array:
         """Return the command of a shaper with frequency number i on X and j on Y."""
         pulses = [shaper_pulses(kind, float(FREQUENCIES_HZ[k]), _ZETA) for k in (i, j)]
-        rows = zip(self._motion.position_mm, pulses, strict=True)
-        return np.stack([shape(row, DT, p) for row, p in rows])
+        return shape_xy(self._motion.position_mm, DT, pulses)
 
     def shaper_rms(self, kind: str, points: int) -> Callable[[int, int], Array]:
         """Return a function of two frequency numbers: contour rms [um], about `points` points."""

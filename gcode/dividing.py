@@ -14,6 +14,7 @@ from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
 from stillpath.models.machine import Machine
+from stillpath.models.runs import runs
 
 __all__ = ["divided", "sections"]
 
@@ -63,10 +64,9 @@ def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterat
         yield piece
         return
     rows = sections(piece)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
     moves = piece.moves
     done = 0
-    for first, stop in edges.reshape(-1, 2).tolist():
+    for first, stop in runs(wanted):
         start, end = rows[first][0], rows[stop - 1][1]
         if start > done:
             yield _left_out(piece, done, start)

@@ -8,12 +8,10 @@ bad for any; what the worst of them pays is kept with the choice.
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,7 @@ from stillpath.models.friction import DryFriction
 from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Channel
@@ -106,9 +104,7 @@ class Choice:
         """Return a channel of a report with the range over the members."""
         if channel.name not in self.ranges:
             return channel
-        rms_um = channel.selected_rms_um
-        rms_um = channel.extruding.contour_rms_um if rms_um is None else rms_um
-        low, high = (rms_um * s for s in self.ranges[channel.name])
+        low, high = (channel.judged_rms_um * s for s in self.ranges[channel.name])
         return channel.model_copy(update={"contour_range_um": (low, high)})
 
 
@@ -177,20 +173,16 @@ def choose_caution(
         Where the choice is kept.
     """
     path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
-    choice: Choice | None = None
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
-        choice = Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
-    if choice is None:
-        choice = _tried(machine, shaper, dt_s, basis)
-        directory.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps(asdict(choice)), encoding="utf-8")
+    choice = kept(path, _read, lambda: _tried(machine, shaper, dt_s, basis))
     return (
         Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz, choice.fit_share),
         choice,
     )
+
+
+def _read(found: dict[str, Any]) -> Choice:
+    ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
+    return Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
 
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:

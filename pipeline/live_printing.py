@@ -59,9 +59,6 @@ def simulate_live(
     live = live_filter(machine, design.taps)
     result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
     channels = [design.ranged(channel, machine) for channel in result.channels]
-    channels = [
-        c.model_copy(update={"label": "printed live"}) if c.name == "after" else c for c in channels
-    ]
     (after,) = (channel for channel in channels if channel.name == "after")
     way = live_way(after, result.original_time_s, result.original_bytes)
     stages = [StageTime(stage="design", cpu_s=round(clock.cpu_s["design"], 4)), *result.stages]

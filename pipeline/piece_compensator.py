@@ -25,6 +25,7 @@ from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
+from stillpath.models.runs import runs
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, designed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
@@ -362,9 +363,8 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     if not np.any(wipes):
         return
     inside = wipes[timeline.row] & timeline.moving
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
     last = command.shape[1] - 1
-    for first, end in edges.reshape(-1, 2):
+    for first, end in runs(inside):
         # From the plan's own ends: the samples around a wipe may lie in a retraction at rest.
         row, stop = timeline.row[first], timeline.row[end - 1] + 1
         begins = phases.start_mm[row, 3]
@@ -383,8 +383,7 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
     The command has other speeds in a corner than the plan has, the filament has the plan's: per mm
     of way it comes in steps there, which firmwares brake for, the more the thicker the line.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], extruding, [False]])))
-    for first, end in edges.reshape(-1, 2):
+    for first, end in runs(extruding):
         span = slice(max(first - 1, 0), end)
         fed_mm = command[3, span] - command[3, span.start]
         way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))

@@ -11,6 +11,7 @@ from stillpath.gcode.dividing import divided, sections
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.slicers.features import Feature, feature_of
 from stillpath.models.machine import Machine
+from stillpath.models.runs import runs
 from stillpath.pipeline.options import Options, Where
 from stillpath.pipeline.result import GroupFigures
 
@@ -102,7 +103,7 @@ class Selection:
         for k in range(len(rows) - 2, -1, -1):
             wanted[k] |= wanted[k + 1] and not prints[k]
         start_s = piece.phases.t_s - piece.phases.t_s[0]
-        for first, last in _runs(~wanted):
+        for first, last in runs(~wanted):
             begin_s = float(start_s[rows[first][0]])
             end = rows[last - 1][1]
             end_s = float(start_s[end]) if end < len(start_s) else piece.phases.duration_s
@@ -118,9 +119,3 @@ class Selection:
     def _named(self, name: str) -> bool:
         feature = feature_of(name)
         return self._features is None or feature is None or feature in self._features
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return where a mask holds without a break: first, and one past the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -31,6 +31,7 @@ from stillpath.models.identification.ripple_observability import (
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.response_kernels import dense_response
 from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
+from stillpath.models.runs import runs
 
 __all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
 
@@ -332,13 +333,9 @@ def _steady(command: Array, plant: DiscretePlant) -> slice:
         return slice(0, 0)
     same = np.abs(np.diff(speed)) <= _STEADY * np.abs(speed).max()
     same &= np.abs(speed[1:]) > 0.05 * np.abs(speed).max()
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
-    starts, ends = edges[::2], edges[1::2]
-    if len(starts) == 0:
-        return slice(0, 0)
-    longest = int(np.argmax(ends - starts))
-    settled = int(starts[longest]) + math.ceil(plant.settling_time_s(1e-3) / plant.dt_s)
-    return slice(min(settled, int(ends[longest])), int(ends[longest]))
+    start, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
+    settled = start + math.ceil(plant.settling_time_s(1e-3) / plant.dt_s)
+    return slice(min(settled, end), end)
 
 
 def _speed(log: PassLog, steady: slice, dt_s: float) -> float:

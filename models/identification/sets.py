@@ -40,6 +40,7 @@ __all__ = [
     "PARAMETRIC_SPREAD",
     "Origin",
     "delay_warning",
+    "measured_modes",
     "parametric_members",
     "plant_set_from",
     "provenance_of",
@@ -253,20 +254,25 @@ def provenance_of(
         residual=fit.residual,
         delay_s=fit.delay_s,
         gain=fit.gain,
-        modes=tuple(
-            MeasuredMode(
-                f_hz=m.f_hz,
-                zeta=m.zeta,
-                f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
-                zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
-            )
-            for m in fit.modes
-        ),
+        modes=measured_modes(fit),
         trust_below_hz=fit.trust_below_hz,
         phase="not measured" if fit.magnitude_only else "aligned at low frequency",
         slow_delay_s=delays_s,
         coherent_share=share,
         coherent_band_hz=band_hz,
+    )
+
+
+def measured_modes(fit: Fit) -> tuple[MeasuredMode, ...]:
+    """Return the modes of a fit as documents have them: without what is not known."""
+    return tuple(
+        MeasuredMode(
+            f_hz=m.f_hz,
+            zeta=m.zeta,
+            f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
+            zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
+        )
+        for m in fit.modes
     )
 
 

@@ -28,8 +28,9 @@ from stillpath.pipeline.advising.advice import (
     is_visible,
     wanted_accel,
 )
-from stillpath.pipeline.advising.trials import Trial, members_of
+from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.pipeline.measuring.set_errors import machine_numbers
 from stillpath.pipeline.pacing.samples import FileSamples
 from stillpath.pipeline.piece_compensator import DT_S
 
@@ -176,7 +177,7 @@ def choose(
     shaped : bool
         A shaper may be advised.
     """
-    members = members_of(machine, DT_S)
+    members = machine_numbers(machine, DT_S)
     as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
     features = [f for f in as_sliced.features if _free(f, sliced.names)]
     visible = {f for f in features if is_visible(sliced.names[f] if f >= 0 else "")}
@@ -346,7 +347,7 @@ def _candidates(
     levels = sliced.levels
     count = len(levels)
     made = [_Candidate([sliced.shaping] * count, ours=False)]
-    members = members_of(machine, DT_S)
+    members = machine_numbers(machine, DT_S)
     few = [members[0], *members[1 :: max(1, -(-(len(members) - 1) // _MEMBERS))]]
     tuned = np.unique(np.linspace(0, count - 1, min(count, _TUNED_LEVELS)).round().astype(int))
     logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}

@@ -215,9 +215,9 @@ class Measurement:
         if self._beside is None:
             self._track.add(errors.index, errors.error_mm, self._dt_s)
 
-    def channels(self) -> list[Channel]:
-        """Return the figures of every channel."""
-        labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
+    def channels(self, after: str = "compensated") -> list[Channel]:
+        """Return the figures of every channel; `after` is the label of the executed motion."""
+        labels = {"before": "as sliced", "after": after, "shaper": self._shaper_label}
         meter, most_mm = self._meter, self._maxima.max_mm
         return [
             Channel(

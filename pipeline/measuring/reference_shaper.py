@@ -12,24 +12,24 @@ grid with more points finds their floor, and all points decide between the best.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
 from stillpath.models.reference_motion import reference_limits, reference_motion_of
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import kept
 from stillpath.simulation.measures import PathDistances, Tally, contour_error, tracking_error
 from stillpath.simulation.response import response
 
@@ -74,6 +74,11 @@ class BestShaper:
     zeta: float
     contour_rms_um: float
     tracking_rms_um: float
+
+    @property
+    def pulses(self) -> list[tuple[Array, Array]]:
+        """Weights and delays [s] of its pulses, for X and for Y."""
+        return [shaper_pulses(self.type, f_hz, self.zeta) for f_hz in (self.fx_hz, self.fy_hz)]
 
     @property
     def label(self) -> str:
@@ -141,7 +146,7 @@ def evaluate_shaper(
     use = extruding if extruding.any() else np.ones(len(extruding), bool)
     y_d_mm, use = _with_rests(y_d_mm, use, dt_s)
     pulses = [shaper_pulses(kind, f_hz, _ZETA) for f_hz in (fx_hz, fy_hz)]
-    u = np.stack([shape(row, dt_s, p) for row, p in zip(y_d_mm, pulses, strict=True)])
+    u = shape_xy(y_d_mm, dt_s, pulses)
     y = response(_plants(machine, dt_s), u)
     contour, tracking = Tally(), Tally()
     contour.add(contour_error(y_d_mm, y, dt_s, stride=2), use[::2])
@@ -159,16 +164,19 @@ def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> Best
     if round(dt_s * 1e6) == _SHIPPED_US and basis in _shipped():
         return _shipped()[basis]
     path = directory / f"shaper-{basis}-{round(dt_s * 1e6)}us-v{_VERSION}.json"
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        found = BestShaper(**json.loads(path.read_text(encoding="utf-8")))
-        if found.type in SHAPERS and min(found.fx_hz, found.fy_hz) > 0:
-            return found
-    y_d, extruding = reference_motion_of(machine, dt_s)
-    best = tune_shaper(machine, y_d, dt_s, extruding)
-    directory.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(asdict(best)), encoding="utf-8")
-    return best
+
+    def tuned() -> BestShaper:
+        y_d, extruding = reference_motion_of(machine, dt_s)
+        return tune_shaper(machine, y_d, dt_s, extruding)
+
+    return kept(path, _read, tuned)
+
+
+def _read(found: dict[str, Any]) -> BestShaper:
+    shaper = BestShaper(**found)
+    if shaper.type not in SHAPERS or min(shaper.fx_hz, shaper.fy_hz) <= 0:
+        raise ValueError("no shaper with frequencies")
+    return shaper
 
 
 def tuning_digest(machine: Machine) -> str:

@@ -107,10 +107,10 @@ class BudgetMeasurement(Measurement):
         """Return the errors of the written file by class of moves, so far."""
         return self._set.sums()
 
-    def channels(self) -> list[Channel]:
-        """Return the figures of every channel."""
+    def channels(self, after: str = "compensated") -> list[Channel]:
+        """Return the figures of every channel; `after` is the label of the executed motion."""
         sliced = {channel.name: channel for channel in self._sliced.channels()}
-        return [sliced.get(channel.name, channel) for channel in super().channels()]
+        return [sliced.get(channel.name, channel) for channel in super().channels(after)]
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
