@@ -55,7 +55,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import tune_shaper
 from stillpath.pipeline.options import Options
-from stillpath.simulation.measures import distance_to_path
+from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.printers.bodies import Bodies
 from stillpath.simulation.printers.drawing import KINDS, draw
 from stillpath.simulation.printers.machines import Printer
@@ -336,7 +336,7 @@ def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Er
         if len(at) == 0:
             continue
         y = printer.prints(section.command(0, n), DT_S)
-        errors.values.append(distance_to_path(path, y[:, at], at, DT_S, WINDOW_S))
+        errors.values.append(PathDistances(path, DT_S, WINDOW_S).at(y[:, at], at))
     return errors
 
 
@@ -372,7 +372,7 @@ def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> floa
         at = np.flatnonzero(extruding[::10]) * 10
         received = DryFriction(machine.friction_mm).received_mm(part.command(0, n)[:, ::step])
         answer = response(pair, received)
-        errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
+        errors.values.append(PathDistances(path, step * DT_S, WINDOW_S).at(answer[:, at], at))
     return errors.rms_um
 
 

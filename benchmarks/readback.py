@@ -26,7 +26,7 @@ from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
-from stillpath.simulation.measures import Tally, distance_to_path
+from stillpath.simulation.measures import PathDistances, Tally
 from stillpath.simulation.response import PlantStream
 
 __all__ = [
@@ -376,7 +376,7 @@ class Judge:
             miss = y - path[:, k0 - a : k1 - a]
             self.tracking.add(np.hypot(miss[0], miss[1]), use)
             at = np.flatnonzero(use[::_CONTOUR_EVERY]) * _CONTOUR_EVERY
-            error = distance_to_path(path, y[:, at], at + (k0 - a), DT_S, WINDOW_S)
+            error = PathDistances(path, DT_S, WINDOW_S).at(y[:, at], at + (k0 - a))
             if len(at) and error.max() > self.contour.max:
                 self.worst_s = DT_S * (k0 + int(at[np.argmax(error)]))
             self.contour.add(error)
@@ -386,7 +386,7 @@ class Judge:
             for stream, tally in zip(members, self.members, strict=True):
                 y = stream.push(u)
                 index = at + (k0 - a) // every
-                tally.add(distance_to_path(path, y[:, at], index, every * DT_S, WINDOW_S))
+                tally.add(PathDistances(path, every * DT_S, WINDOW_S).at(y[:, at], index))
 
     def _stepped(self, u: Array) -> Array:
         """Command as the motors stand: on whole steps, where the firmware plans in steps."""

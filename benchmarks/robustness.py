@@ -31,7 +31,7 @@ from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSet
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
-from stillpath.simulation.measures import distance_to_path, tracking_error
+from stillpath.simulation.measures import PathDistances, tracking_error
 from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
@@ -204,7 +204,7 @@ class Trial:
         contour, tracking = [], []
         for pair in self.members:
             y = response(pair, command)
-            contour.append(_rms(distance_to_path(path, y[:, self._index], self._index, DT)))
+            contour.append(_rms(PathDistances(path, DT).at(y[:, self._index], self._index)))
             tracking.append(_rms(tracking_error(path, y)[use]))
         return Errors(1e3 * np.array(contour), 1e3 * np.array(tracking))
 
@@ -230,7 +230,7 @@ class Trial:
             if (i, j) not in found:
                 pairs = zip(axis(0, i), axis(1, j), strict=True)
                 found[i, j] = 1e3 * np.array(
-                    [_rms(distance_to_path(path, np.stack(pair), index, DT)) for pair in pairs]
+                    [_rms(PathDistances(path, DT).at(np.stack(pair), index)) for pair in pairs]
                 )
             return found[i, j]
 

@@ -150,7 +150,7 @@ class PreviewFbf:
         self._axes = [PreviewAxis(axis, one) for axis, one in zip(("x", "y"), made, strict=True)]
 
     def reset(self, position_mm: Array) -> None:
-        """Take the machine to stand still at `position_mm` (2,)."""
+        """Assume that the machine stands still at `position_mm` (2,)."""
         for axis, position in zip(self._axes, position_mm, strict=True):
             axis.reset(float(position))
 

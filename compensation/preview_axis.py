@@ -271,7 +271,7 @@ class PreviewAxis:
         self.reset(0.0)
 
     def reset(self, position: float) -> None:
-        """Take the axis to stand still at `position`."""
+        """Assume that the axis stands still at `position`."""
         # States are kept relative to `origin`: the digits belong to the vibration.
         self._origin = position
         self._states = np.zeros(sum(p.order for p in self._plants))

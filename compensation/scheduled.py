@@ -75,7 +75,7 @@ class ScheduledCompensator:
         self.name = self._made[self._points[0]].name
 
     def reset(self, position_mm: Array) -> None:
-        """Take the machine to stand still at `position_mm` (2,)."""
+        """Assume that the machine stands still at `position_mm` (2,)."""
         self._past = np.array(position_mm, float)[:, None]
         for point in self._knowing:
             self._made[point].reset(position_mm)

@@ -1,8 +1,8 @@
 """From planned moves to the sampled path of a piece, with its rests laid on the sampling grid.
 
 A *piece* is a row of planned moves that starts and ends at rest. Inside it, moves of X and Y form
-*stretches*; between them lie *rests*, moves of the extruder or of Z alone, which leave the file as
-they came while X and Y stand still. How long a rest takes is decided by the limits under which the
+*stretches*; between them lie *rests*, moves of the extruder or of Z alone, which are written
+unchanged while X and Y stand still. How long a rest takes is decided by the limits under which the
 written file will run, not by the original ones, so the rests' durations are an input here and the
 stretches move in time. A rest starts on the sampling grid; a stretch starts where its rest ends.
 """

@@ -19,9 +19,9 @@ _ALL_BITS = 6
 """Of a long print, every second block after the first 64 tells enough, every fourth after the
 first 128, and so on; each counts for all that it stands for."""
 _TOGETHER = 16
-"""Blocks are transformed so many at a time, as to prepare for it takes longer than a block."""
+"""Blocks transformed at a time: setting a transform up costs more than one block."""
 NOTABLE_UM = 1.0
-"""Less than this beyond the band is not worth a word."""
+"""Less than this beyond the band is not reported."""
 
 
 class BandContent:

@@ -1,9 +1,9 @@
 """Blend fbf with a shaper so that no likely plant does worse: what `robust=auto` decides.
 
-On the plants that explain the measurement a file shall print no worse than with the shaper that the
-same measurement leads to. Before anything is printed, both commands are tried on the reference
-motion, all members answer, and the mixture is taken that is best for the likely ones without being
-bad for any; what the worst of them pays is kept with the choice.
+For every plant that explains the measurement, a file should print no worse than with the shaper
+that the same measurement leads to. Both commands are therefore tried on the reference motion with
+all members of the set, and the mixture is chosen that is best for the likely members without being
+bad for any. How much worse the worst member fares is stored with the choice.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 _VERSION = 8
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
-"""Most where the phase was not measured: what a set does not hold, it cannot warn of."""
+"""Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
 _PRICE = 0.5
-"""Of a member that fares worse than with the shaper, by how much it does: members contradict each
-other, and to please the least likely one would mean to leave the others alone."""
+"""Weight, in the ranking, of how much worse than with the shaper the worst member fares. Members
+contradict each other: to protect the least likely one would mean not to compensate the others."""
 _COARSE_UM, _LEAST_FIT = 4.0, 0.5
 """Contour error from which on straight segments may take all of their tolerance, and the least
 share of it: on machines that are known well the segments would be the larger error."""
@@ -163,14 +163,19 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 def choose_caution(
     machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = DEFAULT_BASIS
 ) -> tuple[Caution, Choice]:
-    """Choose how much of the compensation a machine bears; found once per machine revision.
+    """Choose the mixture of compensation and shaper for a machine, once per machine revision.
 
     Parameters
     ----------
+    machine : Machine
     shaper : BestShaper
         What the nominal plants lead to.
     directory : Path
         Where the choice is kept.
+    dt_s : float
+        Sampling time of the commands.
+    basis : str
+        A key of `compensation.basis.BASES`.
     """
     path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
     choice = kept(path, _read, lambda: _tried(machine, shaper, dt_s, basis))
@@ -248,10 +253,10 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
 
 
 def _strong(machine: Machine) -> Machine:
-    """Return the machine with motors that bear what most do.
+    """Return the machine with at least the default limits of the command.
 
-    How far its plants are known is asked here; what its motors bear, every piece of a print is
-    asked by itself (`compensation.cautious`).
+    The choice depends on how well the plants are known. What the motors allow is checked for every
+    piece of a print (`compensation.cautious`).
     """
     usual, own = CommandLimits(), machine.command
     command = usual.model_copy(
@@ -289,7 +294,7 @@ def error_ranges(
 
 
 def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
-    """Return what dry friction leaves of a command, so many times of what was measured."""
+    """Return what dry friction leaves of a command; `share` scales the measured friction."""
     return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
 
 
@@ -303,12 +308,12 @@ def _delayed(y: Array, samples: float) -> Array:
 
 
 def _rank(choice: Choice) -> float:
-    """Order choices: what they reach on the likely members, and what the worst one pays for it."""
+    """Rank choices, the best lowest: the mean over likely members, and the worst one's excess."""
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 
 
 def most_share(axis: PlantSetSpec) -> float:
-    """Return the largest share of a compensation that an axis bears beside a shaper's."""
+    """Return the largest share of compensation in the mixture for an axis; the rest is shaper."""
     return _UNSEEN_SHARE if _unseen(axis) else 1.0
 
 

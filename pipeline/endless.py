@@ -1,4 +1,4 @@
-"""Prints that would never end are refused before hours are spent on what comes before that."""
+"""Refuse prints that would take impossibly long, before hours are spent on compensating them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class LengthGuard:
         self._looked = False
 
     def check(self, time_s: float, line: int) -> None:
-        """Say that up to and with `line` the print takes so long, before anything is made of it.
+        """Check the print time up to and including `line`, before these lines are processed.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and where kept things lie."""
+"""Files that are written whole or not at all, and what is kept between jobs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def replacing(target: Path) -> Iterator[Path]:
         be replaced by a file.
     """
     if target.exists() and not target.is_file():
-        raise OSError(errno.EINVAL, "is no regular file; name one to write", str(target))
+        raise OSError(errno.EINVAL, "is not a regular file; name one to write", str(target))
     handle = _open_unnamed(target.parent)
     temporary = _named(target) if handle is None else _path_of(handle)
     try:

@@ -1,8 +1,8 @@
-"""The filter of a machine for print time: which one, and what its set says of it.
+"""Choose a machine's filter for live printing, and predict its errors over the plant set.
 
-Filters of several bandwidths, each with some of the best shaper's smoothing, are tried on the
-reference motion. Taken is the best for the likely members among those that are for no member worse
-than the shaper; the shaper itself is always among them, for a shaper is such a filter too.
+Filters of several bandwidths, each mixed with some of the best shaper, are tried on the reference
+motion. Of those that are no worse than the shaper for any member, the one that is best for the
+likely members is taken. The shaper is such a filter too, and always among the candidates.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ _REACHES = (80, 160)
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _STRIDE, _NOTHING = 5, 1e-12
 _AS_GOOD, _AS_SHARP = 1.05, 1.02
-"""The shortest filter that is as good as that, and of this length that with the least bandwidth
-that is as good as this: it asks for less acceleration."""
+"""Ratios to the least error. The shortest filter within the first is taken, and of that length the
+one with the least bandwidth within the second: it asks for less acceleration."""
 
 
 @dataclass(frozen=True, slots=True)

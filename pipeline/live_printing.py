@@ -1,4 +1,4 @@
-"""What the extra inside Klipper makes of a file: by itself, or beside the compensated file."""
+"""Predict live printing (the extra inside Klipper), by itself or beside the compensated file."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def _way(
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:
-    """Return a callback for work before that which fractions count: it shows that there is life."""
+    """Return a callback for work before the job's own: it only shows that work goes on."""
     if progress is None:
         return None
     tell = progress

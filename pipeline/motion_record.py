@@ -33,7 +33,7 @@ class MotionRecord:
     measurement : Measurement
     totals : Totals
     changing : (Compensator, Verifier), optional
-        Who must know all motion of the machine; None: the file is not changed.
+        They are told of all motion of the machine; None: the file is not changed.
     """
 
     def __init__(

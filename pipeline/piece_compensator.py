@@ -56,7 +56,8 @@ _SOFT_S = (2e-3, 4e-3, 8e-3)
 
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
-"""Filament is smoothed over so many times its mm per mm, before and after, and no further."""
+"""Half-width of the smoothing of filament along the path: a multiple of the filament per mm of
+path, and the most in mm."""
 _ROUNDED = 1.0 + 1e-9
 _EXTRUDING_EXCESS_MM = 20e-3
 _TRAVEL_EXCESS_MM = 200e-3
@@ -64,7 +65,7 @@ _TRAVEL_EXCESS_MM = 200e-3
 
 
 class Unfit(ValueError):
-    """A piece that had better stay as sliced; the message is the reason."""
+    """A piece that should stay as sliced; the message says why."""
 
 
 class _Sudden(Unfit):
@@ -143,7 +144,7 @@ class PieceCompensator:
         self._filter = _error_filter(machine)
         command = machine.command
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
-        # An axis that bears more is looked at as if it went less far.
+        # One limit serves both axes: one with a higher limit counts as if it moved less.
         self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
         self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
@@ -303,7 +304,7 @@ class PieceCompensator:
         )
 
     def _check_motors(self, command_mm: NDArray[np.float64]) -> None:
-        """See that X and Y (2, n) together ask no motor of a CoreXY for more than it bears."""
+        """Check that X and Y (2, n) together keep the limits of the motors of a CoreXY."""
         motors = self._machine.command.motors
         if motors is None:
             return
@@ -323,7 +324,7 @@ class PieceCompensator:
     def _check_travel(
         self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
     ) -> None:
-        """See that places (2, n), each of a row of the piece's phases, lie within the travel."""
+        """Check that places (2, n), each of a row of the piece's phases, lie within the travel."""
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
             if travel.min_mm <= place_mm[i].min() and place_mm[i].max() <= travel.max_mm:

@@ -346,7 +346,7 @@ class Result(_Figures):
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     left_out_s: float = 0.0
-    """Time of what leaves as sliced because the job asked for less than all (`where`) [s]."""
+    """Time of what stays as sliced because the job asked for less than all (`where`) [s]."""
     left_out_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     warnings: list[str]

@@ -69,8 +69,8 @@ class Match:
         The part of the plan that the log follows without a jump.
     offset_s, rate : float
         Log time = offset_s + rate * plan time.
-    followed_s, log_s : float
-        Seconds of the log that follow the plan at all, and all of them.
+    log_s : float
+        Length of the log.
     places : int
         Places in the plan that fit about as well (repeated layers); the best one was taken.
     """
@@ -80,7 +80,6 @@ class Match:
     plan_end_s: float
     offset_s: float
     rate: float
-    followed_s: float
     log_s: float
     places: int
 
@@ -146,7 +145,7 @@ def match(plan: Signal, log: Signal) -> Match:
     good = shares > _FOLLOWS
     at_s, lag_s = _refined(plan, log, segments[good], lags[good], segment_s)
     if len(at_s) == 0:
-        return Match(best, 0.0, 0.0, 0.0, 1.0, 0.0, log.duration_s, places)
+        return Match(best, 0.0, 0.0, 0.0, 1.0, log.duration_s, places)
     run = _longest_run(at_s, lag_s, segment_s)
     at_s, lag_s = at_s[run], lag_s[run]
     # Plan time = log time + lag.
@@ -163,7 +162,6 @@ def match(plan: Signal, log: Signal) -> Match:
         plan_end_s=min(end, plan.duration_s),
         offset_s=-intercept * rate,
         rate=rate,
-        followed_s=float(np.sum(good)) * segment_s,
         log_s=log.duration_s,
         places=places,
     )

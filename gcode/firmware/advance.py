@@ -1,7 +1,8 @@
 """Pressure advance in the filament of a stream, where the firmware's own cannot be used.
 
 A firmware that adds advance during its ramps finds none in a stream of short segments, whose ramps
-last a part of a step. There its own is off, and the stream's filament is ahead by as much.
+last a part of a step. There its own is switched off, and the
+stream's filament is advanced by the same amount.
 """
 
 from __future__ import annotations

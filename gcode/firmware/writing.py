@@ -1,7 +1,7 @@
 """The written file: our lines among those of the original, with the printer's state kept right.
 
-Lines that are not ours leave byte for byte. Whatever the stream needs different (limits, firmware
-shaper, modes) is set before its first line and restored before any line that could depend on it.
+Lines of the original are written byte for byte. Whatever the stream needs different (limits, modes,
+firmware shaper) is set before its first line, and restored before any line that may depend on it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Resonances of a fit with their standard deviations, and which of them are none."""
+"""Resonances of a fit with their standard deviations, and which of them are not real."""
 
 from __future__ import annotations
 

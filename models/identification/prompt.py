@@ -1,4 +1,4 @@
-"""Plants whose slow motion is not late: what a recording without a common clock can say."""
+"""Plants without delay of slow motion: all that a recording without a common clock can tell."""
 
 from __future__ import annotations
 

@@ -89,15 +89,12 @@ class RippleLearning:
     ----------
     ripple : AxisRipple
     observability : tuple of Observability
-    residual_rms : float
-        What the waves do not explain, in the unit of the log.
     explained : float
         Share of the log's deviation (rms) that the waves explain, 0..1.
     """
 
     ripple: AxisRipple
     observability: tuple[Observability, ...]
-    residual_rms: float
     explained: float
 
 
@@ -158,7 +155,7 @@ def learn_ripple(
     ripple = _axis_ripple(_sources(basis, amplitudes, sd_mm), homing_repeatability_mm)
     total = _rms_beside(matrix[:, 2 * waves :], aim)
     explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
-    return RippleLearning(ripple, seen, residual, explained)
+    return RippleLearning(ripple, seen, explained)
 
 
 def _solved(matrix: Array, aim: Array, waves: int) -> tuple[Complex, Array, float]:

@@ -195,13 +195,6 @@ def _shipped() -> dict[str, BestShaper]:
     return {row["digest"]: BestShaper(**row["shaper"]) for row in found["machines"].values()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Points:
-    """Samples at which a trial is measured."""
-
-    index: Ints
-
-
 class _Trial:
     """One motion on one machine, ready to be measured under any shaper at any points."""
 
@@ -215,7 +208,8 @@ class _Trial:
         self._answer = response(_plants(machine, dt_s), self._y_d)
         chosen = np.flatnonzero(use)
         self._chosen = chosen.astype(np.int64)
-        self._points: dict[int, _Points] = {}
+        self._points: dict[int, Ints] = {}
+        """Samples at which the trial is measured, by their key."""
         self._shaped: dict[tuple[int, str, int, int], Array] = {}
         self._known: dict[tuple[int, str, int, int], float] = {}
 
@@ -226,14 +220,14 @@ class _Trial:
             # A stride that shares no rhythm with the motion: one random sample per cell.
             offset = np.random.default_rng(1).integers(0, step, len(self._chosen) // step)
             cells = np.arange(len(offset)) * step + offset
-            self._points[count] = _Points(self._chosen[cells])
+            self._points[count] = self._chosen[cells]
         return count
 
     def rms(self, kind: str, i: int, j: int, points: int) -> float:
         """Rms contour error [mm] with frequency number i on X and j on Y."""
         key = (points, kind, i, j)
         if key not in self._known:
-            at = self._points[points].index
+            at = self._points[points]
             y = np.stack([self._axis(0, kind, i, points), self._axis(1, kind, j, points)])
             error = self._distances.at(y, at)
             self._known[key] = float(np.sqrt(error @ error / len(error)))
@@ -247,7 +241,7 @@ class _Trial:
         key = (points, kind, axis, number)
         if key not in self._shaped:
             pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
-            index = self._points[points].index
+            index = self._points[points]
             self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, index)
         return self._shaped[key]
 

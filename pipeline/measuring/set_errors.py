@@ -78,7 +78,7 @@ class SetErrors:
     machine : Machine
     dt_s : float
     stride : int
-        Every which sample is measured.
+        Every `stride`-th sample is measured.
     """
 
     def __init__(self, machine: Machine, dt_s: float, *, stride: int) -> None:

@@ -1,7 +1,8 @@
 """Some seconds of every class of moves, taken from all over a file.
 
-Memory is bounded: of each class so many places are kept, and when they run out every second one
-goes and every second one is taken from then on. The same file gives the same samples.
+Memory is bounded: each class keeps a limited number of samples. When there are more, every second
+one is dropped, and from then on only every second one is taken. The same file gives the same
+samples.
 """
 
 from __future__ import annotations

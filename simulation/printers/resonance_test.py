@@ -1,7 +1,7 @@
 """Klipper's resonance test on a virtual printer, and the files that it leaves.
 
-The accelerometer is as real ones are: its gains are off, it is turned, it hisses, it has steps, its
-rate is not the one on the label, and its clock starts somewhere.
+The accelerometer has the faults of real ones: wrong gains, a rotated mounting, noise, quantisation,
+a sampling rate that is not quite the nominal one, and a clock with an arbitrary origin.
 """
 
 from __future__ import annotations
