@@ -355,11 +355,7 @@ def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
     known = (moves.known & 4) != 0
     found = ~known & np.append(known[1:], False)
     if len(known) and not known[-1]:
-        first, end = (
-            moves.byte_start[-1] - block.text_offset,
-            moves.byte_end[-1] - block.text_offset,
-        )
-        found[-1] = b"Z" in block.text[first:end].split(b";", 1)[0].upper()
+        found[-1] = b"Z" in block.line(moves, -1).split(b";", 1)[0].upper()
     return np.asarray(found)
 
 

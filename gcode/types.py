@@ -24,6 +24,7 @@ __all__ = [
     "Moves",
     "Phases",
     "ProgramBlock",
+    "TextLines",
     "joined",
     "rows_of",
 ]
@@ -175,8 +176,21 @@ class Events:
         return len(self.line)
 
 
+class TextLines:
+    """Base of what holds moves and events with the text that they come from."""
+
+    __slots__ = ()
+    text: bytes
+    text_offset: int
+
+    def line(self, rows: Moves | Events, row: int) -> bytes:
+        """Return the line of a move or an event, with its end."""
+        begin, end = int(rows.byte_start[row]), int(rows.byte_end[row])
+        return self.text[begin - self.text_offset : end - self.text_offset]
+
+
 @dataclass(frozen=True, slots=True)
-class ProgramBlock:
+class ProgramBlock(TextLines):
     """One block of an interpreted file.
 
     `limits` and `modal` are the interpreter's tables. They only grow, and blocks share them, until

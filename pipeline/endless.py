@@ -16,7 +16,6 @@ __all__ = ["LengthGuard"]
 LOOK_AHEAD_S = 48 * 3600.0
 """From here on the rest of the file is planned first: planning costs by the line, all else by the
 second of the print, and twenty minutes of it fit into a line."""
-_BLOCK_BYTES = 1 << 17
 
 
 class LengthGuard:
@@ -55,14 +54,10 @@ class LengthGuard:
         planner = adapter(self._machine).planner()
         line = 1
         self._text.seek(0)
-        while True:
-            data = self._text.read(_BLOCK_BYTES)
-            for block in reader.push(data) if data else reader.flush():
-                planner.push(block)
-                rows: Moves | Events = block.moves if len(block.moves) else block.events
-                line = int(rows.line[-1]) if len(rows) else line
-                check_print_ends(planner.time_s, line)
-            if not data:
-                break
+        for block in reader.blocks(self._text):
+            planner.push(block)
+            rows: Moves | Events = block.moves if len(block.moves) else block.events
+            line = int(rows.line[-1]) if len(rows) else line
+            check_print_ends(planner.time_s, line)
         planner.flush()
         check_print_ends(planner.time_s, line)

@@ -31,7 +31,6 @@ __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
 STANDING_S = 2.0
 """How long a stand is measured: all vibration has died down after that."""
-_BLOCK_BYTES = 1 << 17
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,20 +140,15 @@ class TextMotion:
         guard = LengthGuard(file, self._machine, self._dialect)
         size = max(file.seek(0, io.SEEK_END), 1)
         file.seek(0)
-        while True:
-            data = file.read(_BLOCK_BYTES)
-            for block in self.reader.push(data) if data else self.reader.flush():
-                moves += len(block.moves)
-                self._each(block)
-                self._hold(block)
-                phases = planner.push(block)
-                self._check(phases, planner.time_s, guard.check)
-                for samples, path_mm in self._sampled(self._shortened(phases), final=False):
-                    yield from self._parts(samples, path_mm)
-            self.time_s = planner.time_s
-            self._progress(file.tell() / size, self.time_s)
-            if not data:
-                break
+        for block in self.reader.blocks(file):
+            moves += len(block.moves)
+            self._each(block)
+            self._hold(block)
+            phases = planner.push(block)
+            self._check(phases, planner.time_s, guard.check)
+            for samples, path_mm in self._sampled(self._shortened(phases), final=False):
+                yield from self._parts(samples, path_mm)
+            self._progress(file.tell() / size, planner.time_s)
         phases = planner.flush()
         self._check(phases, planner.time_s, check_print_ends)
         for samples, path_mm in self._sampled(self._shortened(phases), final=True):
@@ -173,10 +167,10 @@ class TextMotion:
             self._set_shaper(block, row)
 
     def _set_shaper(self, block: ProgramBlock, row: int) -> None:
-        events, offset = block.events, block.text_offset
-        line = block.text[int(events.byte_start[row]) - offset : int(events.byte_end[row]) - offset]
+        events = block.events
+        line = block.line(events, row).decode("utf-8", "replace")
         try:
-            found = self._adviser.read_shaper(line.decode("utf-8", "replace"), self._read_shaping)
+            found = self._adviser.read_shaper(line, self._read_shaping)
         except ValueError:
             return
         self._read_shaping = found

@@ -149,8 +149,8 @@ class StreamWriter:
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
-        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)):
-            line = verbatim.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
+        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)).tolist():
+            line = verbatim.line(events, row)
             conflict = self._stream_commands.conflict(line)
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
@@ -262,7 +262,7 @@ class StreamWriter:
     def _event(self, piece: Piece, k: int, kind: int, extruded_mm: float) -> bytes:
         """Text of event k of a piece; `extruded_mm` is where the extruder stands as written."""
         events = piece.events
-        line = piece.line_text(int(events.byte_start[k]), int(events.byte_end[k]))
+        line = piece.line(events, k)
         if kind == EventKind.LIMITS:
             return _held_back(line)
         if kind != EventKind.MODE or self._modal is None:
@@ -287,7 +287,7 @@ class StreamWriter:
 
     def _rest_line(self, piece: Piece, row: int, extruded_mm: float) -> bytes:
         moves = piece.moves
-        line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
+        line = piece.line(moves, row)
         code = line.split(b";", 1)[0]
         state = piece.modal[int(moves.modal_id[row])]
         # The file's own moves run under its own limits.

@@ -26,7 +26,6 @@ from stillpath.pipeline.operating_point import Operation
 
 __all__ = ["FileSamples", "Sample", "take_samples"]
 
-_BLOCK_BYTES = 1 << 17
 _LASTS_S = 4.0
 _TOTAL_S = 120.0
 _FEWEST, _MOST = 3, 12
@@ -118,13 +117,10 @@ def _items(
     source: BinaryIO, machine: Machine, dialect: Dialect, progress: Callable[[float], None] | None
 ) -> Iterator[Piece | VerbatimPart]:
     reader, splitter = Interpreter(machine, dialect=dialect), Splitter(machine)
-    while data := source.read(_BLOCK_BYTES):
-        for block in reader.push(data):
-            yield from splitter.push(block)
+    for block in reader.blocks(source):
+        yield from splitter.push(block)
         if progress is not None:
             progress(float(source.tell()))
-    for block in reader.flush():
-        yield from splitter.push(block)
     yield from splitter.flush()
 
 
