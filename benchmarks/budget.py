@@ -15,7 +15,6 @@ much, the nozzle should be where the original is after as much.
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
+from statistics import geometric_mean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ from readback import (
     Shaped,
     Timed,
     find_input,
+    one_thread_each,
     plain_copy,
     read_motion,
     shared_folder,
@@ -106,8 +107,7 @@ def main() -> None:
     given = parser.parse_args()
 
     shared = shared_folder(given.shared)
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    one_thread_each()
     options = Options(method=given.method, robust=given.robust)
     rows: list[Row] = []
     failures = 0
@@ -147,10 +147,8 @@ def judged(task: Task) -> Row:
     own = read_motion(task.file, machine)
     best = best_shaper(task, machine, own)
     shaped = Judge(machine, members=True)
-    for section in Shaped.sections(own):
-        assert isinstance(section, Shaped)
-        section.shaper = (best.type, best.fx_hz, best.fy_hz, best.zeta)
-        shaped.add(section)
+    for shaped_section in Shaped.through(own, best.pulses):
+        shaped.add(shaped_section)
     worst_um = _worst_um(shaped)
     with tempfile.TemporaryDirectory(prefix="stillpath-budget-") as folder:
         target = Path(folder) / "out.gcode"
@@ -296,7 +294,7 @@ def print_means(rows: list[Row]) -> bool:
         return False
 
     def saved(some: list[Row]) -> float:
-        return 1.0 - math.exp(sum(math.log(row.ratio) for row in some) / len(some))
+        return 1.0 - geometric_mean(row.ratio for row in some)
 
     for what in ("machine", "file"):
         for name in sorted({getattr(row, what) for row in rows}):

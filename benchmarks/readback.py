@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import shape_xy, shaper_pulses
+from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -26,6 +26,7 @@ from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
+from stillpath.models.shaper_pulses import Pulses
 from stillpath.simulation.measures import PathDistances, Tally
 from stillpath.simulation.response import PlantStream
 
@@ -73,6 +74,12 @@ def shared_folder(given: Path | None = None) -> Path | None:
     named = os.environ.get("STILLPATH_SHARED")
     folder = given or (Path(named) if named else root.parent / "shared")
     return folder if folder.is_dir() else None
+
+
+def one_thread_each() -> None:
+    """Keep processes that work side by side to one thread each; libraries read it when loaded."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def find_input(name: str, shared: Path | None) -> Path:
@@ -236,7 +243,7 @@ class Own(Timed):
         self.samples = int(np.ceil((self._end_s[-1] - self._start_s) / DT_S)) + 1
 
     @classmethod
-    def sections(cls, motion: Motion) -> list[Own]:
+    def sections(cls, motion: Motion) -> list[Self]:
         """All sections of a file."""
         bounds = [0, *motion.jumps().tolist(), len(motion.phases)]
         return [cls(motion, a, b) for a, b in pairwise(bounds)]
@@ -254,16 +261,22 @@ class Own(Timed):
 
 
 class Shaped(Own):
-    """A file as it is, driven through the firmware's shaper."""
+    """A file as it is, driven through the firmware's shapers of X and Y."""
 
-    shaper: tuple[str, float, float, float]
+    pulses: Sequence[Pulses]
+
+    @classmethod
+    def through(cls, motion: Motion, pulses: Sequence[Pulses]) -> list[Self]:
+        """All sections of a file, driven through a shaper each for X and Y."""
+        sections = cls.sections(motion)
+        for section in sections:
+            section.pulses = pulses
+        return sections
 
     def command(self, first: int, last: int) -> Array:
-        kind, fx_hz, fy_hz, zeta = self.shaper
         reach = round(_SHAPER_REACH_S / DT_S)
         own = super().command(first - reach, last + reach)
-        pulses = [shaper_pulses(kind, f, zeta) for f in (fx_hz, fy_hz)]
-        return shape_xy(own, DT_S, pulses)[:, reach:-reach]
+        return shape_xy(own, DT_S, self.pulses)[:, reach:-reach]
 
 
 class Aligned(Timed):
