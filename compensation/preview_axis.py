@@ -277,7 +277,7 @@ class PreviewAxis:
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Let the axis follow a command that was not ours, up to the sample after its last."""
+        """Let the axis follow a command (n,) made elsewhere, up to the sample after its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])
@@ -295,13 +295,13 @@ class PreviewAxis:
         self._made = None
 
     def commit_as(self, command: Array) -> None:
-        """Take a command as executed that was made of the last one."""
+        """Take a command (n,) as executed that was made of the last one."""
         self.observe(command)
         self.rung = self.next_rung
         self._made = None
 
     def answer(self, member: int, command: Array) -> Array:
-        """Return what a member of the set does with the command of a piece."""
+        """Return the positions (n,) with which a member of the set answers a command (n,)."""
         first = sum(p.order for p in self._plants[:member])
         p = self._plants[member]
         self._move_origin(float(command[0]))
@@ -310,7 +310,7 @@ class PreviewAxis:
         return y
 
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
-        """Windows whose command leaves the bounds, and those before them."""
+        """Return the windows in which a command (n,) leaves the bounds, and those before them."""
         bend, step = _changes(command)
         slack = 1.0 + 1e-9
         outside = command < bounds.low_mm - TRAVEL_SLACK_MM

@@ -271,10 +271,16 @@ def _strong(machine: Machine) -> Machine:
 def error_ranges(
     machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
 ) -> dict[str, tuple[float, float]]:
-    """Return least and largest error of the members against the nominal plants', by command.
+    """Return least and largest error of the members relative to the nominal plants', by command.
 
-    Friction, where it is known, differs from member to member too, and so does what alignment
-    took from one axis and not from the other.
+    Where friction is known it differs from member to member too, and so does the delay of one axis
+    against the other, which alignment cannot see.
+
+    Parameters
+    ----------
+    commands : dict of str to ndarray, shape (2, n)
+    rms : callable
+        From positions (2, n) to their error.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     nominal = (x.nominal, y.nominal)

@@ -103,7 +103,7 @@ class LiveDesign:
 
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:
-    """Return the filter with the limits that the machine's document gives the command."""
+    """Return the filter with these taps, shape (2, n), within the machine's command limits."""
     bounds = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
     command = machine.command
     return LiveFilter(taps, DT_S, command.velocity_mm_s, command.accel_mm_s2, np.array(bounds))

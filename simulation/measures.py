@@ -366,7 +366,7 @@ def tracking_error(y_d_mm: Array, y_mm: Array) -> Array:
 
 
 def contour_error(y_d_mm: Array, y_mm: Array, dt_s: float = 1e-3, stride: int = 1) -> Array:
-    """Return the contour error of samples 0, stride, 2 stride, ... of a whole motion."""
+    """Return contour errors of samples 0, stride, 2 stride, ... of a whole motion (2, n)."""
     meter = ContourMeter(dt_s, stride=stride)
     first = meter.push(y_d_mm, y_mm[None])
     return np.concatenate([first.error_mm[0], meter.flush().error_mm[0]])

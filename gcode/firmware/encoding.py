@@ -157,7 +157,10 @@ def as_moves(
     speed_mm_s: NDArray[np.float64],
     limits_id: NDArray[np.int32],
 ) -> Moves:
-    """Return moves for a planner; lines count from 1 and stand for nothing."""
+    """Return moves for a planner from places (n, 4), speeds (n,) and rows of a table (n,).
+
+    Their lines count from 1 and stand for nothing.
+    """
     n = len(speed_mm_s)
     zeros, none = np.zeros(n, np.int32), np.full(n, -1, np.int32)
     count = np.arange(n, dtype=np.int64)
@@ -213,7 +216,7 @@ def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float
 
 
 def to_units(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return positions in 1e-6 mm."""
+    """Return positions of any shape in 1e-6 mm."""
     return np.round(position_mm * UNITS_PER_MM).astype(np.int64)
 
 

@@ -67,7 +67,7 @@ class Frame:
     level: float = 1.0
 
     def reaction(self, f_hz: Array) -> ComplexArray:
-        """Return R."""
+        """Return R at the frequencies, shape (len(f_hz),)."""
         s = 1j * f_hz / self.f_hz
         return np.asarray(self.mass_ratio * s * s / (s * s + 2 * self.zeta * s + 1))
 

@@ -82,7 +82,7 @@ class BudgetMeasurement(Measurement):
         Parameters
         ----------
         written, sliced : MotionSamples
-        classes : ndarray of int32
+        classes : ndarray of int32, shape (len(written.moves),)
             What the errors of each of `written.moves` count for.
         """
         super().add(written)

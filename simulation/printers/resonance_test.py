@@ -52,7 +52,7 @@ class Accelerometer:
     offset_s: float = 0.0
 
     def record(self, time_s: Array, accel_mm_s2: Array, rng: np.random.Generator) -> Record:
-        """Return what it says of accelerations (3, n) at `time_s`, gravity included."""
+        """Return its record of accelerations (3, n) at times (n,), gravity included."""
         own_s = np.arange(time_s[0], time_s[-1], 1.0 / self.rate_hz)
         seen = np.stack([np.interp(own_s, time_s, row) for row in accel_mm_s2])
         seen[2] += _GRAVITY_MM_S2
