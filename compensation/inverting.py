@@ -27,7 +27,7 @@ _BLEND_S = 0.03
 _EXTRA_TERMS = 3
 """Terms that ebzpetc adds to zpetc: they bring the error of a zero at -3.7 below a fifth."""
 _LEFT, _MOST_TERMS = 1e-3, 400
-"""What the series of ts may leave of the slowest zero, and how far it may look ahead for that."""
+"""Largest remainder of the slowest zero in the series of ts, and most terms to get there."""
 
 
 def zero_phase_fir(

@@ -61,23 +61,23 @@ LADDER = (
 )
 """Designs from the most accurate to the gentlest."""
 GENTLE_RUNG = 3
-"""The last one with all functions: further down smoothness costs accuracy."""
+"""Last rung with all functions: those below it pay for smoothness with accuracy."""
 BAND_MARGIN = 1.2
-"""How far above its model's band a command may reach. Prices slope the cut-off: what is left beyond
-the band is little, and functions that end right at it would cost accuracy within."""
+"""A command may reach this many times as high as its model's band. Prices make the cut-off gradual:
+little is left beyond the band, while ending right at it would cost accuracy within."""
 
 REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
 ROBUST_CHOICE = 1.1
-"""The robust basis takes n of so many times n functions."""
+"""The robust basis chooses n functions out of this many times n."""
 WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
-"""What rings in a rest stands over the end of a line: less leaves more of it and gains no accuracy
-while extruding, 1 begins to cost some."""
+"""Ringing during a rest happens above the end of a line. A smaller weight leaves more of it without
+any gain while extruding; from 1 on, accuracy while extruding suffers."""
 _FORGOTTEN = 1e-12
-"""What is left of a vibration that no state needs to know of."""
+"""A vibration that has decayed to this share is dropped from the state."""
 _NESTED = {"ce-opt", "dct"}
-"""Bases whose functions for n are the first n of those for more."""
+"""Bases whose n functions are the first n of any larger number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -59,12 +59,12 @@ _PRICE = 0.5
 """Weight, in the ranking, of how much worse than with the shaper the worst member fares. Members
 contradict each other: to protect the least likely one would mean not to compensate the others."""
 _COARSE_UM, _LEAST_FIT = 4.0, 0.5
-"""Contour error from which on straight segments may take all of their tolerance, and the least
-share of it: on machines that are known well the segments would be the larger error."""
+"""Straight segments may use all of their tolerance from this contour error on, and at least this
+share of it below: on a well known machine they would otherwise be the larger error."""
 _FRICTION_UNSURE = 0.25
-"""Relative: of what logs say of it, on virtual printers 10 % are missed, 25 % seldom."""
+"""Relative error of friction identified from logs: often 10 % on virtual printers, seldom 25 %."""
 _LAG_UNSURE_S = 1.5e-4
-"""Of one axis against the other: alignment sets both to 0, viscous guides may delay one of them."""
+"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
 
 

@@ -14,8 +14,8 @@ from stillpath.models.machine import Machine
 __all__ = ["LengthGuard"]
 
 LOOK_AHEAD_S = 48 * 3600.0
-"""From here on the rest of the file is planned first: planning costs by the line, all else by the
-second of the print, and twenty minutes of it fit into a line."""
+"""From here on the rest of the file is planned before anything else: planning costs time per line,
+all else per second of the print, and a single line may last twenty minutes."""
 
 
 class LengthGuard:

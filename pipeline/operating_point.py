@@ -16,8 +16,8 @@ __all__ = ["Operation"]
 
 _ALL_KNOWN = 7
 _LONGEST_RETRACTION_MM = 20.0
-"""Filament that is pulled back further has left the hotend: a change of filament or tool, after
-which the firmware may load on its own, and nothing is owed to what was pulled back."""
+"""Filament pulled back further has left the hotend: a change of filament or tool, after which the
+firmware may load on its own, so that the retraction is no longer counted against extrusion."""
 
 
 class Operation:

@@ -50,10 +50,9 @@ _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
-"""Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
+"""Shares of the largest acceleration, tried in turn where a motor's speed steps by too much."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
-"""Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
-
+"""Half-width of the mean that rounds the path's corners, tried in turn where they are too sharp."""
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
 """Half-width of the smoothing of filament along the path: a multiple of the filament per mm of

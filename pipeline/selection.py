@@ -21,9 +21,9 @@ _WALLS = frozenset({Feature.OUTER_WALL, Feature.OVERHANG_WALL, Feature.THIN_WALL
 _VISIBLE = _WALLS | {Feature.TOP_SURFACE, Feature.SKIN, Feature.IRONING, Feature.BOTTOM_SURFACE}
 _CHOSEN = {"visible": _VISIBLE, "walls": _WALLS}
 _TOLERANCES_UM = (8.0, 16.0)
-"""Tried in turn where a file is too large; beyond, vertices are bound by other things."""
+"""Tried in turn where a file is too large; beyond them other limits place the vertices."""
 _WORTH_S = 0.5
-"""Less than this is not worth the lines that end a stream and begin the next one."""
+"""Shorter stretches are not worth the lines that end a stream and begin the next one."""
 
 
 class TooLarge(Exception):
@@ -63,7 +63,7 @@ class Selection:
         self._machine = machine
         self._features = _CHOSEN.get(where)
         self._counts: dict[int, bool] = {-1: True}
-        """By number of a feature whether it counts."""
+        """Whether a feature counts, by its number."""
 
     def divide(
         self, item: Piece | VerbatimPart, names: Sequence[str]

@@ -19,7 +19,7 @@ NOT_COMPENSATED = "of the extruding time is not compensated"
 """How the warning begins, after the share."""
 
 _WARN_SHARE = 0.2
-"""Of the extruding time, above which it is said that it is not compensated."""
+"""Share of the extruding time above which the report warns that it is not compensated."""
 
 
 class Totals:

@@ -9,6 +9,7 @@ lag is then followed from segment to segment.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,10 @@ from scipy.signal import butter, correlate, sosfiltfilt
 from scipy.stats import theilslopes
 
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.types import AccelerationLog
 
-__all__ = ["Match", "Signal", "band_pass", "log_signal", "match"]
+__all__ = ["Match", "Signal", "band_pass", "log_signal", "match", "read_log"]
 
 Array = NDArray[np.float64]
 
@@ -93,6 +95,27 @@ def band_pass(signal: Array, dt_s: float, low_hz: float, high_hz: float) -> Arra
     nyquist = 0.5 / dt_s
     sos = butter(3, [low_hz / nyquist, min(high_hz / nyquist, 0.95)], "band", output="sos")
     return np.asarray(sosfiltfilt(sos, signal, axis=-1))
+
+
+def read_log(path: Path, otherwise: str) -> AccelerationLog:
+    """Read raw accelerations.
+
+    Parameters
+    ----------
+    path : Path
+    otherwise : str
+        What to do instead of giving a file of another kind.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or holds something else.
+    """
+    recorded = read_measurements(path)[0]
+    if not isinstance(recorded, AccelerationLog):
+        kind = type(recorded).__name__
+        raise ModelError(f"{path.name} holds no raw accelerations but a {kind}; {otherwise}")
+    return recorded
 
 
 def log_signal(log: AccelerationLog) -> Signal:

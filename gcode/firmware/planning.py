@@ -29,13 +29,13 @@ STOPPING = frozenset({EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER})
 LONGEST_MOVE_S = 1200.0
 """A single move that takes longer is taken for a mistake; a bed that is lowered takes minutes."""
 LONGEST_PRINT_S = 3.6e6
-"""So is a print that takes longer: a small file must not keep a computer busy for days."""
+"""Longer prints are refused: a small file must not keep a computer busy for days."""
 
 _HALF = 0.501
-"""Of a step: what rounding may bring, and the last digits."""
+"""Half a step, the most that rounding changes, with room for the last digits."""
 
 _STOPS = np.array([kind in STOPPING for kind in EventKind])
-"""By the number of an event's kind."""
+"""Whether the motion rests, indexed by the number of an event's kind."""
 
 
 def stops(events: Events) -> NDArray[np.bool_]:

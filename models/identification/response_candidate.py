@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 GAIN = (1e-9, 1e9)
-"""Of any two units."""
+"""Bounds of the gain, wide enough for any two units."""
 _ROUNDS = 60
 
 

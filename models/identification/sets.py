@@ -77,14 +77,14 @@ _UNKNOWN = Origin()
 _MOST_MEMBERS = 15
 _SIGMAS = 3.0
 _NO_DIFFERENCE = 0.02
-"""Relative; at low frequency a delay and a zero beyond the band trade off by as much."""
+"""Relative difference of responses that is none: a delay and a far zero trade off by as much."""
 _BAD_MEMBER = 3.0
 _FEW_REPEATS = 1.25
-"""Two or three repeats show less scatter than there is."""
+"""Factor on the scatter of two or three repeats, which show less than there is."""
 _POINTS = 200
 _DELAYS_DIFFER_S = 0.2e-3
 _MOST_GROUNDED = 0.5
-"""Of the damping that may act against the frame, in viscous guides."""
+"""Largest share of the damping that may act against the frame (viscous guides)."""
 
 
 def response_set(

@@ -39,16 +39,16 @@ __all__ = ["AsSliced", "Choice", "choose", "ladder"]
 DAMPING = 0.1
 _LOW_MM_S2, _RATIO = 500.0, 1.2
 _LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
-"""Below `_LOW_MM_S2` walls go only if nothing else brings them within their bound."""
+"""Walls go below `_LOW_MM_S2` only if nothing else brings them within their bound."""
 _AIM = 0.95
-"""Part of a bound that the samples may use."""
+"""Share of a bound that the samples may use."""
 _POINTS, _MEMBERS = 1000, 5
-"""What frequencies are tuned with; all members decide in the end."""
+"""Points and members with which frequencies are tuned; all members decide in the end."""
 _COARSE = 6
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
 _UNLIKE = 2.0
-"""How much more or less than the whole file samples may be said to err."""
+"""Largest ratio between the samples' errors and those of the whole file, either way."""
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 

@@ -42,10 +42,10 @@ __all__ = ["STRIDE", "Measurement", "channel_names"]
 Array = NDArray[np.float64]
 
 STRIDE = 6
-"""Contour errors are measured at every sixth sample, since they change over tens of samples; the
-largest of what is written are looked for between them, too (`maxima`)."""
+"""Contour errors are measured at every sixth sample, since they change over tens of samples; maxima
+of the written motion are searched between them, too (`maxima`)."""
 _SMALL_BYTES = 200_000
-"""Of smaller files every sample is measured: there are too few for chance to even out."""
+"""Smaller files are measured at every sample: they have too few for chance to even out."""
 _TRACK_BINS = 400
 
 

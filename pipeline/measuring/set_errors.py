@@ -21,7 +21,7 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 LANDING_S = 0.05
-"""What is extruded so soon after a travel counts for the travel too, which shook the machine."""
+"""Extrusion this soon after a travel counts for the travel too, which shook the machine."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from stillpath.pipeline.result import Channel, GroupFigures
 __all__ = ["BudgetMeasurement"]
 
 _STRIDE = 24
-"""Of the errors of the set, whose plants are many."""
+"""The set has many plants: their errors are measured at every 24th sample."""
 
 
 class BudgetMeasurement(Measurement):

@@ -53,27 +53,27 @@ from stillpath.models.machine import CommandLimits, MotorLimits
 __all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 
 STEEPEST = 0.01
-"""Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
+"""Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 300_000.0
-"""The filament carries linear advance, and must not be what limits X and Y; within the 32 bits of
-Marlin's acceleration_rate."""
+"""So high that linear advance never limits X and Y, yet within the 32 bits of Marlin's
+acceleration_rate."""
 STREAM_MESH_ACCEL_MM_S2 = 20_000.0
-"""Of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
+"""Acceleration of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
 STREAM_E_JERK_MM_S = 100.0
 DEVIATION_MM = (0.01, 0.3)
-"""What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
+"""Range of M205 J (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
 
 _MOST_FEED = 3.0
-"""Filament per mm, above which the firmware takes a move for a retraction and advances none."""
+"""Filament per mm of path above which the firmware sees a retraction, without linear advance."""
 _ROOM, _DIAGONAL = 1.05, 1.5
-"""So much faster than a command may be: an axis between vertices on whole steps, and the way that
-X and Y make together."""
+"""Speeds above the command's: of one axis, since vertices lie on whole steps, and of X and Y
+together along a diagonal."""
 _CALM = 0.6
-"""Of the motors' step of speed: what makes up for lost time comes on top."""
+"""Share of the motors' permitted step of speed; making up for lost time needs the rest."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
-"""Of a line of ours with its line number, checksum and the host's share of the acknowledgement."""
+"""Length of a written line with line number, checksum and its share of the acknowledgement."""
 
 
 def stream_limits(
