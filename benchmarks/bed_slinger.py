@@ -35,7 +35,7 @@ from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
 from stillpath.pipeline.options import Options
-from stillpath.simulation.measures import Tally, distance_to_path
+from stillpath.simulation.measures import PathDistances, Tally
 
 Array = NDArray[np.float64]
 
@@ -238,7 +238,7 @@ class Judge:
             first, last = max(0, k0 - window), min(n, k1 + window)
             path, extruding = motion.path(first, last)
             at = np.flatnonzero(extruding[k0 - first : k1 - 1 - first : _EVERY]) * _EVERY
-            error = distance_to_path(path, y[:, at], at + (k0 - first), DT_S, WINDOW_S)
+            error = PathDistances(path, DT_S, WINDOW_S).at(y[:, at], at + (k0 - first))
             quarter = min(3, int(4 * printed_kg / self._print_kg))
             self._quarters[quarter].add(error)
 

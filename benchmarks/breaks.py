@@ -61,7 +61,7 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
         return 0.0
     # RepRapFirmware holds moves back by some hundredths of a ms where they come too fast: late
     # steps, which this does not count.
-    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    lasts_s = phases.lasts_s
     ends_s = phases.t_s[0] + np.cumsum(lasts_s)
     phases = replace(phases, t_s=ends_s - lasts_s)
     count = int((ends_s[-1] - ends_s[0] + lasts_s[0]) / _SAMPLE_S) + 2 * _REACH

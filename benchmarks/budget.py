@@ -15,7 +15,6 @@ much, the nozzle should be where the original is after as much.
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
+from statistics import geometric_mean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +38,14 @@ from readback import (
     Shaped,
     Timed,
     find_input,
+    one_thread_each,
     plain_copy,
     read_motion,
     shared_folder,
 )
 
 from stillpath.gcode.sampler import sample_phases
-from stillpath.gcode.types import Phases
+from stillpath.gcode.types import Phases, rows_of
 from stillpath.models.store import load_machine
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.files import default_cache_dir
@@ -106,8 +107,7 @@ def main() -> None:
     given = parser.parse_args()
 
     shared = shared_folder(given.shared)
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    one_thread_each()
     options = Options(method=given.method, robust=given.robust)
     rows: list[Row] = []
     failures = 0
@@ -147,10 +147,8 @@ def judged(task: Task) -> Row:
     own = read_motion(task.file, machine)
     best = best_shaper(task, machine, own)
     shaped = Judge(machine, members=True)
-    for section in Shaped.sections(own):
-        assert isinstance(section, Shaped)
-        section.shaper = (best.type, best.fx_hz, best.fy_hz, best.zeta)
-        shaped.add(section)
+    for shaped_section in Shaped.through(own, best.pulses):
+        shaped.add(shaped_section)
     worst_um = _worst_um(shaped)
     with tempfile.TemporaryDirectory(prefix="stillpath-budget-") as folder:
         target = Path(folder) / "out.gcode"
@@ -210,7 +208,7 @@ class Laid(Timed):
         self._reached = np.maximum.accumulate(reached)
         self._phases, self._first, self._last = written.phases, first, last
         self._begin_s = float(written.phases.t_s[first])
-        self._end_s = written.row_end_s()
+        self._end_s = written.phases.end_s
         self.samples = int(np.ceil((self._end_s[last - 1] - self._begin_s) / DT_S)) + 1
 
     @classmethod
@@ -236,10 +234,10 @@ class Laid(Timed):
         a = max(int(np.searchsorted(self._phases.t_s, t_s[0], "right")) - 1, self._first)
         b = max(int(np.searchsorted(self._phases.t_s, t_s[-1], "right")), a + 1)
         b = min(b, self._last)
-        position, row = sample_phases(_cut(self._phases, a, b), t_s)
+        position, row = sample_phases(rows_of(self._phases, slice(a, b)), t_s)
         row += a
         moving = t_s <= self._end_s[row]
-        return position, row, moving & _feeds(self._phases)[row]
+        return position, row, moving & self._phases.prints[row]
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,20 +255,9 @@ def _fed_rows(phases: Phases) -> _Fed:
         + 2.0 * phases.cruise_mm_s * phases.cruise_s
         + (phases.cruise_mm_s + phases.end_mm_s) * phases.decel_s
     )
-    row = np.flatnonzero(_feeds(phases))
+    row = np.flatnonzero(phases.prints)
     start = phases.start_mm[row]
     return _Fed(row, start, start + phases.direction[row] * length[row, None])
-
-
-def _feeds(phases: Phases) -> NDArray[np.bool_]:
-    direction = phases.direction
-    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
-    return np.asarray(moves_xy & (direction[:, 3] > 0.0))
-
-
-def _cut(phases: Phases, first: int, last: int) -> Phases:
-    names = Phases.__dataclass_fields__
-    return Phases(**{name: getattr(phases, name)[first:last] for name in names})
 
 
 def _worst_um(judge: Judge) -> float:
@@ -307,7 +294,7 @@ def print_means(rows: list[Row]) -> bool:
         return False
 
     def saved(some: list[Row]) -> float:
-        return 1.0 - math.exp(sum(math.log(row.ratio) for row in some) / len(some))
+        return 1.0 - geometric_mean(row.ratio for row in some)
 
     for what in ("machine", "file"):
         for name in sorted({getattr(row, what) for row in rows}):

@@ -35,6 +35,7 @@ from readback import (
     Timed,
     find_input,
     forced_stops,
+    one_thread_each,
     plain_copy,
     read_motion,
     shared_folder,
@@ -51,12 +52,13 @@ from stillpath.models.identification.shaper_choice import choose_shaper_of
 from stillpath.models.identification.types import AccelerationLog, Spectrum
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, ZpkSpec, plant_set
+from stillpath.models.shaper_pulses import shaper_pulses
 from stillpath.models.store import load_machine
 from stillpath.models.typed_in import typed_in
 from stillpath.pipeline.compensate import compensate_file
 from stillpath.pipeline.measuring.reference_shaper import tune_shaper
 from stillpath.pipeline.options import Options
-from stillpath.simulation.measures import distance_to_path
+from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.printers.bodies import Bodies
 from stillpath.simulation.printers.drawing import KINDS, draw
 from stillpath.simulation.printers.machines import Printer
@@ -155,8 +157,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
     shared = shared_folder(given.shared)
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    one_thread_each()
     rows: list[Row] = []
     head = f"{'printer':16}{'file':20}{'none':>7}{'recom.':>8}{'oracle':>8}{'ours':>7}{'max':>6}"
     print(f"{head}{'/recom.':>8}{'/none':>7}{'predicted':>14}  recommended", flush=True)
@@ -227,11 +228,11 @@ def judged(task: Task) -> list[Row]:
         own = read_motion(file, base)
         sections = Own.sections(own)
         none = errors_of(sections, printer, task.seconds)
-        recommended = errors_of(Both.sections_of(own, shapers), printer, task.seconds)
+        recommended = errors_of(through(own, shapers), printer, task.seconds)
         oracle = np.nan
         if task.oracle:
             oracle = errors_of(
-                Both.sections_of(own, tuned(printer, base, sections)), printer, task.seconds
+                through(own, tuned(printer, base, sections)), printer, task.seconds
             ).rms_um
         ours, predicted = recommended, (0.0, np.inf)
         if machine is not None:
@@ -308,30 +309,6 @@ def identified(
     return base.model_copy(update={"axes": axes, "name": printer.name}), shapers, ""
 
 
-class Both(Own):
-    """A file as it is, through a firmware shaper of its own for each axis."""
-
-    shapers: list[tuple[str, float]]
-
-    @classmethod
-    def sections_of(cls, motion: Motion, shapers: list[tuple[str, float]]) -> list[Both]:
-        """All sections of a file."""
-        sections = cls.sections(motion)
-        for section in sections:
-            assert isinstance(section, Both)
-            section.shapers = shapers
-        return sections  # type: ignore[return-value]
-
-    def command(self, first: int, last: int) -> Array:
-        rows = []
-        for row, (kind, f_hz) in enumerate(self.shapers):
-            one = object.__new__(Shaped)
-            one._phases, one._start_s = self._phases, self._start_s
-            one.shaper = (kind, f_hz, f_hz, 0.1)
-            rows.append(one.command(first, last)[row])
-        return np.stack(rows)
-
-
 def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Errors:
     """Let the printer execute sections, up to so many seconds in all."""
     errors, left = Errors(), round(seconds / DT_S)
@@ -345,7 +322,7 @@ def errors_of(sections: Sequence[Timed], printer: Printer, seconds: float) -> Er
         if len(at) == 0:
             continue
         y = printer.prints(section.command(0, n), DT_S)
-        errors.values.append(distance_to_path(path, y[:, at], at, DT_S, WINDOW_S))
+        errors.values.append(PathDistances(path, DT_S, WINDOW_S).at(y[:, at], at))
     return errors
 
 
@@ -381,8 +358,13 @@ def nominal_um(parts: Sequence[Timed], machine: Machine, seconds: float) -> floa
         at = np.flatnonzero(extruding[::10]) * 10
         received = DryFriction(machine.friction_mm).received_mm(part.command(0, n)[:, ::step])
         answer = response(pair, received)
-        errors.values.append(distance_to_path(path, answer[:, at], at, step * DT_S, WINDOW_S))
+        errors.values.append(PathDistances(path, step * DT_S, WINDOW_S).at(answer[:, at], at))
     return errors.rms_um
+
+
+def through(motion: Motion, shapers: Sequence[tuple[str, float]]) -> list[Shaped]:
+    """Return the sections of a file, driven through a shaper of its own for each axis."""
+    return Shaped.through(motion, [shaper_pulses(name, f_hz, 0.1) for name, f_hz in shapers])
 
 
 def tuned(printer: Printer, base: Machine, sections: Sequence[Timed]) -> list[tuple[str, float]]:

@@ -35,7 +35,6 @@ _REASONS = {
     "Slic3r": "Slic3r 1.3 estimates nothing",
     "": "no slicer's file, or it says nothing",
 }
-_BLOCK_BYTES = 1 << 17
 
 
 def marlin(facts: SlicerFacts) -> Machine:
@@ -65,10 +64,7 @@ def marlin(facts: SlicerFacts) -> Machine:
 
 def planned_s(text: bytes, machine: Machine) -> float:
     reader, planner = Interpreter(machine, strict_bounds=False), adapter(machine).planner()
-    for at in range(0, len(text), _BLOCK_BYTES):
-        for block in reader.push(text[at : at + _BLOCK_BYTES]):
-            planner.push(block)
-    for block in reader.flush():
+    for block in reader.blocks(io.BytesIO(text)):
         planner.push(block)
     planner.flush()
     return float(planner.time_s)

@@ -34,7 +34,7 @@ from stillpath.applications.identification.run import InputFile, identify_files
 from stillpath.models.identification.identify import Measured, identify
 from stillpath.models.identification.readers import excitation_for, read_measurements
 from stillpath.models.identification.shaper_choice import choose_shaper_of
-from stillpath.models.identification.spectrum_fit import explain_spectra
+from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import (
     ADXL345,
     LIS2DW,
@@ -136,7 +136,7 @@ def simulated_spectra() -> Iterator[str]:
     rng = np.random.default_rng(2)
     for truth in (TWO, _two_in_band()):
         spectrum = simulate_spectrum({"x": truth, "y": truth}, OLD, rng=rng)
-        fit = explain_spectra([spectrum], OLD).fit
+        fit = explanations([spectrum], OLD).explained().fit
         f, z = _mode_errors(fit, truth)
         modes = ", ".join(f"{m.f_hz:.2f} ({m.zeta:.4f})" for m in fit.modes)
         names = ", ".join(f"{p.f_hz:g} ({p.zeta:g})" for p in truth.poles)
@@ -153,7 +153,7 @@ def real_tables(folder: Path) -> Iterator[str]:
     for path in files:
         (spectrum,) = read_measurements(path)
         assert isinstance(spectrum, Spectrum)
-        fit = explain_spectra([spectrum], excitation_for(spectrum)).fit
+        fit = explanations([spectrum], excitation_for(spectrum)).explained().fit
         plant = continuous(fit.spec)
         dc = abs(float(np.real(plant.frequency_response(0.0)[0])) - 1)
         if plant.poles().real.max() >= 0 or dc > 1e-9 or fit.residual > 2.6 or fit.order > 4:

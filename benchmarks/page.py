@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from statistics import geometric_mean
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -185,7 +185,7 @@ def readme_figures(results: Sequence[Result]) -> str:
         for k, column in enumerate(twins.columns)
         if column.unit == "× best shaper"
     ]
-    mean = math.exp(sum(math.log(ratio) for ratio in ratios) / len(ratios))
+    mean = geometric_mean(ratios)
     worse = [ratio for ratio in ratios if ratio > 1.01]
 
     def said(row: int, head: str) -> str:

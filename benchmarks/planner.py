@@ -64,7 +64,7 @@ def main() -> None:
         golden = np.load(path)
         source = shared / "corpus" / "own" / f"{path.stem.split('__')[0]}.gcode.gz"
         motion = read_motion(source, machine_for(path.stem))
-        total = abs(float(motion.row_end_s()[-1]) - float(golden["total_time_s"]))
+        total = abs(float(motion.phases.end_s[-1]) - float(golden["total_time_s"]))
         worst, same = total, True
         print(f"{path.stem}: total time off by {total:.1e} s")
         for kind, table in zip(("xyz", "e"), tables(motion.phases), strict=True):

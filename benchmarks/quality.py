@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import math
 import os
 import sys
 import tempfile
@@ -29,6 +28,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
+from statistics import geometric_mean
 
 from readback import (
     Aligned,
@@ -38,6 +38,7 @@ from readback import (
     Shaped,
     find_input,
     forced_stops,
+    one_thread_each,
     plain_copy,
     read_motion,
     shared_folder,
@@ -126,8 +127,7 @@ def main() -> None:
     chosen |= {k: getattr(given, k) for k in ("robust", "along") if getattr(given, k) is not None}
     options = Options(**chosen)
     shared = shared_folder(given.shared)
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    one_thread_each()
     rows: list[Row] = []
     failures = 0
     began = time.monotonic()
@@ -176,9 +176,7 @@ def judged(task: Task) -> list[Row]:
     none, shaped = Judge(machine, members=False), Judge(machine, members=True)
     for section in Own.sections(own):
         none.add(section)
-    for shaped_section in Shaped.sections(own):
-        assert isinstance(shaped_section, Shaped)
-        shaped_section.shaper = (best.type, best.fx_hz, best.fy_hz, best.zeta)
+    for shaped_section in Shaped.through(own, best.pulses):
         shaped.add(shaped_section)
     rows = []
     with tempfile.TemporaryDirectory(prefix="stillpath-quality-") as folder:
@@ -333,7 +331,7 @@ def print_means(rows: list[Row]) -> None:
     for tolerance_um in sorted({row.tolerance_um for row in rows}):
         some = [row for row in rows if row.tolerance_um == tolerance_um]
         mean = {
-            name: math.exp(sum(math.log(getattr(row, name)) for row in some) / len(some))
+            name: geometric_mean(getattr(row, name) for row in some)
             for name in ("members_ratio", "ratio", "tracking_ratio")
         }
         print(

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.firmware.planning import STOPPING, intended, join_phases
 from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
@@ -26,7 +26,8 @@ from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Moves, Phases
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
-from stillpath.simulation.measures import Tally, distance_to_path
+from stillpath.models.shaper_pulses import Pulses
+from stillpath.simulation.measures import PathDistances, Tally
 from stillpath.simulation.response import PlantStream
 
 __all__ = [
@@ -73,6 +74,12 @@ def shared_folder(given: Path | None = None) -> Path | None:
     named = os.environ.get("STILLPATH_SHARED")
     folder = given or (Path(named) if named else root.parent / "shared")
     return folder if folder.is_dir() else None
+
+
+def one_thread_each() -> None:
+    """Keep processes that work side by side to one thread each; libraries read it when loaded."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 def find_input(name: str, shared: Path | None) -> Path:
@@ -127,7 +134,7 @@ class Motion:
     def stretches(self) -> tuple[Ints, Ints]:
         """First and last row of `phases` of each unbroken motion in X and Y."""
         phases = self.phases
-        xy = _moves_xy(phases)
+        xy = phases.moves_xy
         stopped = np.searchsorted(self.stops, phases.move_index, "right")
         begins = xy & np.append(True, ~xy[:-1] | (np.diff(stopped) > 0))
         begins[self.jumps()] = xy[self.jumps()]
@@ -139,11 +146,6 @@ class Motion:
         before = self.end_mm[self.phases.move_index[:-1], :2]
         away = np.max(np.abs(self.phases.start_mm[1:, :2] - before), axis=1)
         return np.flatnonzero(away > _JUMP_MM) + 1
-
-    def row_end_s(self) -> Array:
-        """When each row of `phases` ends."""
-        phases = self.phases
-        return np.asarray(phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s)
 
 
 def read_motion(path: Path, machine: Machine, forced: Sequence[int] = ()) -> Motion:
@@ -237,11 +239,11 @@ class Own(Timed):
         self._phases = _rows(motion.phases, first_row, last_row)
         self._asked = _rows(motion.asked, first_row, last_row)
         self._start_s = float(self._phases.t_s[0])
-        self._end_s = motion.row_end_s()[first_row:last_row]
+        self._end_s = motion.phases.end_s[first_row:last_row]
         self.samples = int(np.ceil((self._end_s[-1] - self._start_s) / DT_S)) + 1
 
     @classmethod
-    def sections(cls, motion: Motion) -> list[Own]:
+    def sections(cls, motion: Motion) -> list[Self]:
         """All sections of a file."""
         bounds = [0, *motion.jumps().tolist(), len(motion.phases)]
         return [cls(motion, a, b) for a, b in pairwise(bounds)]
@@ -251,7 +253,7 @@ class Own(Timed):
         phases, offset = _around(self._asked, t_s)
         position, row = sample_phases(phases, t_s)
         moving = t_s <= self._end_s[offset + row]
-        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+        return position[:2], moving & phases.moves_xy[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
@@ -259,17 +261,22 @@ class Own(Timed):
 
 
 class Shaped(Own):
-    """A file as it is, driven through the firmware's shaper."""
+    """A file as it is, driven through the firmware's shapers of X and Y."""
 
-    shaper: tuple[str, float, float, float]
+    pulses: Sequence[Pulses]
+
+    @classmethod
+    def through(cls, motion: Motion, pulses: Sequence[Pulses]) -> list[Self]:
+        """All sections of a file, driven through a shaper each for X and Y."""
+        sections = cls.sections(motion)
+        for section in sections:
+            section.pulses = pulses
+        return sections
 
     def command(self, first: int, last: int) -> Array:
-        kind, fx_hz, fy_hz, zeta = self.shaper
         reach = round(_SHAPER_REACH_S / DT_S)
         own = super().command(first - reach, last + reach)
-        pulses = [shaper_pulses(kind, f, zeta) for f in (fx_hz, fy_hz)]
-        rows = [shape(row, DT_S, p) for row, p in zip(own, pulses, strict=True)]
-        return np.stack(rows)[:, reach:-reach]
+        return shape_xy(own, DT_S, self.pulses)[:, reach:-reach]
 
 
 class Aligned(Timed):
@@ -283,7 +290,7 @@ class Aligned(Timed):
     def __init__(self, original: Motion, written: Motion) -> None:
         self._path, self._written = original.asked, written.phases
         self.original_rows, self.written_rows = _match(original, written)
-        ends = original.row_end_s()
+        ends = original.phases.end_s
         self._from_s = self._path.t_s[self.original_rows[0]]
         self._until_s = ends[self.original_rows[1]]
         self._begin_s = written.phases.t_s[self.written_rows[0]]
@@ -296,7 +303,7 @@ class Aligned(Timed):
         jumps = written.jumps()
         if len(jumps) != len(original.jumps()):
             raise ReadBackError("the written file loses its position elsewhere")
-        ends = written.row_end_s()
+        ends = written.phases.end_s
         bounds = [0, *jumps.tolist(), len(written.phases)]
         parts = []
         for a, b in pairwise(bounds):
@@ -323,7 +330,7 @@ class Aligned(Timed):
         wanted_s = np.maximum.accumulate(wanted_s)
         phases, _ = _around(self._path, wanted_s)
         position, row = sample_phases(phases, wanted_s)
-        return position[:2], moving & _moves_xy(phases)[row] & (phases.direction[row, 3] > 0.0)
+        return position[:2], moving & phases.moves_xy[row] & (phases.direction[row, 3] > 0.0)
 
     def command(self, first: int, last: int) -> Array:
         t_s: Array = self._start_s + DT_S * np.arange(first, last, dtype=np.float64)
@@ -382,7 +389,7 @@ class Judge:
             miss = y - path[:, k0 - a : k1 - a]
             self.tracking.add(np.hypot(miss[0], miss[1]), use)
             at = np.flatnonzero(use[::_CONTOUR_EVERY]) * _CONTOUR_EVERY
-            error = distance_to_path(path, y[:, at], at + (k0 - a), DT_S, WINDOW_S)
+            error = PathDistances(path, DT_S, WINDOW_S).at(y[:, at], at + (k0 - a))
             if len(at) and error.max() > self.contour.max:
                 self.worst_s = DT_S * (k0 + int(at[np.argmax(error)]))
             self.contour.add(error)
@@ -392,7 +399,7 @@ class Judge:
             for stream, tally in zip(members, self.members, strict=True):
                 y = stream.push(u)
                 index = at + (k0 - a) // every
-                tally.add(distance_to_path(path, y[:, at], index, every * DT_S, WINDOW_S))
+                tally.add(PathDistances(path, every * DT_S, WINDOW_S).at(y[:, at], index))
 
     def _stepped(self, u: Array) -> Array:
         """Command as the motors stand: on whole steps, where the firmware plans in steps."""
@@ -447,10 +454,6 @@ def _next_match(places: Array, wanted: Array, start: int) -> int | None:
 def _same(places: Array, wanted: Array) -> Mask:
     gap = np.abs(places - wanted)
     return np.asarray(np.all(gap[:, :3] < _SAME_MM, axis=1) & (gap[:, 3] < _SAME_E_MM))
-
-
-def _moves_xy(phases: Phases) -> Mask:
-    return np.asarray((phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0))
 
 
 def _around(phases: Phases, t_s: Array) -> tuple[Phases, int]:

@@ -25,13 +25,13 @@ from readback import DT_S, Own, find_input, plain_copy, read_motion, shared_fold
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.registry import compensator
-from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import Mode, ModesSpec, ParametricMembers, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion
 from stillpath.models.store import load_machine
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
-from stillpath.simulation.measures import distance_to_path, tracking_error
+from stillpath.simulation.measures import PathDistances, tracking_error
 from stillpath.simulation.response import response
 
 Array = NDArray[np.float64]
@@ -204,15 +204,14 @@ class Trial:
         contour, tracking = [], []
         for pair in self.members:
             y = response(pair, command)
-            contour.append(_rms(distance_to_path(path, y[:, self._index], self._index, DT)))
+            contour.append(_rms(PathDistances(path, DT).at(y[:, self._index], self._index)))
             tracking.append(_rms(tracking_error(path, y)[use]))
         return Errors(1e3 * np.array(contour), 1e3 * np.array(tracking))
 
     def shaped(self, kind: str, i: int, j: int) -> Array:
         """Return the command of a shaper with frequency number i on X and j on Y."""
         pulses = [shaper_pulses(kind, float(FREQUENCIES_HZ[k]), _ZETA) for k in (i, j)]
-        rows = zip(self._motion.position_mm, pulses, strict=True)
-        return np.stack([shape(row, DT, p) for row, p in rows])
+        return shape_xy(self._motion.position_mm, DT, pulses)
 
     def shaper_rms(self, kind: str, points: int) -> Callable[[int, int], Array]:
         """Return a function of two frequency numbers: contour rms [um], about `points` points."""
@@ -231,7 +230,7 @@ class Trial:
             if (i, j) not in found:
                 pairs = zip(axis(0, i), axis(1, j), strict=True)
                 found[i, j] = 1e3 * np.array(
-                    [_rms(distance_to_path(path, np.stack(pair), index, DT)) for pair in pairs]
+                    [_rms(PathDistances(path, DT).at(np.stack(pair), index)) for pair in pairs]
                 )
             return found[i, j]
 

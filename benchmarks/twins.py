@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import sys
 import tempfile
@@ -21,6 +20,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
+from statistics import geometric_mean
 
 from builtin_machines import TABLES
 from quality import FILES, Task, best_shaper
@@ -31,6 +31,7 @@ from readback import (
     Shaped,
     find_input,
     forced_stops,
+    one_thread_each,
     plain_copy,
     read_motion,
     shared_folder,
@@ -97,8 +98,7 @@ def main() -> int:
     shared = shared_folder(given.shared)
     if shared is None:
         sys.exit("the folder of shared data is not there; see --shared")
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
+    one_thread_each()
     options = Options(robust=given.robust, tolerance_um=given.tolerance_um)
     machines = {name: load_machine(MACHINES[name]) for name in given.machines}
     if given.identified:
@@ -124,7 +124,7 @@ def main() -> int:
                         flush=True,
                     )
     worst = max(row.to_shaper for row in rows)
-    mean = math.exp(sum(math.log(row.to_shaper) for row in rows) / len(rows))
+    mean = geometric_mean(row.to_shaper for row in rows)
     nothing = max(row.to_none for row in rows)
     missed = 0
     for what, value, limit in (
@@ -171,9 +171,7 @@ def judged(
         none, shaped, ours = (Judge(truth, members=False) for _ in range(3))
         for section in Own.sections(own):
             none.add(section)
-        for shaped_section in Shaped.sections(own):
-            assert isinstance(shaped_section, Shaped)
-            shaped_section.shaper = (best.type, best.fx_hz, best.fy_hz, best.zeta)
+        for shaped_section in Shaped.through(own, best.pulses):
             shaped.add(shaped_section)
         for part in Aligned(original, written).sections(original, written):
             ours.add(part)

@@ -168,7 +168,7 @@ def _options(file: Path | None, given: dict[str, Any]) -> ControllerOptions:
             raise typer.BadParameter(f"{file}: a JSON object of settings is needed")
     document |= given
     if "method" not in document:
-        raise typer.BadParameter(f"--method is missing; there is {', '.join(METHODS)}")
+        raise typer.BadParameter(f"--method is missing; there are {', '.join(METHODS)}")
     return read_options(document)
 
 

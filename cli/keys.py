@@ -52,7 +52,7 @@ def create(
     known = [each.value for each in Scope]
     for wanted in scope or ():
         if wanted not in known:
-            raise ModelError(f"there is no scope {wanted!r}; there is {', '.join(known)}")
+            raise ModelError(f"there is no scope {wanted!r}; there are {', '.join(known)}")
     scopes = [Scope(wanted) for wanted in scope or ("read", "submit")]
     expires_at = None if days is None else time.time() + days * 86400
     with _opened(data_dir) as engine:

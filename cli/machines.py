@@ -415,8 +415,9 @@ def from_m503(
     """Make a machine from Marlin's M503: limits and steps, with plants still to be measured."""
     from stillpath.applications.machines import marlin_settings
     from stillpath.applications.machines.revision import source_file
+    from stillpath.models.user_files import read_bytes
 
-    content = _m503(file)
+    content = read_bytes(file, _LARGEST_LOG_BYTES, "keep M503's answer only")
     machine = marlin_settings.machine_from_m503(
         content.decode(errors="replace"),
         file.name,
@@ -460,15 +461,6 @@ def _leading(revision: Revision, axis: Any) -> str:
 
     mode = leading(revision.machine.axes[axis].nominal)
     return "" if mode is None else f"{mode[0]:.1f}"
-
-
-def _m503(file: Path) -> bytes:
-    try:
-        if file.stat().st_size > _LARGEST_LOG_BYTES:
-            raise ModelError(f"{file}: over {_LARGEST_LOG_BYTES} bytes; keep M503's answer only")
-        return file.read_bytes()
-    except OSError as error:
-        raise ModelError(f"cannot read {file}: {error.strerror}") from None
 
 
 def _print_revision(revision: Revision) -> None:

@@ -54,7 +54,7 @@ def trajectories(
     """Write planned, commanded and simulated motion with the errors, 1000 rows a second."""
     chosen = form or ("npz" if output.suffix == ".npz" else "csv")
     if chosen not in ("csv", "npz"):
-        raise typer.BadParameter(f"--format {form}: there is csv and npz")
+        raise typer.BadParameter(f"--format {form}: choose csv or npz")
     check_input(source)
     target = check_output(output)
     if target.exists() and target.samefile(source):
@@ -96,7 +96,7 @@ def plan(
     check_input(source)
     target = check_output(output)
     if target == source.resolve():
-        raise Refused("OUT must not be IN: the motion is no G-code")
+        raise Refused("OUT must not be IN: the motion is not G-code")
     read_as = chosen_options(dialect=dialect).dialect
     found = open_machines().for_job(machine, files=True)
 

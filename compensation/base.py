@@ -32,7 +32,7 @@ class Compensator(Protocol):
     tail_s: float
 
     def reset(self, position_mm: NDArray[np.float64]) -> None:
-        """Take the machine to stand still at `position_mm`, shape (2,)."""
+        """Assume that the machine stands still at `position_mm`, shape (2,)."""
         ...
 
     def observe(self, command_mm: NDArray[np.float64]) -> None:

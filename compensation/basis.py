@@ -263,7 +263,7 @@ def spread_functions(nominal: Array, spread_gram: Array, r: int = 0) -> tuple[Ar
 
 
 def orthonormal(functions: Array) -> Array:
-    """Return the functions orthonormalised in their order, signs fixed."""
+    """Return functions, shape (m, n), orthonormalised in their order, signs fixed."""
     q, _ = np.linalg.qr(functions)
     return _signed(np.asarray(q, np.float64))
 

@@ -1,10 +1,9 @@
-"""Filtered basis functions with some of a shaper's smoothing: for plants known only so far.
+"""Filtered basis functions blended with a shaper, for plants that are only partly known.
 
 Where the members of a set disagree, inverting the plant that lies in the middle makes the others
 worse; a shaper, which is symmetric and only smooths, does little good and little harm to any. Plant
 and command are linear, so the error of a mixture of both commands is the mixture of their errors,
-member by member: how much to take of each is a question with a number for an answer
-(`pipeline.caution`).
+member by member, and the best mixture can be computed (`pipeline.caution`).
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class CautiousFbf:
     Raises
     ------
     DesignError
-        For shares outside 0 to 1, or a shaper that there is not.
+        For shares outside 0 to 1, or an unknown shaper.
     """
 
     name = "fbf"
@@ -87,7 +86,7 @@ class CautiousFbf:
         return self._inner.rungs
 
     def reset(self, position_mm: Array) -> None:
-        """Take the machine to stand still at `position_mm` (2,)."""
+        """Assume that the machine stands still at `position_mm` (2,)."""
         self._inner.reset(position_mm)
 
     def observe(self, command_mm: Array) -> None:

@@ -45,8 +45,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 ROBUST = ("off", "ensemble", "minimax")
-"""The nominal plant; least squares over the set with its weights; with weights that balance the
-members' errors."""
+"""off: the nominal plant; ensemble: weighted least squares over the set; minimax: the same with
+weights that balance the members' errors."""
 
 ACCEL_RATIO = 1.4
 """An axis may ask for at most this multiple of the planned path's own peak acceleration; X and Y
@@ -54,10 +54,10 @@ together then stay below twice of it."""
 RMS_RATIO = 1.5
 """The same for the rms acceleration, as long as that costs no functions."""
 _BOUNDED_SHARE = 0.2
-"""Solve windows again within bounds if so few leave them; otherwise take a gentler design."""
+"""Windows outside the bounds are solved again if they are fewer; else a gentler design is taken."""
 _BOUNDED_ROUNDS = 4
 _REACH_S, _STRIDE = 0.03, 7
-"""Of the distance of an answer from the path: how far along, and at which samples."""
+"""The nearest point of the path is looked for within this time, at every 7th sample."""
 
 
 class PreviewFbf:
@@ -150,7 +150,7 @@ class PreviewFbf:
         self._axes = [PreviewAxis(axis, one) for axis, one in zip(("x", "y"), made, strict=True)]
 
     def reset(self, position_mm: Array) -> None:
-        """Take the machine to stand still at `position_mm` (2,)."""
+        """Assume that the machine stands still at `position_mm` (2,)."""
         for axis, position in zip(self._axes, position_mm, strict=True):
             axis.reset(float(position))
 

@@ -1,7 +1,7 @@
 """Compensation of dry friction, laid over a compensator of vibration.
 
-What the axes shall receive is w; with the command w + c s(w) they do (`models.friction`). The turns
-of s are rounded, symmetrically: what a motor cannot follow is not asked of it.
+The axes should receive w, and with the command w + c s(w) they do (`models.friction`). The
+reversals of s are rounded symmetrically, so that the motors can follow.
 """
 
 from __future__ import annotations

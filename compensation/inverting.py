@@ -27,7 +27,7 @@ _BLEND_S = 0.03
 _EXTRA_TERMS = 3
 """Terms that ebzpetc adds to zpetc: they bring the error of a zero at -3.7 below a fifth."""
 _LEFT, _MOST_TERMS = 1e-3, 400
-"""What the series of ts may leave of the slowest zero, and how far it may look ahead for that."""
+"""Largest remainder of the slowest zero in the series of ts, and most terms to get there."""
 
 
 def zero_phase_fir(
@@ -94,8 +94,6 @@ class InversionCompensator(Memoryless):
             for design in self.filters
         ]
         self._blend = max(2, round(_BLEND_S / dt_s))
-        self.cutoffs_hz: tuple[float, float] = (self._ladder[0], self._ladder[0])
-        """What the last run used for X and Y."""
 
     def compensate(
         self,
@@ -104,26 +102,18 @@ class InversionCompensator(Memoryless):
         rests: NDArray[np.int64],
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
-        rows, used = [], []
-        for axis, y_d in enumerate(y_d_mm):
-            row, cutoff_hz = self._within_limits(axis, y_d, rests)
-            rows.append(row)
-            used.append(cutoff_hz)
-        self.cutoffs_hz = (used[0], used[1])
-        return np.stack(rows)
+        return np.stack([self._within_limits(i, y_d, rests) for i, y_d in enumerate(y_d_mm)])
 
-    def _within_limits(
-        self, axis: int, y_d: Array, rests: NDArray[np.int64]
-    ) -> tuple[Array, float]:
+    def _within_limits(self, axis: int, y_d: Array, rests: NDArray[np.int64]) -> Array:
         dt, limits = self._dt_s, self._limits[axis]
         accel = speed = 0.0
-        for cutoff_hz, fir in zip(self._ladder, self._firs[axis], strict=True):
+        for fir in self._firs[axis]:
             u = self.filters[axis].apply(y_d, fir)
             u = stand_still(np.stack([u, u]), np.stack([y_d, y_d]), rests, self._blend)[0]
             speed = float(np.abs(np.diff(u)).max(initial=0.0)) / dt
             accel = float(np.abs(np.diff(u, 2)).max(initial=0.0)) / dt**2
             if speed <= limits.velocity_mm_s and accel <= limits.accel_mm_s2:
-                return u, cutoff_hz
+                return np.asarray(u)
         raise DesignError(
             f"{self.name}, axis {'xy'[axis]}: even with a low-pass at {self._ladder[-1]:.0f} Hz "
             f"the command needs {speed:.0f} mm/s and {accel:.0f} mm/s2 (limits "

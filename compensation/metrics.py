@@ -1,4 +1,4 @@
-"""How good a lifted controller is for paths one knows nothing about (paper 003, 2.5 to 4.4).
+"""How good a lifted controller is when nothing is known about the path (paper 003, 2.5 to 4.4).
 
 Frobenius norms of the error and of the controller, divided by the root of the number of samples:
 expected rms error and command for white noise of rms 1. For smooth paths they order designs and
@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 def error_metric(plant: LiftedOperator, controller: Array) -> float:
-    """Return J_e = |I - G C|_F / sqrt(rows) (2.18)."""
+    """Return J_e = |I - G C|_F / sqrt(rows) (2.18); C has the shape (inputs, rows)."""
     error = np.eye(plant.shape[0]) - plant.apply(controller)
     return float(np.linalg.norm(error) / np.sqrt(plant.shape[0]))
 
@@ -44,7 +44,7 @@ def error_of_functions(n: int, samples: int) -> float:
 
 
 def effort_metric(controller: Array) -> float:
-    """Return J_c = |C|_F / sqrt(columns of C) (3.4)."""
+    """Return J_c = |C|_F / sqrt(samples) (3.4), C of shape (inputs, samples)."""
     return float(np.linalg.norm(controller) / np.sqrt(controller.shape[1]))
 
 
@@ -72,7 +72,10 @@ def effort_of_ce_opt(singular_values: ArrayLike, n: int) -> float:
 
 
 def robust_error_metric(members: LiftedSet, controller: Array) -> float:
-    """Return J_e,r = sqrt(sum_j l_j |I - G_j C|_F^2 / rows) (4.2), without the single plants."""
+    """Return J_e,r = sqrt(sum_j l_j |I - G_j C|_F^2 / rows) (4.2), C of shape (inputs, rows).
+
+    Computed from the Gram matrices of the set, without the single plants.
+    """
     rows = len(members.mean)
     cross = float(np.sum(members.mean * controller.T))
     square = float(np.sum(controller * (members.gram @ controller)))

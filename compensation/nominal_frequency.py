@@ -146,7 +146,7 @@ class FrequencyNominal:
         """
         if self.ahead_share > limit:
             raise DesignError(
-                f"G_r is no stable causal filter: {self.ahead_share:.2%} of its response lies "
+                f"G_r is not a stable causal filter: {self.ahead_share:.2%} of its response lies "
                 f"ahead of time, limit {limit:.2%}. Take it two-sided (operator), or delay it "
                 f"(delayed) by {self.needed_delay(limit)} samples and the path with it"
             )

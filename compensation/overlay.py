@@ -1,4 +1,4 @@
-"""What is laid over a compensator of vibration: ripple, friction."""
+"""Base of the compensators that are laid over another one: ripple, friction."""
 
 from __future__ import annotations
 

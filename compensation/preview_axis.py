@@ -61,23 +61,23 @@ LADDER = (
 )
 """Designs from the most accurate to the gentlest."""
 GENTLE_RUNG = 3
-"""The last one with all functions: further down smoothness costs accuracy."""
+"""Last rung with all functions: those below it pay for smoothness with accuracy."""
 BAND_MARGIN = 1.2
-"""How far above its model's band a command may reach. Prices slope the cut-off: what is left beyond
-the band is little, and functions that end right at it would cost accuracy within."""
+"""A command may reach this many times as high as its model's band. Prices make the cut-off gradual:
+little is left beyond the band, while ending right at it would cost accuracy within."""
 
 REST_FUNCTIONS = 64
 """Most functions (per 300 samples) in windows that hold a rest, which are solved one by one."""
 ROBUST_CHOICE = 1.1
-"""The robust basis takes n of so many times n functions."""
+"""The robust basis chooses n functions out of this many times n."""
 WEIGHT_TRAVEL = 0.2
 WEIGHT_REST = 0.5
-"""What rings in a rest stands over the end of a line: less leaves more of it and gains no accuracy
-while extruding, 1 begins to cost some."""
+"""Ringing during a rest happens above the end of a line. A smaller weight leaves more of it without
+any gain while extruding; from 1 on, accuracy while extruding suffers."""
 _FORGOTTEN = 1e-12
-"""What is left of a vibration that no state needs to know of."""
+"""A vibration that has decayed to this share is dropped from the state."""
 _NESTED = {"ce-opt", "dct"}
-"""Bases whose functions for n are the first n of those for more."""
+"""Bases whose n functions are the first n of any larger number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,13 +271,13 @@ class PreviewAxis:
         self.reset(0.0)
 
     def reset(self, position: float) -> None:
-        """Take the axis to stand still at `position`."""
+        """Assume that the axis stands still at `position`."""
         # States are kept relative to `origin`: the digits belong to the vibration.
         self._origin = position
         self._states = np.zeros(sum(p.order for p in self._plants))
 
     def observe(self, command: Array) -> None:
-        """Let the axis follow a command that was not ours, up to the sample after its last."""
+        """Let the axis follow a command (n,) made elsewhere, up to the sample after its last."""
         if len(command) == 0:
             return
         origin = float(command[-1])
@@ -295,13 +295,13 @@ class PreviewAxis:
         self._made = None
 
     def commit_as(self, command: Array) -> None:
-        """Take a command as executed that was made of the last one."""
+        """Take a command (n,) as executed that was made of the last one."""
         self.observe(command)
         self.rung = self.next_rung
         self._made = None
 
     def answer(self, member: int, command: Array) -> Array:
-        """Return what a member of the set does with the command of a piece."""
+        """Return the positions (n,) with which a member of the set answers a command (n,)."""
         first = sum(p.order for p in self._plants[:member])
         p = self._plants[member]
         self._move_origin(float(command[0]))
@@ -310,7 +310,7 @@ class PreviewAxis:
         return y
 
     def windows_outside(self, bounds: Bounds, command: Array) -> set[int]:
-        """Windows whose command leaves the bounds, and those before them."""
+        """Return the windows in which a command (n,) leaves the bounds, and those before them."""
         bend, step = _changes(command)
         slack = 1.0 + 1e-9
         outside = command < bounds.low_mm - TRAVEL_SLACK_MM

@@ -42,11 +42,11 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _STEPS = (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125)
-"""Budgets of a wave's acceleration, in parts of the machine's limit."""
+"""Acceleration that a wave may take, as shares of the machine's limit, tried in turn."""
 _BAND = (0.30, 0.45)
-"""Frequencies, times the sampling time, between which a wave fades away."""
+"""A wave fades out between these frequencies (times the sampling time)."""
 _CUTOFF = 0.2
-"""Of the output side's low-pass, times the sampling time; it goes with the root of the budget."""
+"""Cut-off of the output side's low-pass (times the sampling time), ~ the root of the budget."""
 _BLEND_S = 0.02
 _MOST_STEPS, _CLOSE_MM = 20, 1e-12
 _SLOWEST_ZERO = 0.97
@@ -191,7 +191,7 @@ class RippleCompensator(Overlay):
         ]
         self._blend = max(2, round(_BLEND_S / dt_s))
         self._least_mm_s2 = self.budget_mm_s2 = machine.command.accel_mm_s2
-        """Of the last piece, for the acceleration of a wave; 0: no room, the ripple stays."""
+        """Budget for a wave's acceleration in the last piece; 0: no room, the ripple stays."""
 
     def compensate(
         self, y_d_mm: Array, extruding: NDArray[np.bool_], rests: NDArray[np.int64]

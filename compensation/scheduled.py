@@ -24,13 +24,13 @@ __all__ = ["BLEND_STEP", "DESIGN_STEP", "REMEMBERED_S", "ScheduledCompensator"]
 Array = NDArray[np.float64]
 
 DESIGN_STEP = 0.02
-"""Ratio, minus 1, of a resonance from one design to the next in mass and height."""
+"""Relative change of a resonance between neighbouring designs in mass and height."""
 BLEND_STEP = 0.02
-"""The same in x and y. The blend of two neighbours is off by the square of their difference."""
+"""The same in x and y, where neighbours are blended: the error is the square of the difference."""
 REMEMBERED_S = 4.0
-"""How much of the past a compensator is shown when it takes over."""
+"""Length of the past that a compensator is run through before it takes over."""
 _ROOM = 0.98
-"""Blends of designs that exhaust the machine's limits would exceed them a little."""
+"""Share of the limits for each design: blends of designs exceed the limits of either a little."""
 
 
 class ScheduledCompensator:
@@ -64,7 +64,7 @@ class ScheduledCompensator:
         self._made: dict[OperatingPoint, Compensator] = {}
         self._share = 1.0
         self._knowing: set[OperatingPoint] = set()
-        """Points whose compensators know the state of the machine."""
+        """Points whose compensators have followed the machine's state so far."""
         self._past = np.zeros((2, 1))
         self._last: Array | None = None
         self._used: tuple[OperatingPoint, ...] = ()
@@ -75,7 +75,7 @@ class ScheduledCompensator:
         self.name = self._made[self._points[0]].name
 
     def reset(self, position_mm: Array) -> None:
-        """Take the machine to stand still at `position_mm` (2,)."""
+        """Assume that the machine stands still at `position_mm` (2,)."""
         self._past = np.array(position_mm, float)[:, None]
         for point in self._knowing:
             self._made[point].reset(position_mm)

@@ -6,6 +6,8 @@ delays make the vibrations of the copies cancel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +20,7 @@ from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.shaper_pulses import SHAPERS, Pulses
 
-__all__ = ["SHAPERS", "ShaperCompensator", "shape", "shaper_pulses"]
+__all__ = ["SHAPERS", "ShaperCompensator", "shape", "shape_xy", "shaper_pulses"]
 
 Array = NDArray[np.float64]
 
@@ -75,6 +77,11 @@ def shape(
     return out
 
 
+def shape_xy(command_mm: Array, dt_s: float, pulses: Sequence[Pulses]) -> Array:
+    """Apply to X and Y, shape (2, n), the shaper of each; see `shape`."""
+    return np.stack([shape(row, dt_s, own) for row, own in zip(command_mm, pulses, strict=True)])
+
+
 class ShaperCompensator(Memoryless):
     """A firmware shaper applied to the plan, so that any firmware can use it.
 
@@ -115,9 +122,7 @@ class ShaperCompensator(Memoryless):
         rests: NDArray[np.int64],
     ) -> Array:
         """See `compensation.base.Compensator.compensate`."""
-        shaped = np.stack(
-            [shape(row, self._dt_s, p) for row, p in zip(y_d_mm, self.pulses, strict=True)]
-        )
+        shaped = shape_xy(y_d_mm, self._dt_s, self.pulses)
         return stand_still(shaped, y_d_mm, rests, self._blend)
 
 

@@ -37,7 +37,7 @@ Choice = tuple[int, frozenset[int]]
 
 ROUNDS = 4
 RELAXATION = 1.6
-"""Beyond the new targets; 2 would be the edge of stability."""
+"""Over-relaxation towards the new targets; 2 would be the edge of stability."""
 REACH_S = 0.008
 _BOUNDED_ROUNDS = 12
 _WEIGHT_ROUNDS = 8

@@ -14,6 +14,7 @@ from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import Limits, ModalState, Phases, rows_of
 from stillpath.models.machine import Machine
+from stillpath.models.runs import runs
 
 __all__ = ["divided", "sections"]
 
@@ -35,7 +36,7 @@ def sections(piece: Piece) -> list[tuple[int, int]]:
     phases = piece.phases
     # By line of the file: an arc is many moves, some of which feed less than a step.
     starts = np.flatnonzero(np.diff(piece.moves.byte_start, prepend=-1))
-    moves_xy = np.logical_or.reduceat(np.any(phases.direction[:, :2] != 0.0, axis=1), starts)
+    moves_xy = np.logical_or.reduceat(phases.moves_xy, starts)
     feeds = np.logical_or.reduceat(phases.direction[:, 3] > 0.0, starts)
     slow = (feeds[1:] != feeds[:-1]) & (phases.end_mm_s[starts[1:] - 1] <= _SLOW_MM_S)
     edges = np.flatnonzero((moves_xy[1:] != moves_xy[:-1]) | slow) + 1
@@ -63,10 +64,9 @@ def divided(piece: Piece, wanted: NDArray[np.bool_], machine: Machine) -> Iterat
         yield piece
         return
     rows = sections(piece)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], wanted, [False]]).astype(np.int8)))
     moves = piece.moves
     done = 0
-    for first, stop in edges.reshape(-1, 2).tolist():
+    for first, stop in runs(wanted):
         start, end = rows[first][0], rows[stop - 1][1]
         if start > done:
             yield _left_out(piece, done, start)

@@ -3,7 +3,7 @@
 A galvo has no planner: it draws every G1 at its F, and between lines it jumps and waits until the
 mirrors have settled. Words as laser senders and slicers write them: G0 G1 X Y F, motion modal, M3
 or M4 and M5 with a power S for the beam, or, in files without those, an extruder that moves on. Z
-is not looked at.
+is ignored.
 """
 
 from __future__ import annotations

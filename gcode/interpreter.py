@@ -9,6 +9,8 @@ and after them the event that stops the machine.
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +34,7 @@ __all__ = ["Interpreter", "interpret_bytes"]
 _BOM = b"\xef\xbb\xbf"
 _BOM_16 = (b"\xff\xfe", b"\xfe\xff")
 _PAD = b"\n" * PADDING
-_CHUNK = 1 << 20
+_BLOCK_BYTES, _CHUNK = 1 << 17, 1 << 20
 _LONGEST_LINE = 1 << 24
 _LONGEST_COMMAND = 65_536
 _FEWEST_ROWS, _MOST_ROWS = 1024, 32_768
@@ -140,6 +142,12 @@ class Interpreter:
         text = b"".join((*self._carry, _PAD))
         self._carry, self._carried = [], 0
         return self._read(text) if len(text) > PADDING else []
+
+    def blocks(self, file: BinaryIO) -> Iterator[ProgramBlock]:
+        """Read a file from its present position to its end; errors are those of `push`."""
+        while data := file.read(_BLOCK_BYTES):
+            yield from self.push(data)
+        yield from self.flush()
 
     def snapshot(self) -> Interpreter:
         """Return an interpreter that goes on from here, whatever this one reads next."""

@@ -92,9 +92,8 @@ def move_classes(moves: Moves, first_layer: FirstLayer = FirstLayer()) -> Ints:
         The feature's id for what extrudes, `TRAVEL`, or `AS_SLICED`.
     """
     way = moves.end_mm - moves.start_mm
-    xy = (way[:, 0] != 0.0) | (way[:, 1] != 0.0)
     classes = np.where(way[:, 3] > 0.0, moves.feature, TRAVEL)
-    kept = ~xy | (way[:, 3] < 0.0) | first_layer.has(moves)
+    kept = ~moves.moves_xy | (way[:, 3] < 0.0) | first_layer.has(moves)
     return np.where(kept, AS_SLICED, classes).astype(np.int32)
 
 

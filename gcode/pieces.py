@@ -16,13 +16,14 @@ from stillpath.gcode.types import (
     ModalState,
     Moves,
     Phases,
+    TextLines,
 )
 
 __all__ = ["LeftOut", "Piece", "VerbatimPart"]
 
 
 @dataclass(frozen=True, slots=True)
-class VerbatimPart:
+class VerbatimPart(TextLines):
     """Lines of the file in order, to stay as sliced.
 
     Attributes
@@ -56,10 +57,6 @@ class VerbatimPart:
     def first_line(self) -> int:
         """Number of its first line in the file, from 1; it must hold one."""
         return min(int(rows.line[0]) for rows in (self.moves, self.events) if len(rows))
-
-    def line_text(self, byte_start: int, byte_end: int) -> bytes:
-        """Return the bytes of a line by its absolute offsets."""
-        return self.text[byte_start - self.text_offset : byte_end - self.text_offset]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode import _sample_kernels as kernels
-from stillpath.gcode.types import Phases
+from stillpath.gcode.types import Phases, joined
 
 __all__ = ["Sampler", "Samples", "distances", "sample_phases", "sample_until"]
 
@@ -177,18 +177,18 @@ class Sampler:
     def push(self, phases: Phases) -> Iterator[Samples]:
         """Take the next phases; yield the samples up to the end of the last of them."""
         if len(phases):
-            known = phases if self._last is None else _join(self._last, phases)
+            known = phases if self._last is None else joined([self._last, phases])
             self._last = _tail(phases)
             # A sample that falls on the end belongs to what comes next.
-            yield from self._sample(known, math.ceil(_end_s(phases) / self.dt_s))
+            yield from self._sample(known, math.ceil(phases.end_s[-1] / self.dt_s))
 
     def flush(self) -> Iterator[Samples]:
         """Yield the rest: the last sample stands at the end of the last phase."""
         if self._last is not None:
-            yield from self._sample(self._last, math.ceil(_end_s(self._last) / self.dt_s) + 1)
+            yield from self._sample(self._last, math.ceil(self._last.end_s[-1] / self.dt_s) + 1)
 
     def _sample(self, phases: Phases, stop: int) -> Iterator[Samples]:
-        end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+        end_s = phases.end_s
         while self._next < stop:
             n = min(stop - self._next, _MOST)
             position, moving = np.empty((4, n)), np.empty(n, np.bool_)
@@ -240,19 +240,6 @@ def _check(phases: Phases) -> None:
         raise ValueError("nothing to sample: there are no phases")
 
 
-def _end_s(phases: Phases) -> float:
-    return float(phases.t_s[-1] + phases.accel_s[-1] + phases.cruise_s[-1] + phases.decel_s[-1])
-
-
 def _tail(phases: Phases) -> Phases:
     """Copy the last phase."""
     return Phases(*(getattr(phases, name)[-1:].copy() for name in Phases.__dataclass_fields__))
-
-
-def _join(first: Phases, second: Phases) -> Phases:
-    return Phases(
-        *(
-            np.concatenate((getattr(first, name), getattr(second, name)))
-            for name in Phases.__dataclass_fields__
-        )
-    )

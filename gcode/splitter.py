@@ -24,13 +24,13 @@ from stillpath.gcode.types import (
     Moves,
     Phases,
     ProgramBlock,
+    joined,
     rows_of,
 )
 from stillpath.models.machine import Machine
 
 __all__ = ["Splitter", "excerpt"]
 
-T = TypeVar("T", Moves, Events, Phases)
 S = TypeVar("S", Moves, Events)
 R = TypeVar("R")
 
@@ -109,8 +109,8 @@ class Splitter:
             self._text, self._text_offset = block.text, block.text_offset
             return
         local = _shifted(local, len(self._moves))
-        self._moves = _joined(self._moves, moves)
-        self._events = _joined(self._events, local)
+        self._moves = joined([self._moves, moves])
+        self._events = joined([self._events, local])
         self._raw = np.concatenate([self._raw, raw])
         # A block's text covers its lines and may begin before the end of what we hold.
         held = self._text_offset + len(self._text)
@@ -171,8 +171,7 @@ class Splitter:
     def _raw_moves(self, block: ProgramBlock, events: Events) -> NDArray[np.bool_]:
         """Mark moves of X or Y that must keep their lines, and all that bring back a state."""
         moves = block.moves
-        travel = moves.end_mm - moves.start_mm
-        xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+        travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
         # Our lines name places; where Z is not known, a line that moves it cannot be one of them.
         needed = np.where(travel[:, 2] != 0.0, 7, 3)
         raw = xy & (((moves.known & needed) != needed) | ((moves.known & KEPT) != 0))
@@ -203,8 +202,7 @@ class Splitter:
         while self._moves is not None and self._events is not None:
             moves, events = self._moves, self._events
             count = len(moves)
-            travel = moves.end_mm - moves.start_mm
-            xy = (travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)
+            travel, xy = moves.end_mm - moves.start_mm, moves.moves_xy
             ours = np.flatnonzero(xy & ~self._raw) if self._compensate else np.zeros(0, np.int64)
             if len(ours) == 0:
                 yield self._take(None)
@@ -228,14 +226,13 @@ class Splitter:
                 # A move of no length has no plan; leave its neighbourhood as it is.
                 self._raw[:last] |= xy[:last]
                 continue
-            slow = phases.accel_s + phases.cruise_s + phases.decel_s > self._longest_s
+            slow = phases.lasts_s > self._longest_s
             if np.any(slow & xy[:last]):
                 # Slower under the limits in force than their F says.
                 lines = moves.line[:last]
                 self._raw[:last] |= xy[:last] & np.isin(lines, lines[slow])
                 continue
-            total = _end_s(phases)
-            if total <= self._longest_s:
+            if phases.end_s[-1] <= self._longest_s:
                 if not closed:
                     return
                 yield self._piece(last, phases)
@@ -358,11 +355,7 @@ def _finds_height(block: ProgramBlock) -> NDArray[np.bool_]:
     known = (moves.known & 4) != 0
     found = ~known & np.append(known[1:], False)
     if len(known) and not known[-1]:
-        first, end = (
-            moves.byte_start[-1] - block.text_offset,
-            moves.byte_end[-1] - block.text_offset,
-        )
-        found[-1] = b"Z" in block.text[first:end].split(b";", 1)[0].upper()
+        found[-1] = b"Z" in block.line(moves, -1).split(b";", 1)[0].upper()
     return np.asarray(found)
 
 
@@ -372,10 +365,8 @@ def _place_to_cut(moves: Moves, phases: Phases, longest_s: float) -> tuple[int, 
     The best place is a rest before filament is fed again (nothing oozes there), then any
     extruder-only move, then a Z move, then the slowest corner of the last ten seconds.
     """
-    direction = phases.direction
-    xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
+    direction, xy, end_s = phases.direction, phases.moves_xy, phases.end_s
     only_e = ~xy & (direction[:, 2] == 0.0)
-    end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
     inside = end_s <= longest_s
     follows = np.zeros(len(xy), dtype=bool)
     follows[:-1] = xy[:-1] & ~xy[1:]
@@ -407,20 +398,6 @@ def _shortest_s(moves: Moves) -> NDArray[np.float64]:
     length = np.sqrt(np.sum(travel[:, :3] ** 2, axis=1))
     length = np.where(length > 0.0, length, np.abs(travel[:, 3]))
     return np.asarray(length / moves.speed_mm_s)
-
-
-def _end_s(phases: Phases) -> float:
-    last = rows_of(phases, slice(-1, None))
-    return float((last.t_s + last.accel_s + last.cruise_s + last.decel_s)[0])
-
-
-def _joined(first: T, second: T) -> T:
-    return type(first)(
-        **{
-            f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
-            for f in fields(first)
-        }
-    )
 
 
 def _numbered(ids: NDArray[np.int32]) -> tuple[list[int], NDArray[np.int32]]:

@@ -39,7 +39,7 @@ __all__ = ["MachineState", "Names", "Retraction", "Saved", "nobody"]
 _MEMOS = 8192
 _FIRST_ROWS = 256
 _MOST_ROWS = 4096
-"""Of a table; beyond it the rows are forgotten as soon as nobody needs them."""
+"""Rows of a table; a longer one forgets its rows as soon as nobody needs them."""
 _LAYERS = 1024
 
 
@@ -384,7 +384,7 @@ class Names:
 
 def nobody(command: Command) -> int:
     """Carry out commands while nothing is read: there are none."""
-    raise RuntimeError(f"nobody carries out {command.name}")
+    raise RuntimeError(f"no handler for {command.name}")
 
 
 def _set_arcs(f: NDArray[np.float64], firmware: FirmwareFacts) -> None:

@@ -1,8 +1,8 @@
 """From planned moves to the sampled path of a piece, with its rests laid on the sampling grid.
 
 A *piece* is a row of planned moves that starts and ends at rest. Inside it, moves of X and Y form
-*stretches*; between them lie *rests*, moves of the extruder or of Z alone, which leave the file as
-they came while X and Y stand still. How long a rest takes is decided by the limits under which the
+*stretches*; between them lie *rests*, moves of the extruder or of Z alone, which are written
+unchanged while X and Y stand still. How long a rest takes is decided by the limits under which the
 written file will run, not by the original ones, so the rests' durations are an input here and the
 stretches move in time. A rest starts on the sampling grid; a stretch starts where its rest ends.
 """
@@ -75,7 +75,7 @@ class Timeline:
 
 def group_rows(phases: Phases) -> list[Group]:
     """Split the rows of a piece into stretches and rests, in order."""
-    moves_xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
+    moves_xy = phases.moves_xy
     edges = np.flatnonzero(np.diff(moves_xy)) + 1
     bounds = [0, *edges.tolist(), len(moves_xy)]
     return [
@@ -119,12 +119,11 @@ def build_timeline(
     end_s : float
         Standing time after the last group, at most which the command may take to settle.
     """
-    duration = phases.accel_s + phases.cruise_s + phases.decel_s
+    duration = phases.lasts_s
     start, end, row_start, rests = _laid(groups, duration, rest_s, dt_s, lead_s, tail_s)
     samples = int(np.ceil(end[-1] / dt_s - _GRID_EPS)) + 1 + round(end_s / dt_s)
     moved = replace(phases, t_s=row_start)
-    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
-    until = np.where(xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
+    until = np.where(phases.moves_xy, row_start + duration + _GRID_EPS * dt_s, -np.inf)
     position, row, moving = sample_until(moved, (0.0, dt_s, samples), until)
     return Timeline(
         dt_s=dt_s,

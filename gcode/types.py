@@ -6,7 +6,7 @@ thousand rows. Byte offsets count from the start of the file, line numbers from 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Self, TypeVar, cast
@@ -24,6 +24,8 @@ __all__ = [
     "Moves",
     "Phases",
     "ProgramBlock",
+    "TextLines",
+    "joined",
     "rows_of",
 ]
 
@@ -133,6 +135,16 @@ class Moves:
     def __len__(self) -> int:
         return len(self.line)
 
+    @property
+    def moves_xy(self) -> NDArray[np.bool_]:
+        """Which moves change X or Y, shape (n,)."""
+        return _moves_xy(self.end_mm - self.start_mm)
+
+    @property
+    def prints(self) -> NDArray[np.bool_]:
+        """Which moves feed filament forward while X or Y moves, shape (n,)."""
+        return _prints(self.end_mm - self.start_mm)
+
 
 @dataclass(frozen=True, slots=True)
 class Events:
@@ -164,8 +176,21 @@ class Events:
         return len(self.line)
 
 
+class TextLines:
+    """Base of what holds moves and events with the text that they come from."""
+
+    __slots__ = ()
+    text: bytes
+    text_offset: int
+
+    def line(self, rows: Moves | Events, row: int) -> bytes:
+        """Return the line of a move or an event, with its end."""
+        begin, end = int(rows.byte_start[row]), int(rows.byte_end[row])
+        return self.text[begin - self.text_offset : end - self.text_offset]
+
+
 @dataclass(frozen=True, slots=True)
-class ProgramBlock:
+class ProgramBlock(TextLines):
     """One block of an interpreted file.
 
     `limits` and `modal` are the interpreter's tables. They only grow, and blocks share them, until
@@ -224,12 +249,41 @@ class Phases:
         return len(self.t_s)
 
     @property
+    def lasts_s(self) -> NDArray[np.float64]:
+        """Duration of each move, shape (n,)."""
+        return np.asarray(self.accel_s + self.cruise_s + self.decel_s)
+
+    @property
+    def end_s(self) -> NDArray[np.float64]:
+        """When each move ends, shape (n,)."""
+        return np.asarray(self.t_s + self.accel_s + self.cruise_s + self.decel_s)
+
+    @property
     def duration_s(self) -> float:
         """From the first move's start to the last one's end."""
         if len(self) == 0:
             return 0.0
         last_s = self.accel_s[-1] + self.cruise_s[-1] + self.decel_s[-1]
         return float(self.t_s[-1] + last_s - self.t_s[0])
+
+    @property
+    def moves_xy(self) -> NDArray[np.bool_]:
+        """Which moves change X or Y, shape (n,)."""
+        return _moves_xy(self.direction)
+
+    @property
+    def prints(self) -> NDArray[np.bool_]:
+        """Which moves feed filament forward while X or Y moves, shape (n,)."""
+        return _prints(self.direction)
+
+
+def _moves_xy(travel: NDArray[np.float64]) -> NDArray[np.bool_]:
+    # Faster than np.any along the short axis.
+    return np.asarray((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0))
+
+
+def _prints(travel: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(_moves_xy(travel) & (travel[:, 3] > 0.0))
 
 
 _Table = TypeVar("_Table", Moves, Events, Phases)
@@ -238,3 +292,12 @@ _Table = TypeVar("_Table", Moves, Events, Phases)
 def rows_of(table: _Table, rows: slice) -> _Table:
     """Return some rows of a table."""
     return type(table)(**{f.name: getattr(table, f.name)[rows] for f in fields(table)})
+
+
+def joined(tables: Sequence[_Table]) -> _Table:
+    """Return one table with the rows of all, in order; at least one must be given."""
+    first = tables[0]
+    if len(tables) == 1:
+        return first
+    names = [f.name for f in fields(first)]
+    return type(first)(**{n: np.concatenate([getattr(t, n) for t in tables]) for n in names})

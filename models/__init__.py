@@ -1,1 +1,1 @@
-"""What a machine is and how it moves: documents, plants, motion. Depends on nothing of ours."""
+"""What a machine is and how it moves: documents, plants, motion. Depends on no other layer."""

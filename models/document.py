@@ -12,10 +12,10 @@ _LEAST, _MOST = 1e-100, 1e100
 
 
 def _size(number: float) -> float:
-    """Refuse what is no size of anything: its square would be 0 or infinite, and so would times."""
+    """Refuse numbers whose squares, or times computed from them, would be 0 or infinite."""
     if not _LEAST <= number <= _MOST:
         raise ValueError(
-            f"{number:g} is no size of anything: give something between {_LEAST:g} and {_MOST:g}"
+            f"{number:g} is not a plausible size: give something between {_LEAST:g} and {_MOST:g}"
         )
     return number
 

@@ -123,7 +123,7 @@ class ContinuousPlant(_StateSpace):
 
     def discretise(self, dt_s: float) -> DiscretePlant:
         """Return the first-order-hold equivalent, exact for commands linear between samples."""
-        from scipy.linalg import expm  # slow to import, and checking a document needs it not
+        from scipy.linalg import expm  # slow to import, not needed to check a document
 
         n = self.order
         if n == 0:

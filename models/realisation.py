@@ -45,7 +45,7 @@ def balanced(a: Matrix, b: Matrix, c: Matrix, d: float, *, discrete: bool) -> Sy
     Diagonal balancing: equal diagonals of both Gramians. Unlike a full balancing it needs no
     inverse, and so it survives zeros that almost cancel poles.
     """
-    # Slow to import, and checking a document needs it not.
+    # Slow to import, and not needed to check a document.
     from scipy.linalg import solve_discrete_lyapunov
 
     if len(b) == 0:

@@ -41,7 +41,7 @@ class Roots:
 def dc_gain(
     zeros: NDArray[np.complex128], poles: NDArray[np.complex128], dt_s: float | None
 ) -> float:
-    """Return prod(v0 - zeros) / prod(v0 - poles) with v0 = 0 (in s) or 1 (in z)."""
+    """Return prod(v0 - zeros) / prod(v0 - poles), v0 = 0 of roots in s (no `dt_s`), 1 in z."""
     at = 0.0 if dt_s is None else 1.0
     if np.any(poles == at):
         raise ModelError(
@@ -138,7 +138,7 @@ def scaled_roots(roots: Roots, frequency: float, damping: float) -> Roots:
 
 
 def frequency_and_damping(roots: NDArray[np.complex128], dt_s: float | None) -> NDArray[np.float64]:
-    """Return rows (f_hz, zeta) of the complex pairs, rising in frequency."""
+    """Return the rows (f_hz, zeta) of the complex pairs, shape (pairs, 2), rising in frequency."""
     s, has = to_s(roots, dt_s)
     s = s[has & (roots.imag > 0)]
     size = np.abs(s)

@@ -16,12 +16,12 @@ T = TypeVar("T", bound=np.generic)
 
 BLOCK = 1024
 _ALL_BITS = 6
-"""Of a long print, every second block after the first 64 tells enough, every fourth after the
-first 128, and so on; each counts for all that it stands for."""
+"""Long prints are thinned out: every second block after the first 64, every fourth after the
+first 128, and so on; each is weighted by the number of blocks it represents."""
 _TOGETHER = 16
-"""Blocks are transformed so many at a time, as to prepare for it takes longer than a block."""
+"""Blocks transformed at a time: setting a transform up costs more than one block."""
 NOTABLE_UM = 1.0
-"""Less than this beyond the band is not worth a word."""
+"""Motion beyond the band is reported from this size on."""
 
 
 class BandContent:
@@ -43,7 +43,7 @@ class BandContent:
         self._power = np.zeros((2, BLOCK // 2 + 1))
         self._seen = self._blocks = 0
         self._accel = np.zeros((_TOGETHER, 2, BLOCK))
-        """Of the blocks still to be transformed, and how many each of them stands for."""
+        """Blocks still to be transformed, and (below) the number of blocks each represents."""
         self._weights: list[int] = []
         self._limited = any(
             axis.band_hz or (axis.provenance and axis.provenance.trust_below_hz)

@@ -1,19 +1,17 @@
 """Blend fbf with a shaper so that no likely plant does worse: what `robust=auto` decides.
 
-On the plants that explain the measurement a file shall print no worse than with the shaper that the
-same measurement leads to. Before anything is printed, both commands are tried on the reference
-motion, all members answer, and the mixture is taken that is best for the likely ones without being
-bad for any; what the worst of them pays is kept with the choice.
+For every plant that explains the measurement, a file should print no worse than with the shaper
+that the same measurement leads to. Both commands are therefore tried on the reference motion with
+all members of the set, and the mixture is chosen that is best for the likely members without being
+bad for any. How much worse the worst member fares is stored with the choice.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +27,7 @@ from stillpath.models.machine import CommandLimits, Machine
 from stillpath.models.plants import DiscretePlant, PlantSetSpec, plant_set
 from stillpath.models.reference_motion import reference_motion_of
 from stillpath.models.typed_in import stated_hz
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.result import Channel
@@ -58,17 +56,17 @@ Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 _VERSION = 9
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
-"""Most where the phase was not measured: what a set does not hold, it cannot warn of."""
+"""Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
 _PRICE = 0.5
-"""Of a member that fares worse than with the shaper, by how much it does: members contradict each
-other, and to please the least likely one would mean to leave the others alone."""
+"""Weight, in the ranking, of how much worse than with the shaper the worst member fares. Members
+contradict each other: to protect the least likely one would mean not to compensate the others."""
 _COARSE_UM, _LEAST_FIT = 4.0, 0.5
-"""Contour error from which on straight segments may take all of their tolerance, and the least
-share of it: on machines that are known well the segments would be the larger error."""
+"""Straight segments may use all of their tolerance from this contour error on, and at least this
+share of it below: on a well known machine they would otherwise be the larger error."""
 _FRICTION_UNSURE = 0.25
-"""Relative: of what logs say of it, on virtual printers 10 % are missed, 25 % seldom."""
+"""Relative error of friction identified from logs: often 10 % on virtual printers, seldom 25 %."""
 _LAG_UNSURE_S = 1.5e-4
-"""Of one axis against the other: alignment sets both to 0, viscous guides may delay one of them."""
+"""Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
 _NO_RESTS = np.zeros((0, 2), np.int64)
 
@@ -114,9 +112,7 @@ class Choice:
         """Return a channel of a report with the range over the members."""
         if channel.name not in self.ranges:
             return channel
-        rms_um = channel.selected_rms_um
-        rms_um = channel.extruding.contour_rms_um if rms_um is None else rms_um
-        low, high = (rms_um * s for s in self.ranges[channel.name])
+        low, high = (channel.judged_rms_um * s for s in self.ranges[channel.name])
         return channel.model_copy(update={"contour_range_um": (low, high)})
 
 
@@ -194,30 +190,31 @@ def prediction_note(machine: Machine, choice: Choice) -> str:
 def choose_caution(
     machine: Machine, shaper: BestShaper, directory: Path, dt_s: float, basis: str = DEFAULT_BASIS
 ) -> tuple[Caution, Choice]:
-    """Choose how much of the compensation a machine bears; found once per machine revision.
+    """Choose the mixture of compensation and shaper for a machine, once per machine revision.
 
     Parameters
     ----------
+    machine : Machine
     shaper : BestShaper
         What the nominal plants lead to.
     directory : Path
         Where the choice is kept.
+    dt_s : float
+        Sampling time of the commands.
+    basis : str
+        A key of `compensation.basis.BASES`.
     """
     path = directory / f"caution-{machine.revision}-{basis}-v{_VERSION}.json"
-    choice: Choice | None = None
-    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        found = json.loads(path.read_text(encoding="utf-8"))
-        ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
-        choice = Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
-    if choice is None:
-        choice = _tried(machine, shaper, dt_s, basis)
-        directory.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary:
-            temporary.write_text(json.dumps(asdict(choice)), encoding="utf-8")
+    choice = kept(path, _read, lambda: _tried(machine, shaper, dt_s, basis))
     return (
         Caution(choice.shares, shaper.type, shaper.fx_hz, shaper.fy_hz, choice.fit_share),
         choice,
     )
+
+
+def _read(found: dict[str, Any]) -> Choice:
+    ranges = {name: (low, high) for name, (low, high) in found["ranges"].items()}
+    return Choice(**{**found, "shares": tuple(found["shares"]), "ranges": ranges})
 
 
 def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Choice:
@@ -295,10 +292,10 @@ def _commands(
 
 
 def _strong(machine: Machine) -> Machine:
-    """Return the machine with motors that bear what most do.
+    """Return the machine with at least the default limits of the command.
 
-    How far its plants are known is asked here; what its motors bear, every piece of a print is
-    asked by itself (`compensation.cautious`).
+    The choice depends on how well the plants are known. What the motors allow is checked for every
+    piece of a print (`compensation.cautious`).
     """
     usual, own = CommandLimits(), machine.command
     command = usual.model_copy(
@@ -313,10 +310,16 @@ def _strong(machine: Machine) -> Machine:
 def error_ranges(
     machine: Machine, commands: dict[str, Array], rms: Callable[[Array], float], dt_s: float
 ) -> dict[str, tuple[float, float]]:
-    """Return least and largest error of the members against the nominal plants', by command.
+    """Return least and largest error of the members relative to the nominal plants', by command.
 
-    Friction, where it is known, differs from member to member too, and so does what alignment
-    took from one axis and not from the other.
+    Where friction is known it differs from member to member too, and so does the delay of one axis
+    against the other, which alignment cannot see.
+
+    Parameters
+    ----------
+    commands : dict of str to ndarray, shape (2, n)
+    rms : callable
+        From positions (2, n) to their error.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
     nominal = (x.nominal, y.nominal)
@@ -336,7 +339,7 @@ def error_ranges(
 
 
 def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
-    """Return what dry friction leaves of a command, so many times of what was measured."""
+    """Return what dry friction leaves of a command; `share` scales the measured friction."""
     return DryFriction([share * held for held in machine.friction_mm]).received_mm(command)
 
 
@@ -350,12 +353,12 @@ def _delayed(y: Array, samples: float) -> Array:
 
 
 def _rank(choice: Choice) -> float:
-    """Order choices: what they reach on the likely members, and what the worst one pays for it."""
+    """Rank choices, the best lowest: the mean over likely members, and the worst one's excess."""
     return choice.mean + _PRICE * max(0.0, choice.worst - 1.0)
 
 
 def most_share(axis: PlantSetSpec) -> float:
-    """Return the largest share of a compensation that an axis bears beside a shaper's."""
+    """Return the largest share of compensation in the mixture for an axis; the rest is shaper."""
     if stated_hz(axis) is not None:
         return 0.0
     return _UNSEEN_SHARE if _unseen(axis) else 1.0

@@ -1,4 +1,4 @@
-"""Tables with a row a sample, written as they come: NumPy's npz, or CSV."""
+"""Tables with one row per sample, written as they come: NumPy's npz, or CSV."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Table(Protocol):
 
 @contextlib.contextmanager
 def npz_table(target: Path, types: Mapping[str, str]) -> Iterator[Table]:
-    """Yield a table that becomes an npz file of one array a column, whole or not at all.
+    """Yield a table that becomes an npz file of one array per column, whole or not at all.
 
     Parameters
     ----------

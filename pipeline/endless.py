@@ -1,4 +1,4 @@
-"""Prints that would never end are refused before hours are spent on what comes before that."""
+"""Refuse prints that would take impossibly long, before hours are spent on compensating them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from stillpath.models.machine import Machine
 __all__ = ["LengthGuard"]
 
 LOOK_AHEAD_S = 48 * 3600.0
-"""From here on the rest of the file is planned first: planning costs by the line, all else by the
-second of the print, and twenty minutes of it fit into a line."""
-_BLOCK_BYTES = 1 << 17
+"""From here on the rest of the file is planned before anything else: planning costs time per line,
+all else per second of the print, and a single line may last twenty minutes."""
 
 
 class LengthGuard:
@@ -36,7 +35,7 @@ class LengthGuard:
         self._looked = False
 
     def check(self, time_s: float, line: int) -> None:
-        """Say that up to and with `line` the print takes so long, before anything is made of it.
+        """Check the print time up to and including `line`, before these lines are processed.
 
         Raises
         ------
@@ -55,14 +54,10 @@ class LengthGuard:
         planner = adapter(self._machine).planner()
         line = 1
         self._text.seek(0)
-        while True:
-            data = self._text.read(_BLOCK_BYTES)
-            for block in reader.push(data) if data else reader.flush():
-                planner.push(block)
-                rows: Moves | Events = block.moves if len(block.moves) else block.events
-                line = int(rows.line[-1]) if len(rows) else line
-                check_print_ends(planner.time_s, line)
-            if not data:
-                break
+        for block in reader.blocks(self._text):
+            planner.push(block)
+            rows: Moves | Events = block.moves if len(block.moves) else block.events
+            line = int(rows.line[-1]) if len(rows) else line
+            check_print_ends(planner.time_s, line)
         planner.flush()
         check_print_ends(planner.time_s, line)

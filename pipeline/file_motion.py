@@ -19,7 +19,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.sampler import Sampler, Samples
 from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.gcode.types import EventKind, Moves, Phases, ProgramBlock, rows_of
+from stillpath.gcode.types import EventKind, Moves, Phases, ProgramBlock, joined, rows_of
 from stillpath.models.machine import Machine
 from stillpath.models.shaping import OFF, Shaping
 from stillpath.pipeline.endless import LengthGuard
@@ -31,7 +31,6 @@ __all__ = ["STANDING_S", "FileMotion", "MotionPart", "TextMotion"]
 
 STANDING_S = 2.0
 """How long a stand is measured: all vibration has died down after that."""
-_BLOCK_BYTES = 1 << 17
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,17 +57,14 @@ class MotionPart:
     def motion(self) -> MotionSamples:
         """Return the samples with line, layer and feature."""
         row = self.samples.move_index - self.first_move
-        moves = self.moves
-        travel = moves.end_mm - moves.start_mm
-        feeds = ((travel[:, 0] != 0.0) | (travel[:, 1] != 0.0)) & (travel[:, 3] > 0.0)
         executed_mm = self.samples.xyz_mm[:2]
         return MotionSamples(
             path_mm=executed_mm if self.path_mm is None else self.path_mm,
             executed_mm=executed_mm,
             z_mm=self.samples.xyz_mm[2],
-            extruding=feeds[row] & self.samples.moving,
+            extruding=self.moves.prints[row] & self.samples.moving,
             row=row,
-            moves=moves,
+            moves=self.moves,
             first_move=self.first_move,
             sliced_mm=None if self.path_mm is None else executed_mm,
         )
@@ -144,20 +140,15 @@ class TextMotion:
         guard = LengthGuard(file, self._machine, self._dialect)
         size = max(file.seek(0, io.SEEK_END), 1)
         file.seek(0)
-        while True:
-            data = file.read(_BLOCK_BYTES)
-            for block in self.reader.push(data) if data else self.reader.flush():
-                moves += len(block.moves)
-                self._each(block)
-                self._hold(block)
-                phases = planner.push(block)
-                self._check(phases, planner.time_s, guard.check)
-                for samples, path_mm in self._sampled(self._shortened(phases), final=False):
-                    yield from self._parts(samples, path_mm)
-            self.time_s = planner.time_s
-            self._progress(file.tell() / size, self.time_s)
-            if not data:
-                break
+        for block in self.reader.blocks(file):
+            moves += len(block.moves)
+            self._each(block)
+            self._hold(block)
+            phases = planner.push(block)
+            self._check(phases, planner.time_s, guard.check)
+            for samples, path_mm in self._sampled(self._shortened(phases), final=False):
+                yield from self._parts(samples, path_mm)
+            self._progress(file.tell() / size, planner.time_s)
         phases = planner.flush()
         self._check(phases, planner.time_s, check_print_ends)
         for samples, path_mm in self._sampled(self._shortened(phases), final=True):
@@ -176,10 +167,10 @@ class TextMotion:
             self._set_shaper(block, row)
 
     def _set_shaper(self, block: ProgramBlock, row: int) -> None:
-        events, offset = block.events, block.text_offset
-        line = block.text[int(events.byte_start[row]) - offset : int(events.byte_end[row]) - offset]
+        events = block.events
+        line = block.line(events, row).decode("utf-8", "replace")
         try:
-            found = self._adviser.read_shaper(line.decode("utf-8", "replace"), self._read_shaping)
+            found = self._adviser.read_shaper(line, self._read_shaping)
         except ValueError:
             return
         self._read_shaping = found
@@ -208,7 +199,7 @@ class TextMotion:
         """Leave out what the machine stands longer than it must."""
         if len(phases) == 0 or np.isinf(self._longest_stand_s):
             return phases
-        end_s = phases.t_s + phases.accel_s + phases.cruise_s + phases.decel_s
+        end_s = phases.end_s
         stands_s = phases.t_s - np.append(self._end_s, end_s[:-1])
         left_out_s = np.cumsum(np.maximum(stands_s - self._longest_stand_s, 0.0)) + self._left_out_s
         self._left_out_s, self._end_s = float(left_out_s[-1]), float(end_s[-1])
@@ -223,7 +214,7 @@ class TextMotion:
                 yield samples, None
             return
         if len(phases):
-            moves, first = _joined([m for _, m in self._held]), self._held[0][0]
+            moves, first = joined([m for _, m in self._held]), self._held[0][0]
             numbered = replace(phases, move_index=phases.move_index - first)
             asked = intended(numbered, moves.start_mm, moves.end_mm, self._step_mm)
         else:
@@ -261,7 +252,7 @@ class TextMotion:
         first = int(samples.move_index[0])
         while len(self._held) > 1 and self._held[1][0] <= first:
             self._held.pop(0)
-        moves = _joined([m for _, m in self._held])
+        moves = joined([m for _, m in self._held])
         return MotionPart(samples, path_mm, moves, self._held[0][0], jumped, self._shaping)
 
 
@@ -313,10 +304,3 @@ def _all(sampler: Sampler, phases: Phases, *, final: bool) -> Iterator[Samples]:
     yield from sampler.push(phases)
     if final:
         yield from sampler.flush()
-
-
-def _joined(parts: list[Moves]) -> Moves:
-    if len(parts) == 1:
-        return parts[0]
-    names = Moves.__dataclass_fields__
-    return Moves(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})

@@ -1,4 +1,4 @@
-"""Opens all that a file is rewritten with, and puts the new one in place when it is complete."""
+"""Open the files that a rewrite needs, and put the new file in place when it is complete."""
 
 from __future__ import annotations
 

@@ -1,17 +1,22 @@
-"""Files that are written whole or not at all, and where kept things lie."""
+"""Files that are written whole or not at all, and what is kept between jobs."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
 import secrets
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, TypeVar
 
-__all__ = ["Discarding", "default_cache_dir", "replacing"]
+__all__ = ["Discarding", "default_cache_dir", "kept", "replacing"]
+
+T = TypeVar("T")
 
 _NAME_PART = 40
 """Characters of a name that its temporary file carries on; names have at most 255 bytes."""
@@ -39,7 +44,7 @@ def replacing(target: Path) -> Iterator[Path]:
         be replaced by a file.
     """
     if target.exists() and not target.is_file():
-        raise OSError(errno.EINVAL, "is no regular file; name one to write", str(target))
+        raise OSError(errno.EINVAL, "is not a regular file; name one to write", str(target))
     handle = _open_unnamed(target.parent)
     temporary = _named(target) if handle is None else _path_of(handle)
     try:
@@ -94,6 +99,35 @@ def _link(handle: int, target: Path) -> Path:
     # With a folder's handle, which an absolute path does not use, Python follows links.
     os.link(_path_of(handle), name, src_dir_fd=handle, follow_symlinks=True)
     return name
+
+
+def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
+    """Return what a JSON file keeps; what is missing or cannot be read is made and written.
+
+    Parameters
+    ----------
+    path : Path
+        Written whole or not at all; its folder is made if it does not exist.
+    read : callable
+        Turns the JSON document into the value; raises ValueError, TypeError or KeyError if it
+        cannot.
+    make : callable
+        Makes the value, a dataclass of numbers, texts and arrays.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        return read(json.loads(path.read_text(encoding="utf-8")))
+    made = make()
+    document: Any = asdict(made)  # type: ignore[call-overload]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        text = json.dumps(document, default=lambda array: array.tolist())
+        temporary.write_text(text, encoding="utf-8")
+    return made
 
 
 def default_cache_dir() -> Path:

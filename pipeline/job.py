@@ -61,7 +61,7 @@ from stillpath.pipeline.result import PutBack, Result, StageTime
 from stillpath.pipeline.selection import Selection, TooLarge
 from stillpath.pipeline.summary import Summary
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import feeding, plan_verbatim, switching_s, takes_s
+from stillpath.pipeline.verbatim import plan_verbatim, switching_s, takes_s
 from stillpath.pipeline.verifying import Verifier
 
 if TYPE_CHECKING:
@@ -70,9 +70,9 @@ if TYPE_CHECKING:
 __all__ = ["Attempt", "Job"]
 
 _SAID = (Unfit, GcodeError, DesignError, ModelError)
-"""What says of itself why a piece cannot be compensated."""
+"""Errors whose message says why a piece cannot be compensated."""
 _FAULTS = (*_SAID, ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
-"""With those of our own: a piece that meets one stays as sliced, and the others are printed."""
+"""These and errors of ours: the piece concerned stays as sliced, the others are compensated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +87,25 @@ class Attempt:
 
 
 class Job:
-    """State of one file on its way.
+    """One run of the pipeline over one file.
 
-    What is written waits in the target for its times: `retiming` knows how to copy it.
+    What is written waits in `target` until its times are known; `retiming` then copies it.
+
+    Parameters
+    ----------
+    source, target : binary files
+        Plain G-code, seekable; the target is read again at the end.
+    order : Order
+    layers : LayerWriter, optional
+    trace : callable, optional
+        Is given the motion as it is measured.
+    budget : SpeedBudget, optional
+        Paces chosen by an earlier run; None: they are chosen here, if the options have a budget.
+
+    Attributes
+    ----------
+    compensated : list of (int, int)
+        First and last line of every compensated piece, in order.
     """
 
     def __init__(
@@ -186,11 +202,11 @@ class Job:
 
     @property
     def delay_s(self) -> float:
-        """How much later than the original the written file is where the pipeline has come to."""
+        """How much later than the original the written file is at the current place."""
         return self._sum.time_s - self._sum.original_s
 
     def run(self, name: str, facts: SlicerFacts) -> Result:
-        """Write the file, but for its times, and return what it measures.
+        """Write the file except for its times, and return the figures measured on it.
 
         Raises
         ------
@@ -362,8 +378,7 @@ class Job:
     def _put_back(self, piece: Piece, seconds: float, reason: str) -> None:
         """Let a piece stay as sliced."""
         phases = piece.phases
-        row_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        extruding_s = float(np.sum(row_s[feeding(phases)]))
+        extruding_s = float(np.sum(phases.lasts_s[phases.prints]))
         self._sum.put_back.append(
             PutBack(
                 line_first=int(piece.moves.line[0]),

@@ -1,25 +1,23 @@
-"""The filter of a machine for print time: which one, and what its set says of it.
+"""Choose a machine's filter for live printing, and predict its errors over the plant set.
 
-Filters of several bandwidths, each with some of the best shaper's smoothing, are tried on the
-reference motion. Taken is the best for the likely members among those that are for no member worse
-than the shaper; the shaper itself is always among them, for a shaper is such a filter too.
+Filters of several bandwidths, each mixed with some of the best shaper, are tried on the reference
+motion. Of those that are no worse than the shaper for any member, the one that is best for the
+likely members is taken. The shaper is such a filter too, and always among the candidates.
 """
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.base import DesignError
 from stillpath.compensation.live_filter import LiveFilter, design_taps, exact_moments, shaper_taps
-from stillpath.compensation.shapers import shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import plant_set
 from stillpath.models.reference_motion import reference_motion_of
@@ -30,7 +28,7 @@ from stillpath.pipeline.caution import (
     most_share,
     pair_weights,
 )
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import kept
 from stillpath.pipeline.measuring.reference_shaper import BestShaper, cached_shaper
 from stillpath.pipeline.result import Channel
 from stillpath.simulation.measures import PathDistances
@@ -49,8 +47,8 @@ _REACHES = (80, 160)
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _STRIDE, _NOTHING = 5, 1e-12
 _AS_GOOD, _AS_SHARP = 1.05, 1.02
-"""The shortest filter that is as good as that, and of this length that with the least bandwidth
-that is as good as this: it asks for less acceleration."""
+"""Ratios to the least error. The shortest filter within the first is taken, and of that length the
+one with the least bandwidth within the second: it asks for less acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +103,7 @@ class LiveDesign:
 
 
 def live_filter(machine: Machine, taps: Array) -> LiveFilter:
-    """Return the filter with the limits that the machine's document gives the command."""
+    """Return the filter with these taps, shape (2, n), within the machine's command limits."""
     bounds = [(machine.travel[a].min_mm, machine.travel[a].max_mm) for a in ("x", "y")]
     command = machine.command
     return LiveFilter(taps, DT_S, command.velocity_mm_s, command.accel_mm_s2, np.array(bounds))
@@ -124,8 +122,7 @@ def design_live(machine: Machine, shaper: BestShaper) -> LiveDesign:
     DesignError
         For a machine that cannot print live (`Machine.live_refusal`).
     """
-    if machine.live_refusal is not None:
-        raise DesignError(machine.live_refusal)
+    _check_live(machine)
     return _Trial(machine, shaper).chosen()
 
 
@@ -141,22 +138,19 @@ def cached_live_design(machine: Machine, directory: Path) -> LiveDesign:
         As `design_live` does.
     """
     path = directory / f"live-{machine.revision}-v{_VERSION}.json"
-    if machine.live_refusal is None:
-        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-            return _read(path)
-    made = design_live(machine, cached_shaper(machine, directory, DT_S))
-    directory.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        text = json.dumps({**asdict(made), "taps": made.taps.tolist()})
-        temporary.write_text(text, encoding="utf-8")
-    return made
+    _check_live(machine)
+    return kept(path, _read, lambda: design_live(machine, cached_shaper(machine, directory, DT_S)))
 
 
-def _read(path: Path) -> LiveDesign:
-    found = json.loads(path.read_text(encoding="utf-8"))
+def _check_live(machine: Machine) -> None:
+    if machine.live_refusal is not None:
+        raise DesignError(machine.live_refusal)
+
+
+def _read(found: dict[str, Any]) -> LiveDesign:
     taps = np.array(found["taps"], dtype=float)
     if taps.shape not in {(2, 2 * reach + 1) for reach in _REACHES} or not np.isfinite(taps).all():
-        raise ValueError(f"{path} holds no filter")
+        raise ValueError("no taps of a filter")
     contour_um = {name: tuple(values) for name, values in found["contour_um"].items()}
     given = {"taps": taps, "shares": tuple(found["shares"]), "contour_um": contour_um}
     return LiveDesign(**{**found, **given, "shaper": BestShaper(**found["shaper"])})
@@ -184,8 +178,7 @@ class _Trial:
         self._distances = PathDistances(self._path, DT_S)
         self._pairs = member_pairs(machine, DT_S)
         self._weights = pair_weights(machine, len(self._pairs))
-        pulses = [shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)]
-        self._smooth_taps = np.stack([shaper_taps(p, DT_S, _REACHES[-1]) for p in pulses])
+        self._smooth_taps = np.stack([shaper_taps(p, DT_S, _REACHES[-1]) for p in shaper.pulses])
         self._smooth = self._command(self._smooth_taps)
         self._smooth_mm = self._answers(self._smooth)
         self._shaped = np.array([self._rms(y) for y in self._smooth_mm])

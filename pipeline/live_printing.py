@@ -1,4 +1,4 @@
-"""What the extra inside Klipper makes of a file: by itself, or beside the compensated file."""
+"""Predict live printing (the extra inside Klipper), by itself or beside the compensated file."""
 
 from __future__ import annotations
 
@@ -59,9 +59,6 @@ def simulate_live(
     live = live_filter(machine, design.taps)
     result = simulate_motion(motion, cache_dir=cache_dir, layers=layers, trace=trace, live=live)
     channels = [design.ranged(channel, machine) for channel in result.channels]
-    channels = [
-        c.model_copy(update={"label": "printed live"}) if c.name == "after" else c for c in channels
-    ]
     (after,) = (channel for channel in channels if channel.name == "after")
     way = live_way(after, result.original_time_s, result.original_bytes)
     stages = [StageTime(stage="design", cpu_s=round(clock.cpu_s["design"], 4)), *result.stages]
@@ -160,7 +157,7 @@ def _way(
 
 
 def _before(progress: ProgressCallback | None) -> ProgressCallback | None:
-    """Return a callback for work before that which fractions count: it shows that there is life."""
+    """Return a callback for work before the job's own: it only shows that work goes on."""
     if progress is None:
         return None
     tell = progress

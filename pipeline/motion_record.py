@@ -16,7 +16,6 @@ from stillpath.pipeline.measuring.measure import Measurement
 from stillpath.pipeline.measuring.points import MotionSamples
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece, as_executed
 from stillpath.pipeline.totals import Totals
-from stillpath.pipeline.verbatim import feeding
 from stillpath.pipeline.verifying import Verifier
 
 __all__ = ["MotionRecord"]
@@ -34,7 +33,7 @@ class MotionRecord:
     measurement : Measurement
     totals : Totals
     changing : (Compensator, Verifier), optional
-        Who must know all motion of the machine; None: the file is not changed.
+        They are told of all motion of the machine; None: the file is not changed.
     """
 
     def __init__(
@@ -60,19 +59,19 @@ class MotionRecord:
         """Planned and executed motion of a piece on one grid of real time."""
         asked = self._asked(paced, paced.phases)
         planned, position, row, extruding = as_executed(made, asked, executed)
-        came = planned
+        sliced = planned
         if self._rounds:
             moved = replace(paced.phases, t_s=made.encoded.row_start_s)
-            came, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
-        return self._samples(piece, row, planned, position, extruding, came)
+            sliced, _ = sample_phases(moved, (0.0, DT_S, len(row)), flat=True)
+        return self._samples(piece, row, planned, position, extruding, sliced)
 
     def as_sliced(self, piece: Piece) -> MotionSamples:
         """Motion of a piece as the firmware makes it of the sliced file."""
         phases = piece.phases
         grid = (0.0, DT_S, max(round(phases.duration_s / DT_S), 1))
         path, row = sample_phases(self._asked(piece, phases), grid)
-        came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
-        return self._samples(piece, row, path, came, feeding(phases)[row], came)
+        sliced = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+        return self._samples(piece, row, path, sliced, phases.prints[row], sliced)
 
     def pass_by(self, verbatim: VerbatimPart, part: Phases | float | None) -> None:
         """Measure what a verbatim part does: motion, standing [s], or (None) losing its place."""
@@ -98,16 +97,15 @@ class MotionRecord:
             self._observe(stood)
 
     def _move(self, verbatim: VerbatimPart, phases: Phases) -> None:
-        duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        until = np.where(feeding(phases), phases.t_s + duration_s, -np.inf)
+        until = np.where(phases.prints, phases.t_s + phases.lasts_s, -np.inf)
         asked = self._asked(verbatim, phases)
         samples = max(round(phases.duration_s / DT_S), 1)
         for start in range(0, samples, _CHUNK):
             grid = (start * DT_S, DT_S, min(_CHUNK, samples - start))
             path, row, extruding = sample_until(asked, grid, until, axes=3)
-            came = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
+            sliced = sample_phases(phases, grid, flat=True)[0] if self._rounds else path
             at = phases.move_index[row]
-            self._measurement.add(self._samples(verbatim, at, path, came, extruding, came))
+            self._measurement.add(self._samples(verbatim, at, path, sliced, extruding, sliced))
             self._observe(path[:2])
 
     def _observe(self, command_mm: np.ndarray) -> None:

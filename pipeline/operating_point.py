@@ -16,8 +16,8 @@ __all__ = ["Operation"]
 
 _ALL_KNOWN = 7
 _LONGEST_RETRACTION_MM = 20.0
-"""Filament that is pulled back further has left the hotend: a change of filament or tool, after
-which the firmware may load on its own, and nothing is owed to what was pulled back."""
+"""Filament pulled back further has left the hotend: a change of filament or tool, after which the
+firmware may load on its own, so that the retraction is no longer counted against extrusion."""
 
 
 class Operation:
@@ -61,9 +61,7 @@ class Operation:
         known = np.flatnonzero((moves.known & _ALL_KNOWN) == _ALL_KNOWN)
         position = (self._point.x_mm, self._point.y_mm, self._point.z_mm)
         if len(known):
-            travel = moves.end_mm[known] - moves.start_mm[known]
-            prints = (travel[:, 3] > 0.0) & np.any(travel[:, :2] != 0.0, axis=1)
-            x, y, z = moves.start_mm[known[np.argmax(prints)], :3].tolist()
+            x, y, z = moves.start_mm[known[np.argmax(moves.prints[known])], :3].tolist()
             position = (x, y, z)
         laid_mm, _ = self._laid(moves)
         half_kg = 0.5 * self._kg_per_mm * laid_mm

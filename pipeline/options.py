@@ -84,7 +84,7 @@ class Options(BaseModel):
     firmware reads it). `budget_um` is the contour error (root mean square while extruding, of the
     worst plant of the machine's set) that every feature may have: the print becomes as fast as
     that allows (None: it keeps its speeds).
-    `where` says which features are compensated (`pipeline.selection`); the others leave as
+    `where` says which features are compensated (`pipeline.selection`); the others stay as
     sliced, and the file is smaller. `max_mb` is the most that the G-code may have, in millions of
     bytes: fewer features are compensated, and less exactly, until it fits.
     """

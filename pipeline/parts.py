@@ -16,8 +16,6 @@ from stillpath.pipeline.clock import StageClock
 
 __all__ = ["FileParts"]
 
-_BLOCK_BYTES = 1 << 17
-
 
 class FileParts:
     """Read a file from where it is, block by block.
@@ -45,16 +43,10 @@ class FileParts:
         GcodeError
             The file was compensated before.
         """
-        while True:
-            with self._clock.stage("read"):
-                data = self._source.read(_BLOCK_BYTES)
-                blocks = self._reader.push(data) if data else self._reader.flush()
-            for block in blocks:
-                _refuse_compensated(block)
-                yield from self._clock.each("plan", self._splitter.push(block))
-            if not data:
-                yield from self._clock.each("plan", self._splitter.flush())
-                return
+        for block in self._clock.each("read", self._reader.blocks(self._source)):
+            _refuse_compensated(block)
+            yield from self._clock.each("plan", self._splitter.push(block))
+        yield from self._clock.each("plan", self._splitter.flush())
 
 
 def _refuse_compensated(block: ProgramBlock) -> None:

@@ -25,6 +25,7 @@ from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
 from stillpath.models.operating import OperatingGrid, machine_at
 from stillpath.models.plants import plant_set
+from stillpath.models.runs import runs
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.caution import design_mode, designed
 from stillpath.pipeline.measuring._peak_kernels import peaks, speed_step
@@ -49,13 +50,13 @@ _REST_TOLERANCE_S = 5e-3
 _ROUNDS = 2
 MIN_STEP_MM_S = 5.0
 _ACCEL_SHARES = (1.0, 0.8, 0.6, 0.5)
-"""Of the command's largest acceleration, tried in turn where a motor's speed steps by too much."""
+"""Shares of the largest acceleration, tried in turn where a motor's speed steps by too much."""
 _SOFT_S = (2e-3, 4e-3, 8e-3)
-"""Reach of the mean that rounds the path's corners, tried in turn where they are too sudden."""
-
+"""Half-width of the mean that rounds the path's corners, tried in turn where they are too sharp."""
 
 _FEED_REACH, _FEED_REACH_MM = 2.5, 0.5
-"""Filament is smoothed over so many times its mm per mm, before and after, and no further."""
+"""Half-width of the smoothing of filament along the path: a multiple of the filament per mm of
+path, and the most in mm."""
 _ROUNDED = 1.0 + 1e-9
 _EXTRUDING_EXCESS_MM = 20e-3
 _TRAVEL_EXCESS_MM = 200e-3
@@ -63,7 +64,7 @@ _TRAVEL_EXCESS_MM = 200e-3
 
 
 class Unfit(ValueError):
-    """A piece that had better stay as sliced; the message is the reason."""
+    """A piece that should stay as sliced; the message says why."""
 
 
 class _Sudden(Unfit):
@@ -142,7 +143,7 @@ class PieceCompensator:
         self._filter = _error_filter(machine)
         command = machine.command
         steps = [command.of(axis).speed_step_mm_s for axis in ("x", "y")]
-        # An axis that bears more is looked at as if it went less far.
+        # One limit serves both axes: one with a higher limit counts as if it moved less.
         self._of_a_step = np.array([*(command.speed_step_mm_s / step for step in steps), 1.0, 1.0])
         self._grid = OperatingGrid(machine, step=DESIGN_STEP, blend_step=BLEND_STEP)
         self._level: OperatingPoint | None = None
@@ -302,7 +303,7 @@ class PieceCompensator:
         )
 
     def _check_motors(self, command_mm: NDArray[np.float64]) -> None:
-        """See that X and Y (2, n) together ask no motor of a CoreXY for more than it bears."""
+        """Check that X and Y (2, n) together keep the limits of the motors of a CoreXY."""
         motors = self._machine.command.motors
         if motors is None:
             return
@@ -322,7 +323,7 @@ class PieceCompensator:
     def _check_travel(
         self, place_mm: NDArray[np.float64], row: NDArray[np.int64], piece: Piece
     ) -> None:
-        """See that places (2, n), each of a row of the piece's phases, lie within the travel."""
+        """Check that places (2, n), each of a row of the piece's phases, lie within the travel."""
         for i, axis in enumerate(("x", "y")):
             travel = self._machine.travel[axis]  # type: ignore[index]
             if travel.min_mm <= place_mm[i].min() and place_mm[i].max() <= travel.max_mm:
@@ -358,14 +359,12 @@ def _retract_along(command: NDArray[np.float64], timeline: Timeline, phases: Pha
     Klipper limits such moves by E per mm of X Y. The command stands where the plan creeps and the
     other way round; filament at the plan's times would then need impossible accelerations.
     """
-    direction = phases.direction
-    wipes = (direction[:, 3] < 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+    wipes = phases.moves_xy & (phases.direction[:, 3] < 0.0)
     if not np.any(wipes):
         return
     inside = wipes[timeline.row] & timeline.moving
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]])))
     last = command.shape[1] - 1
-    for first, end in edges.reshape(-1, 2):
+    for first, end in runs(inside):
         # From the plan's own ends: the samples around a wipe may lie in a retraction at rest.
         row, stop = timeline.row[first], timeline.row[end - 1] + 1
         begins = phases.start_mm[row, 3]
@@ -384,8 +383,7 @@ def _feed_evenly(command: NDArray[np.float64], extruding: NDArray[np.bool_]) -> 
     The command has other speeds in a corner than the plan has, the filament has the plan's: per mm
     of way it comes in steps there, which firmwares brake for, the more the thicker the line.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], extruding, [False]])))
-    for first, end in edges.reshape(-1, 2):
+    for first, end in runs(extruding):
         span = slice(max(first - 1, 0), end)
         fed_mm = command[3, span] - command[3, span.start]
         way_mm = np.append(0.0, np.cumsum(np.hypot(*np.diff(command[:2, span]))))
@@ -478,13 +476,10 @@ def as_executed(
     """
     dt_s = piece.timeline.dt_s
     origin = float(piece.timeline.start_s[0])
-    last = executed.accel_s[-1] + executed.cruise_s[-1] + executed.decel_s[-1]
+    last = executed.lasts_s[-1]
     n = int(np.ceil((float(executed.t_s[-1] + last) + origin) / dt_s - 1e-3)) + 1
     moved = replace(phases, t_s=piece.encoded.row_start_s)
-    duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    direction = phases.direction
-    feeds = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
-    until = np.where(feeds, moved.t_s + duration, -np.inf)
+    until = np.where(phases.prints, moved.t_s + phases.lasts_s, -np.inf)
     planned, row, extruding = sample_until(moved, (0.0, dt_s, n), until, axes=3)
     position, _ = sample_phases(executed, (-origin, dt_s, n), flat=True)
     return planned, position, row, extruding

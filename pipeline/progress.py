@@ -72,7 +72,7 @@ def progress_to(
 ) -> Callable[[float], None]:
     """Return a callback for a stage before or after the work that `fraction` counts.
 
-    What it is given, the share of the stage itself, only shows that there is life.
+    What it is given, the share of the stage itself, only shows that work goes on.
     """
     began = time.monotonic()
 

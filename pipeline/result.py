@@ -66,6 +66,12 @@ class Channel(_Figures):
     residual_rms_um: float
     """Vibration in the 0.1 s after each rest begins, root mean square [um]."""
 
+    @property
+    def judged_rms_um(self) -> float:
+        """Contour error of what is compensated, root mean square while extruding [um]."""
+        selected_um = self.selected_rms_um
+        return self.extruding.contour_rms_um if selected_um is None else selected_um
+
 
 class GroupFigures(_Figures):
     """Contour error while extruding, for one layer or feature, by channel name."""
@@ -340,7 +346,7 @@ class Result(_Figures):
     left_alone_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     left_out_s: float = 0.0
-    """Time of what leaves as sliced because the job asked for less than all (`where`) [s]."""
+    """Time of what stays as sliced because the job asked for less than all (`where`) [s]."""
     left_out_extruding_s: float = 0.0
     """How much of that extrudes [s]."""
     warnings: list[str]

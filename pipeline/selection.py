@@ -11,9 +11,9 @@ from stillpath.gcode.dividing import divided, sections
 from stillpath.gcode.pieces import LeftOut, Piece, VerbatimPart
 from stillpath.gcode.slicers.features import Feature, feature_of
 from stillpath.models.machine import Machine
+from stillpath.models.runs import runs
 from stillpath.pipeline.options import Options, Where
 from stillpath.pipeline.result import GroupFigures
-from stillpath.pipeline.verbatim import feeding
 
 __all__ = ["Selection", "TooLarge", "smaller"]
 
@@ -21,9 +21,9 @@ _WALLS = frozenset({Feature.OUTER_WALL, Feature.OVERHANG_WALL, Feature.THIN_WALL
 _VISIBLE = _WALLS | {Feature.TOP_SURFACE, Feature.SKIN, Feature.IRONING, Feature.BOTTOM_SURFACE}
 _CHOSEN = {"visible": _VISIBLE, "walls": _WALLS}
 _TOLERANCES_UM = (8.0, 16.0)
-"""Tried in turn where a file is too large; beyond, vertices are bound by other things."""
+"""Tried in turn where a file is too large; beyond them other limits place the vertices."""
 _WORTH_S = 0.5
-"""Less than this is not worth the lines that end a stream and begin the next one."""
+"""Shorter stretches are not worth the lines that end a stream and begin the next one."""
 
 
 class TooLarge(Exception):
@@ -63,7 +63,7 @@ class Selection:
         self._machine = machine
         self._features = _CHOSEN.get(where)
         self._counts: dict[int, bool] = {-1: True}
-        """By number of a feature whether it counts."""
+        """Whether a feature counts, by its number."""
 
     def divide(
         self, item: Piece | VerbatimPart, names: Sequence[str]
@@ -95,7 +95,7 @@ class Selection:
 
     def _wanted(self, piece: Piece, names: Sequence[str]) -> NDArray[np.bool_]:
         """Mark the sections of a piece that are compensated."""
-        feeds, feature = feeding(piece.phases), piece.moves.feature
+        feeds, feature = piece.phases.prints, piece.moves.feature
         counts = np.array([self._shows(int(k), names) for k in feature])
         rows = sections(piece)
         prints = np.array([np.any(feeds[a:b]) for a, b in rows])
@@ -103,7 +103,7 @@ class Selection:
         for k in range(len(rows) - 2, -1, -1):
             wanted[k] |= wanted[k + 1] and not prints[k]
         start_s = piece.phases.t_s - piece.phases.t_s[0]
-        for first, last in _runs(~wanted):
+        for first, last in runs(~wanted):
             begin_s = float(start_s[rows[first][0]])
             end = rows[last - 1][1]
             end_s = float(start_s[end]) if end < len(start_s) else piece.phases.duration_s
@@ -119,9 +119,3 @@ class Selection:
     def _named(self, name: str) -> bool:
         feature = feature_of(name)
         return self._features is None or feature is None or feature in self._features
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return where a mask holds without a break: first, and one past the last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

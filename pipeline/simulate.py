@@ -156,7 +156,7 @@ def simulate_motion(
         machine_revision=machine.revision,
         settings={"method": "simulate" if live is None else "live"},
         source_name=motion.source.name,
-        channels=measurement.channels(),
+        channels=measurement.channels("printed live"),
         best_shaper=shaper.label,
         original_time_s=motion.time_s,
         time_s=motion.time_s,

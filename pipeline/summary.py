@@ -87,12 +87,8 @@ class Summary:
 
     def _channels(self) -> list[Channel]:
         """Return the figures of the whole print, with what counts where a part is compensated."""
-        channels = self.measurement.channels()
-        if self.writer is None:
-            channels = [
-                c.model_copy(update={"label": "as written"}) if c.name == "after" else c
-                for c in channels
-            ]
+        after = "as written" if self.writer is None else "compensated"
+        channels = self.measurement.channels(after)
         if self.options.where != "all":
             features = self.measurement.features(self.reader.feature_names)
             rms_um = self.selection.rms_um(features)
@@ -106,7 +102,7 @@ class Summary:
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
         if self.writer is not None:
             # First, as it says that the file had better not be printed.
-            yield from self._outdone({c.name: _counting_rms_um(c) for c in channels})
+            yield from self._outdone({c.name: c.judged_rms_um for c in channels})
         yield from self.totals.warnings
         yield from passed_over(self.reader)
         yield from self.measurement.warnings()
@@ -144,8 +140,3 @@ class Summary:
                 f"rms of contour error, this file {um_text(ours)} um. "
                 "Print it as sliced with that shaper, or let --method advise write the commands"
             )
-
-
-def _counting_rms_um(channel: Channel) -> float:
-    selected_um = channel.selected_rms_um
-    return channel.extruding.contour_rms_um if selected_um is None else selected_um

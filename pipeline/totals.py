@@ -11,7 +11,7 @@ from stillpath.gcode.pieces import LeftOut, VerbatimPart
 from stillpath.gcode.types import Phases
 from stillpath.pipeline.piece_compensator import DT_S, CompensatedPiece
 from stillpath.pipeline.result import PutBack
-from stillpath.pipeline.verbatim import feeding, last_length_mm
+from stillpath.pipeline.verbatim import last_length_mm
 
 __all__ = ["NOT_COMPENSATED", "Totals"]
 
@@ -19,7 +19,7 @@ NOT_COMPENSATED = "of the extruding time is not compensated"
 """How the warning begins, after the share."""
 
 _WARN_SHARE = 0.2
-"""Of the extruding time, above which it is said that it is not compensated."""
+"""Share of the extruding time above which the report warns that it is not compensated."""
 
 
 class Totals:
@@ -59,11 +59,10 @@ class Totals:
 
     def add_verbatim(self, verbatim: VerbatimPart, phases: Phases) -> None:
         """Add motion whose lines are not changed."""
-        motion_s, feeds = phases.duration_s, feeding(phases)
+        motion_s, feeds = phases.duration_s, phases.prints
         self.original_s += motion_s
         self.time_s += motion_s
-        duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
-        extruding_s = float(np.sum(duration_s[feeds]))
+        extruding_s = float(np.sum(phases.lasts_s[feeds]))
         self.extruding_s += extruding_s
         if isinstance(verbatim, LeftOut):
             self.left_out_s += motion_s

@@ -93,8 +93,8 @@ def write_trajectories(
 def _check_window(start_s: float, stop_s: float | None) -> None:
     if not 0.0 <= start_s < (np.inf if stop_s is None else stop_s):
         raise GcodeError(
-            f"{start_s:g} s to {stop_s or 0.0:g} s is no period of the print: it must start at 0 "
-            "or later, and end after its start"
+            f"{start_s:g} s to {stop_s or 0.0:g} s is not a period of the print: it must start at "
+            "0 s or later, and end after its start"
         )
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stillpath.gcode.firmware.planning import stops
 from stillpath.gcode.pieces import Piece, VerbatimPart
@@ -14,7 +13,7 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.types import EventKind, Phases, ProgramBlock, rows_of
 from stillpath.models.machine import Machine
 
-__all__ = ["feeding", "last_length_mm", "plan_verbatim", "switching_s", "takes_s"]
+__all__ = ["last_length_mm", "plan_verbatim", "switching_s", "takes_s"]
 
 
 def plan_verbatim(verbatim: VerbatimPart, machine: Machine) -> Iterator[Phases | float | None]:
@@ -67,10 +66,3 @@ def last_length_mm(phases: Phases) -> float:
         + v1 * phases.cruise_s[-1]
         + 0.5 * (v1 + v2) * phases.decel_s[-1]
     )
-
-
-def feeding(phases: Phases) -> NDArray[np.bool_]:
-    """Mark rows that move X or Y and feed forward."""
-    direction = phases.direction
-    moves_xy = (direction[:, 0] != 0.0) | (direction[:, 1] != 0.0)
-    return np.asarray(moves_xy & (direction[:, 3] > 0.0))

@@ -25,7 +25,7 @@ from stillpath.simulation.scheduled import MachineStream
 __all__ = ["NEGLIGIBLE_UM", "Verifier"]
 
 NEGLIGIBLE_UM = 1.0
-"""Contour error that nobody sees, whoever has less of it."""
+"""Contour error that nobody sees: below it, which of two is smaller does not matter."""
 
 _TIME_EXCESS_S = 20e-3
 _END_MM = np.array([1e-6, 1e-6, 1e-6, 1e-4])
@@ -108,19 +108,19 @@ class Verifier:
             self._past_mm = np.hstack([self._past_mm, command_mm[:2]])[:, -_PAST:]
 
     def check_gain(self, motion: MotionSamples, point: OperatingPoint) -> None:
-        """Compare a piece with what came, on motors with steps: those cost fine motion most.
+        """Compare the contour error of a piece with that of the sliced file, on coarse motor steps.
 
         Parameters
         ----------
         motion : MotionSamples
-            With what came. If that is as planned, nothing is done.
+            Without `sliced_mm`, where the firmware rounds to no steps, nothing is done.
         point : OperatingPoint
             Where the machine is.
 
         Raises
         ------
         Unfit
-            When what came would print better.
+            When the sliced lines would print better.
         """
         if motion.sliced_mm is None:
             return
@@ -135,9 +135,9 @@ class Verifier:
         extruding = np.append(np.zeros(past.shape[1], np.bool_), motion.extruding)
         meter.push(path_mm, np.stack(answers), extruding)
         meter.flush()
-        came_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
-        if ours_um > max(_CLEARLY * came_um, NEGLIGIBLE_UM):
+        sliced_um, ours_um = (1e3 * tally.rms for tally in meter.contour_extruding)
+        if ours_um > max(_CLEARLY * sliced_um, NEGLIGIBLE_UM):
             raise Unfit(
                 f"on the motors' steps its contour error would be {ours_um:.1f} um rms, and it is "
-                f"{came_um:.1f} um as sliced"
+                f"{sliced_um:.1f} um as sliced"
             )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from html import escape
 
-__all__ = ["Band", "Chart", "Line", "Mark", "draw"]
+__all__ = ["Band", "Chart", "Figure", "Line", "Mark", "captioned", "draw"]
 
 Values = Sequence[float | None]
 
@@ -70,6 +70,27 @@ class Chart:
     marks: Sequence[Mark] = field(default=())
     log_x: bool = False
     bands: Sequence[Band] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A chart with its caption, as SVG: `wide` for a screen, `narrow` for a phone, if any."""
+
+    title: str
+    note: str
+    wide: str
+    narrow: str = ""
+
+
+def captioned(
+    title: str,
+    note: str,
+    chart: Chart,
+    wide: tuple[float, float],
+    narrow: tuple[float, float] | None = None,
+) -> Figure:
+    """Return a chart with its caption, drawn in one or two sizes (width, height)."""
+    return Figure(title, note, draw(chart, *wide), "" if narrow is None else draw(chart, *narrow))
 
 
 def draw(chart: Chart, width: float, height: float) -> str:

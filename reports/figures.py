@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from stillpath.pipeline.result import AxisSpectrum, Result
-from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.charts import Chart, Figure, Line, Mark, captioned
 
-__all__ = ["SpectrumFigure", "spectrum_figures"]
+__all__ = ["spectrum_figures"]
 
 _SIZE, _NARROW = (470.0, 290.0), (350.0, 260.0)
 _HERTZ_APART = 0.12
 """Marks nearer to each other than this share of the axis have one text."""
 
 
-@dataclass(frozen=True, slots=True)
-class SpectrumFigure:
-    """The spectrum of an axis, for two widths of the page."""
-
-    title: str
-    wide: str
-    narrow: str
-
-
-def spectrum_figures(result: Result) -> list[SpectrumFigure]:
+def spectrum_figures(result: Result) -> list[Figure]:
     """Return the spectra of the error, before and after."""
     names = [channel.name for channel in result.channels]
     figures = []
@@ -41,8 +30,8 @@ def spectrum_figures(result: Result) -> list[SpectrumFigure]:
             log=True,
             marks=_marks(spectrum),
         )
-        wide, narrow = draw(chart, *_SIZE), draw(chart, *_NARROW)
-        figures.append(SpectrumFigure(f"{axis}: {_resonances(spectrum)}", wide, narrow))
+        title = f"{axis}: {_resonances(spectrum)}"
+        figures.append(captioned(title, "", chart, _SIZE, _NARROW))
     return figures
 
 

@@ -283,7 +283,7 @@ def _host_of(server: str) -> str | None:
     try:
         parts = urlsplit(server)
         fits = parts.scheme in ("http", "https") and parts.port != 0
-    except ValueError:  # a port that is no number, half an IPv6 address
+    except ValueError:  # a port that is not a number, half an IPv6 address
         return None
     return parts.hostname or None if fits else None
 

@@ -33,7 +33,7 @@ def configure_logging() -> None:
 
 
 class _Stderr:
-    """Whatever stderr is at the moment of writing: who redirects it does not keep it for ever."""
+    """Whatever stderr is at the moment of writing, so that a redirection ends when it should."""
 
     def write(self, text: str) -> int:
         return sys.stderr.write(text)

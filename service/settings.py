@@ -23,7 +23,7 @@ def _network(text: str) -> str:
         return str(ipaddress.ip_network(text, strict=False))
     except ValueError:
         raise ValueError(
-            f"{text!r:.80} is no address or network; write for instance 127.0.0.1 or 10.0.0.0/8"
+            f"{text!r:.80} is not an address or network; write for instance 127.0.0.1 or 10.0.0.0/8"
         ) from None
 
 

@@ -30,7 +30,6 @@ __all__ = [
     "PathDistances",
     "Tally",
     "contour_error",
-    "distance_to_path",
     "tracking_error",
 ]
 
@@ -39,7 +38,7 @@ Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 WINDOW_S = 0.08
-"""So far from its sample the nearest point of the path is looked for."""
+"""How far from its sample, in time, the nearest point of the path is looked for."""
 _RESIDUAL_S = 0.1
 _SHORTEST_REST_S = 0.02
 _STILL_MM = 1e-9
@@ -152,7 +151,7 @@ class ContourMeter:
     window_s : float
         The path counts this long before and after a point's instant; less at start and end.
     stride : int
-        Every which sample is measured (0, stride, 2 stride, ...); the path keeps all samples.
+        Samples 0, stride, 2 stride, ... are measured; the path keeps all samples.
     channels : int
         Number of motions.
 
@@ -367,31 +366,10 @@ def tracking_error(y_d_mm: Array, y_mm: Array) -> Array:
 
 
 def contour_error(y_d_mm: Array, y_mm: Array, dt_s: float = 1e-3, stride: int = 1) -> Array:
-    """Return the contour error of samples 0, stride, 2 stride, ... of a whole motion."""
+    """Return contour errors of samples 0, stride, 2 stride, ... of a whole motion (2, n)."""
     meter = ContourMeter(dt_s, stride=stride)
     first = meter.push(y_d_mm, y_mm[None])
     return np.concatenate([first.error_mm[0], meter.flush().error_mm[0]])
-
-
-def distance_to_path(
-    path_mm: Array,
-    points_mm: Array,
-    index: NDArray[np.int64],
-    dt_s: float = 1e-3,
-    window_s: float = WINDOW_S,
-) -> Array:
-    """Return the contour error of chosen samples only.
-
-    Parameters
-    ----------
-    path_mm : ndarray, shape (2, n)
-        The whole planned motion.
-    points_mm : ndarray, shape (2, m)
-        Executed positions at the samples `index`.
-    index : ndarray of int64, shape (m,)
-        Rising; each within the path.
-    """
-    return PathDistances(path_mm, dt_s, window_s).at(points_mm, index)
 
 
 class PathDistances:

@@ -28,10 +28,9 @@ REMEMBERED_S = 4.0
 class MachineStream:
     """Answer of X and Y of a machine to a command that arrives in blocks.
 
-    The nominal plants answer, to a command with the machine's ripple and less what dry friction
-    holds back; the machine stands still at
-    the first sample pushed. Plants that depend on x and y answer all, and count with the weights
-    of the planned position.
+    The nominal plants answer the command with the machine's ripple added and what dry friction
+    holds back taken off. The machine stands still at the first sample pushed. Where plants depend
+    on x and y, all nodes of the grid answer and are blended by weights of the planned position.
 
     Parameters
     ----------

@@ -36,7 +36,6 @@ __all__ = [
 
 Frequency = Annotated[float, Field(ge=1e-3, le=1e6, allow_inf_nan=False)]
 Targets = Annotated[tuple[Frequency, ...], Field(min_length=1, max_length=8)]
-Zero = tuple[Annotated[float, Field(ge=0, le=2)], Annotated[float, Field(ge=0, le=1e6)]]
 Shape = Literal["pointwise", "hermite"]
 Disturbance = Annotated[Narrowband | Switched | Wideband | Periodic, Field(discriminator="kind")]
 LoopName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=64)]
@@ -227,7 +226,9 @@ def read_options(document: Mapping[str, Any]) -> ControllerOptions:
         first = error.errors(include_url=False)[0]
         method = document.get("method")
         if first["type"].startswith("union_tag"):
-            raise DesignError(f"unknown method {method!r}; there is {', '.join(METHODS)}") from None
+            raise DesignError(
+                f"unknown method {method!r}; there are {', '.join(METHODS)}"
+            ) from None
         where = ".".join(str(part) for part in first["loc"][1:])
         if first["type"] == "missing":
             raise DesignError(f"{method} needs {where}") from None

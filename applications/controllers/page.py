@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from stillpath.applications.controllers.design import Designed
 from stillpath.applications.controllers.figures import ControllerReport, Envelope
-from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.charts import Chart, Figure, Line, Mark, captioned
 from stillpath.reports.pages import rendered, style_of, write_texts
 
 __all__ = [
     "STYLE",
-    "Figure",
     "charted",
     "decibels",
     "render_controller",
@@ -25,16 +23,6 @@ __all__ = [
 STYLE = ("stillpath.applications.controllers", "controller.css")
 _WIDE, _NARROW, _SMALL = (990.0, 340.0), (400.0, 300.0), (480.0, 270.0)
 _LOWEST_DB, _HIGHEST_DB = -60.0, 40.0
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A chart with its caption; `wide` for a screen, `narrow` for a phone."""
-
-    title: str
-    note: str
-    wide: str
-    narrow: str
 
 
 def write_controller(made: Designed, directory: Path) -> None:
@@ -75,7 +63,7 @@ def render_controller(report: ControllerReport) -> str:
 
 def charted(title: str, note: str, chart: Chart, *, wide: bool = False) -> Figure:
     """Return a chart, drawn for a screen and for a phone."""
-    return Figure(title, note, draw(chart, *(_WIDE if wide else _SMALL)), draw(chart, *_NARROW))
+    return captioned(title, note, chart, _WIDE if wide else _SMALL, _NARROW)
 
 
 def short(value: float) -> str:

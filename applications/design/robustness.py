@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stillpath.applications.design.figures import Curve
 from stillpath.compensation.fbf import PreviewFbf
-from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.compensation.shapers import shape_xy
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, PlantSpec, WeightedMember, discretise, plant_set
@@ -88,12 +88,7 @@ class Trial:
 
     def shaped(self, shaper: BestShaper) -> Curve:
         """Return the figures of a firmware shaper with its tuned frequencies."""
-        pulses = [
-            shaper_pulses(shaper.type, f_hz, shaper.zeta) for f_hz in (shaper.fx_hz, shaper.fy_hz)
-        ]
-        command = np.stack(
-            [shape(row, self._dt_s, p) for row, p in zip(self.y_d_mm, pulses, strict=True)]
-        )
+        command = shape_xy(self.y_d_mm, self._dt_s, shaper.pulses)
         setting = f"{shaper.fx_hz:.1f} / {shaper.fy_hz:.1f} Hz"
         return self._curve(shaper.type, shaper.type, setting, command)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from stillpath.applications.identification.figures import AxisFigures, IdentificationReport
 from stillpath.models.provenance import MeasuredMode
-from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.charts import Chart, Figure, Line, Mark, captioned
 from stillpath.reports.pages import rendered, style_of, write_texts
 
 __all__ = [
@@ -61,22 +61,14 @@ def render_identification(report: IdentificationReport) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Figure:
-    title: str
-    note: str
-    wide: str
-    narrow: str
-
-
-@dataclass(frozen=True, slots=True)
 class _Axis:
     """An axis with its drawings."""
 
     a: AxisFigures
-    figures: Sequence[_Figure]
+    figures: Sequence[Figure]
 
 
-def _figures(axis: AxisFigures) -> list[_Figure]:
+def _figures(axis: AxisFigures) -> list[Figure]:
     if axis.spectra:
         return [_spectrum(axis), _magnitude(axis)]
     if axis.responses:
@@ -84,7 +76,7 @@ def _figures(axis: AxisFigures) -> list[_Figure]:
     return [_magnitude(axis)]
 
 
-def _magnitude(axis: AxisFigures) -> _Figure:
+def _magnitude(axis: AxisFigures) -> Figure:
     named = zip(axis.responses, _named([r.label for r in axis.responses]), strict=True)
     measured = [Line(r.f_hz, r.magnitude, style, name) for r, (style, name) in named]
     members = [Line(m.f_hz, m.magnitude, "soft thin member") for m in axis.members]
@@ -98,20 +90,20 @@ def _magnitude(axis: AxisFigures) -> _Figure:
     return _figure("Magnitude", note, "|G|", [*members, model, *measured], True, marks)
 
 
-def _phase(axis: AxisFigures) -> _Figure:
+def _phase(axis: AxisFigures) -> Figure:
     measured = [Line(r.f_hz, r.phase_deg, _style(k)) for k, r in enumerate(axis.responses)]
     model = Line(axis.model.f_hz, axis.model.phase_deg, "after main")
     note = "Degrees; a delay of the recording is taken out."
     return _figure("Phase", note, "phase, °", [model, *measured], False)
 
 
-def _coherence(axis: AxisFigures) -> _Figure:
+def _coherence(axis: AxisFigures) -> Figure:
     lines = [Line(r.f_hz, r.coherence, _style(k)) for k, r in enumerate(axis.responses)]
     note = "How much of the measured motion follows the command; below 0.95 is not fitted."
     return _figure("Coherence", note, "coherence", lines, False)
 
 
-def _residual(axis: AxisFigures) -> _Figure:
+def _residual(axis: AxisFigures) -> Figure:
     lines = [
         Line(r.f_hz, [None if v is None else 100 * v for v in r.residual], _style(k))
         for k, r in enumerate(axis.responses)
@@ -120,7 +112,7 @@ def _residual(axis: AxisFigures) -> _Figure:
     return _figure("What the model misses", note, "%", lines, True)
 
 
-def _spectrum(axis: AxisFigures) -> _Figure:
+def _spectrum(axis: AxisFigures) -> Figure:
     named = zip(axis.spectra, _named([s.label for s in axis.spectra]), strict=True)
     measured = [Line(s.f_hz, s.measured, style, name) for s, (style, name) in named]
     first = axis.spectra[0]
@@ -136,7 +128,7 @@ def _figure(
     lines: Sequence[Line],
     log: bool,
     marks: Sequence[Mark] = (),
-) -> _Figure:
+) -> Figure:
     chart = Chart(
         about=f"{title} against frequency. {note}",
         x_title="frequency, Hz",
@@ -146,7 +138,7 @@ def _figure(
         marks=marks,
     )
     wide = title in ("Magnitude", "Power spectrum")
-    return _Figure(title, note, draw(chart, *(_WIDE if wide else _SMALL)), draw(chart, *_NARROW))
+    return captioned(title, note, chart, _WIDE if wide else _SMALL, _NARROW)
 
 
 def _named(labels: Sequence[str]) -> list[tuple[str, str]]:

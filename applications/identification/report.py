@@ -19,6 +19,7 @@ from stillpath.applications.identification.figures import (
 )
 from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
 from stillpath.models.identification.readers import ReadSettings, direction_of, excitation_for
+from stillpath.models.identification.sets import measured_modes
 from stillpath.models.identification.shaper_choice import choose_shaper, choose_shaper_of
 from stillpath.models.identification.spectrum_model import driven_column
 from stillpath.models.identification.types import (
@@ -119,15 +120,7 @@ def _axis(
 
 def _modes(plant: PlantSpec, fit: Fit | None) -> tuple[MeasuredMode, ...]:
     if fit is not None:
-        return tuple(
-            MeasuredMode(
-                f_hz=m.f_hz,
-                zeta=m.zeta,
-                f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
-                zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
-            )
-            for m in fit.modes
-        )
+        return measured_modes(fit)
     rows = continuous(plant).modes()
     return tuple(MeasuredMode(f_hz=float(f), zeta=float(z)) for f, z in rows)
 

@@ -24,6 +24,7 @@ from stillpath.models.plants import PlantSpec
 from stillpath.models.provenance import SourceFile
 from stillpath.models.schedule import AxisSchedule, MassSchedule, resonances_hz
 from stillpath.models.store import explain
+from stillpath.models.user_files import read_bytes
 
 __all__ = ["Identified", "InputFile", "identify_files", "read_inputs"]
 
@@ -122,12 +123,8 @@ def _read_input(argument: str) -> InputFile:
     if not path.exists() and "@" in argument:
         before, _, after = argument.rpartition("@")
         path, condition = Path(before), Condition.parse(after)
-    try:
-        if path.stat().st_size > LARGEST_BYTES:
-            raise ModelError(f"{path}: over {LARGEST_BYTES} bytes, no measurement is that large")
-        return InputFile(path.name, path.read_bytes(), condition)
-    except OSError as error:
-        raise ModelError(f"cannot read {path}: {error.strerror}") from None
+    content = read_bytes(path, LARGEST_BYTES, "no measurement is that large")
+    return InputFile(path.name, content, condition)
 
 
 def _with_what_is_known(base: Machine, axis: Axis, found: AxisIdentification) -> AxisIdentification:

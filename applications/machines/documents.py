@@ -155,5 +155,5 @@ class DocumentFolder:
         except OSError:
             if not self.names(target):
                 raise
-            raise FileExistsError(f"{self._root / target} is there already") from None
+            raise FileExistsError(f"{self._root / target} already exists") from None
         sync_folder(self._root)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from stillpath.models.errors import ModelError
+from stillpath.models.user_files import read_bytes
 
 __all__ = [
     "Fact",
@@ -113,12 +114,7 @@ def read_printer_config(path: Path) -> PrinterConfig:
     ModelError
         If the file cannot be read or is no configuration.
     """
-    try:
-        if path.stat().st_size > _LARGEST_BYTES:
-            raise ModelError(f"{path}: over {_LARGEST_BYTES} bytes, not a printer.cfg")
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise ModelError(f"cannot read the configuration {path}: {error.strerror}") from None
+    text = read_bytes(path, _LARGEST_BYTES, "not a printer.cfg").decode(errors="replace")
     return parse_printer_config(text, path.name)
 
 

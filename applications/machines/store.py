@@ -200,14 +200,13 @@ class MachineStore:
         *,
         author: str,
         message: str = "",
-        when: datetime | None = None,
         expected: int | None = None,
     ) -> Revision:
         """Bring an earlier state back, as a new revision; history stays as it is."""
         earlier = self.revision(name, number)
         message = message or f"back to revision {number}"
         fields = {"author": author, "message": message, "restored": number}
-        return self._add(name, lambda _: (earlier.machine, fields), when=when, expected=expected)
+        return self._add(name, lambda _: (earlier.machine, fields), expected=expected)
 
     def approve(
         self,
@@ -253,10 +252,10 @@ class MachineStore:
         except FileExistsError:
             raise _exists(name) from None
 
-    def delete(self, name: str, *, when: datetime | None = None) -> None:
+    def delete(self, name: str) -> None:
         """Move a machine with its history to the trash; `restore` brings it back."""
         self._existing(name)
-        stamp = (when or datetime.now(UTC)).strftime("%Y%m%dT%H%M%S.%fZ")
+        stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         try:
             self._documents.move(name, f"{_TRASH}/{name}/{stamp}")
         except FileNotFoundError:

@@ -21,6 +21,7 @@ from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.provenance import SourceFile
 from stillpath.models.store import explain, read_machine
+from stillpath.models.user_files import read_bytes
 
 __all__ = ["export_history", "import_file", "with_firmware_file"]
 
@@ -74,7 +75,7 @@ def import_file(
     ModelError
         If the file is neither, or the name cannot be used.
     """
-    content = _content(file)
+    content = read_bytes(file, _LARGEST_BYTES, "neither machine nor history")
     history = _as_history(content, file)
     machine = read_machine(content, str(file)) if history is None else history.revisions[-1].machine
     if history is not None and name in (None, history.name):
@@ -105,7 +106,7 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
     ModelError
         Naming the first field of the section that is wrong.
     """
-    content = _content(file)
+    content = read_bytes(file, _LARGEST_BYTES, "neither machine nor history")
     text = content.decode(errors="replace")
     if looks_like_m503(text):
         return with_m503(machine, text, file.name), source_file(file.name, content)
@@ -123,15 +124,6 @@ def with_firmware_file(machine: Machine, file: Path) -> tuple[Machine, SourceFil
     except ValidationError as error:
         raise ModelError(f"{file}: {explain(error)}") from None
     return changed, source_file(file.name, content)
-
-
-def _content(file: Path) -> bytes:
-    try:
-        if file.stat().st_size > _LARGEST_BYTES:
-            raise ModelError(f"{file}: over {_LARGEST_BYTES} bytes, neither machine nor history")
-        return file.read_bytes()
-    except OSError as error:
-        raise ModelError(f"cannot read {file}: {error.strerror}") from None
 
 
 def _as_history(content: bytes, file: Path) -> _History | None:

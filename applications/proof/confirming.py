@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from stillpath.applications.proof.drive import ringing_mode
 from stillpath.applications.proof.judging import AxisMotion, judge
+from stillpath.applications.proof.matching import read_log
 from stillpath.applications.proof.ring_figures import AxisRing, Half, RingReport, Verdict
 from stillpath.applications.proof.ring_log import (
     AxisLog,
@@ -40,8 +41,6 @@ from stillpath.applications.proof.ring_motion import (
 from stillpath.applications.proof.ring_test import AXES, Axis
 from stillpath.models.confirmation import Confirmation, plants_digest, um_text
 from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers import read_measurements
-from stillpath.models.identification.types import AccelerationLog
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSetSpec, discretise
 from stillpath.models.provenance import SourceFile
@@ -103,7 +102,7 @@ def verify_ring(
         notes.append("The model follows mass or position; predicted is what the nominal plants do.")
     axes = {axis: _Axis(machine, motion, axis, today or date.today()) for axis in AXES}
     for path in logs:
-        recorded = _accelerations_of(path)
+        recorded = read_log(path, "give what was logged while the ring test ran")
         notes += recorded.notes
         source = SourceFile(name=path.name, sha256=hashlib.sha256(path.read_bytes()).hexdigest())
         try:
@@ -137,16 +136,6 @@ def verify_ring(
 def _give_reason(axes: Iterable[_Axis], reason: str) -> None:
     for axis in axes:
         axis.add_reason(reason)
-
-
-def _accelerations_of(path: Path) -> AccelerationLog:
-    (recorded, *_) = read_measurements(path)
-    if not isinstance(recorded, AccelerationLog):
-        raise ModelError(
-            f"{path.name} holds no raw accelerations but a {type(recorded).__name__}; give what "
-            "was logged while the ring test ran"
-        )
-    return recorded
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ lag is then followed from segment to segment.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,10 @@ from scipy.signal import butter, correlate, sosfiltfilt
 from scipy.stats import theilslopes
 
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.types import AccelerationLog
 
-__all__ = ["Match", "Signal", "band_pass", "log_signal", "match"]
+__all__ = ["Match", "Signal", "band_pass", "log_signal", "match", "read_log"]
 
 Array = NDArray[np.float64]
 
@@ -69,8 +71,8 @@ class Match:
         The part of the plan that the log follows without a jump.
     offset_s, rate : float
         Log time = offset_s + rate * plan time.
-    followed_s, log_s : float
-        Seconds of the log that follow the plan at all, and all of them.
+    log_s : float
+        Length of the log.
     places : int
         Places in the plan that fit about as well (repeated layers); the best one was taken.
     """
@@ -80,7 +82,6 @@ class Match:
     plan_end_s: float
     offset_s: float
     rate: float
-    followed_s: float
     log_s: float
     places: int
 
@@ -94,6 +95,27 @@ def band_pass(signal: Array, dt_s: float, low_hz: float, high_hz: float) -> Arra
     nyquist = 0.5 / dt_s
     sos = butter(3, [low_hz / nyquist, min(high_hz / nyquist, 0.95)], "band", output="sos")
     return np.asarray(sosfiltfilt(sos, signal, axis=-1))
+
+
+def read_log(path: Path, otherwise: str) -> AccelerationLog:
+    """Read raw accelerations.
+
+    Parameters
+    ----------
+    path : Path
+    otherwise : str
+        What to do instead of giving a file of another kind.
+
+    Raises
+    ------
+    ModelError
+        The file cannot be read, or holds something else.
+    """
+    recorded = read_measurements(path)[0]
+    if not isinstance(recorded, AccelerationLog):
+        kind = type(recorded).__name__
+        raise ModelError(f"{path.name} holds no raw accelerations but a {kind}; {otherwise}")
+    return recorded
 
 
 def log_signal(log: AccelerationLog) -> Signal:
@@ -146,7 +168,7 @@ def match(plan: Signal, log: Signal) -> Match:
     good = shares > _FOLLOWS
     at_s, lag_s = _refined(plan, log, segments[good], lags[good], segment_s)
     if len(at_s) == 0:
-        return Match(best, 0.0, 0.0, 0.0, 1.0, 0.0, log.duration_s, places)
+        return Match(best, 0.0, 0.0, 0.0, 1.0, log.duration_s, places)
     run = _longest_run(at_s, lag_s, segment_s)
     at_s, lag_s = at_s[run], lag_s[run]
     # Plan time = log time + lag.
@@ -163,7 +185,6 @@ def match(plan: Signal, log: Signal) -> Match:
         plan_end_s=min(end, plan.duration_s),
         offset_s=-intercept * rate,
         rate=rate,
-        followed_s=float(np.sum(good)) * segment_s,
         log_s=log.duration_s,
         places=places,
     )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from stillpath.applications.proof.figures import AxisReadback, Curve, ReadbackReport
-from stillpath.reports.charts import Chart, Line, Mark, draw
+from stillpath.reports.charts import Chart, Figure, Line, Mark, captioned
 from stillpath.reports.pages import rendered, style_of, write_texts
 
 __all__ = ["render_readback", "write_readback"]
@@ -44,20 +43,13 @@ def render_readback(report: ReadbackReport) -> str:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Figure:
-    """A chart with its caption."""
-
-    title: str
-    note: str
-    svg: str
-
-
-def _figures(axis: AxisReadback) -> list[_Figure]:
+def _figures(axis: AxisReadback) -> list[Figure]:
     name = axis.axis.upper()
     marks = [Mark(axis.f_hz, f"{axis.f_hz:.1f} Hz")]
     return [
-        _figure(
+        captioned(
+            f"Axis {name}: spectrum of the acceleration",
+            "measured, by the model, and fitted: with the frequency found here",
             Chart(
                 about=f"Power spectrum of the acceleration of {name}, measured and predicted.",
                 x_title="frequency, Hz",
@@ -66,24 +58,20 @@ def _figures(axis: AxisReadback) -> list[_Figure]:
                 log=True,
                 marks=marks,
             ),
-            f"Axis {name}: spectrum of the acceleration",
-            "measured, by the model, and fitted: with the frequency found here",
+            _SIZE,
         ),
-        _figure(
+        captioned(
+            f"Axis {name}: around one corner",
+            "the one that rings most, 5 to 200 Hz",
             Chart(
                 about=f"Acceleration of {name} around one corner, measured and predicted.",
                 x_title="time, ms",
                 y_title="m/s²",
                 lines=_lines(axis.excerpt, 1e-3),
             ),
-            f"Axis {name}: around one corner",
-            "the one that rings most, 5 to 200 Hz",
+            _SIZE,
         ),
     ]
-
-
-def _figure(chart: Chart, title: str, note: str) -> _Figure:
-    return _Figure(title, note, draw(chart, *_SIZE))
 
 
 def _lines(curve: Curve, scale: float) -> list[Line]:

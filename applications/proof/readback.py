@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 
 from stillpath.applications.proof.figures import ReadbackReport
 from stillpath.applications.proof.judging import AxisMotion, judge
-from stillpath.applications.proof.matching import Match, Signal, band_pass, log_signal, match
-from stillpath.models.errors import ModelError
-from stillpath.models.identification.readers import read_measurements
-from stillpath.models.identification.types import AccelerationLog
+from stillpath.applications.proof.matching import (
+    Match,
+    Signal,
+    band_pass,
+    log_signal,
+    match,
+    read_log,
+)
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
 from stillpath.pipeline.progress import ProgressCallback
@@ -26,6 +30,7 @@ __all__ = ["verify_log"]
 
 Array = NDArray[np.float64]
 
+_RECORD = "record with ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) during the print"
 _RATE_HZ = 1000.0
 _LONGEST_S = 240.0
 """More of a log tells nothing new."""
@@ -61,7 +66,7 @@ def verify_log(
     ModelError
         The log cannot be read, or holds no accelerations.
     """
-    recorded = _recorded(log)
+    recorded = read_log(log, _RECORD)
     measured = log_signal(recorded)
     command = _planned(printed, machine, progress)
     specs = {a: machine.axes[a].nominal for a in ("x", "y")}
@@ -111,16 +116,6 @@ def _another_print(report: dict[str, Any], found: Match) -> ReadbackReport:
         sensor=[],
         axes=[],
     )
-
-
-def _recorded(log: Path) -> AccelerationLog:
-    (recorded, *_) = read_measurements(log)
-    if not isinstance(recorded, AccelerationLog):
-        raise ModelError(
-            f"{log.name} holds no raw accelerations but a {type(recorded).__name__}; record with "
-            "ACCELEROMETER_MEASURE (Klipper) or M956 (RepRapFirmware) while the print runs"
-        )
-    return recorded
 
 
 def _planned(printed: Path, machine: Machine, progress: ProgressCallback | None) -> Signal:

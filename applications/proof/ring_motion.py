@@ -23,6 +23,7 @@ from stillpath.applications.proof.ring_test import (
 from stillpath.models.errors import ModelError
 from stillpath.models.machine import Machine
 from stillpath.models.plants import PlantSpec, discretise
+from stillpath.models.runs import runs
 from stillpath.pipeline.file_motion import TextMotion
 from stillpath.pipeline.reading import dialect_for
 from stillpath.simulation.response import PlantStream
@@ -162,8 +163,7 @@ def _stops(
 
 def _runs_s(inside: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """Return from when until when something holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
-    return [(a / RATE_HZ, b / RATE_HZ) for a, b in edges.reshape(-1, 2).tolist()]
+    return [(first / RATE_HZ, end / RATE_HZ) for first, end in runs(inside)]
 
 
 def _plants(printed: Path) -> dict[Axis, str]:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stillpath.applications.controllers.page import STYLE, Figure, charted, short
+from stillpath.applications.controllers.page import STYLE, charted, short
 from stillpath.applications.scanning.figures import ScanReport, TrackFigures
 from stillpath.applications.scanning.scan import Scan
 from stillpath.pipeline.files import replacing
-from stillpath.reports.charts import Chart, Line
+from stillpath.reports.charts import Chart, Figure, Line
 from stillpath.reports.pages import rendered, style_of, write_texts
 
 __all__ = ["render_scan", "worst_tracks", "write_command", "write_scan"]

@@ -156,7 +156,7 @@ def _check_controller(controller: LoadedController | None, spec: LoopSpec) -> No
     if controller is not None and _machine(controller.spec) != _machine(spec):
         raise DesignError(
             f"the controller was designed for {controller.spec.name!r}, not for the loop of "
-            f"{spec.name!r}; design it anew"
+            f"{spec.name!r}; design it again"
         )
 
 

@@ -160,7 +160,7 @@ class WorkerPool:
     def _planned(self, item: Item) -> tuple[Found, Outcome]:
         """Return what the outcome will be, as far as it is known before the work."""
         if _shown(item.source) != str(item.source):
-            raise Failure("its name is no valid text; rename it", "file")
+            raise Failure("its name is not valid text; rename it", "file")
         if not item.machine:
             raise Failure(
                 "no pattern of --machine-map fits, and there is no --machine for the rest",

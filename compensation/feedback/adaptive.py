@@ -63,7 +63,7 @@ class FrequencyTracker:
         self.jumped = False
 
     def push(self, x: Array) -> tuple[float, ...]:
-        """Return the frequencies in Hz, rising, after the samples x; () while there are none."""
+        """Return the frequencies [Hz], rising, after samples x (n,); () while there are none."""
         now = self._now
         self.jumped = False
         power = float(np.mean(x**2))
@@ -150,7 +150,7 @@ class AdaptiveFmsdob:
         return add_on_blocks(self._loops[0], self._silent(), "servo")
 
     def hear(self, dhat: Array) -> Retuning | None:
-        """Return what to change after the samples `dhat`, None for nothing."""
+        """Return what to change after the samples `dhat`, shape (n,); None: nothing."""
         disturbance, self._memory = lfilter(*self._unloop, dhat, zi=self._memory)
         found = self.tracker.push(disturbance)
         moved, self._last = _apart(found, self._last), found

@@ -77,7 +77,7 @@ class LatticeBandPass:
         )
 
     def response(self, w: Array) -> Complex:
-        """Return Q_BP at w rad/sample."""
+        """Return Q_BP at w rad/sample, an array of any shape."""
         z = np.exp(1j * np.asarray(w, float))
         out = np.ones(len(z), complex)
         for num, den in self.notches():

@@ -4,7 +4,7 @@
 
 The delay stands in the model, not in an inverse: S = S0 (1 - L). A double integrator held over a
 sample has a zero at -1, and so has the bilinear transform of Q; the inverse of Gn* would ring
-there for ever. It is taken out of both before anything is realised (the paper's figure 15).
+there forever. It is taken out of both before anything is realised (the paper's figure 15).
 
 With P = z^-m Gn* E, S = S0 (1 - L) / (1 + S0 L (E - 1)).
 """

@@ -18,7 +18,7 @@ they lay at 0.97 (an exact inverse rings there: paper 004's own fast plant has t
 those outside are expanded into the future, which the period's delay has room for.
 
 A baseline with integral action lets no constant of the add-on through, V(1) = 0. A memory of
-constants would drift there for ever without a trace in y, so the mean over a period is taken out
+constants would drift there forever without a trace in y, so the mean over a period is taken out
 of it: zero at constants, untouched at the harmonics.
 """
 

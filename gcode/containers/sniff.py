@@ -36,7 +36,7 @@ _FOREIGN = {
     b"\x7fELF": "a program",
 }
 _STL_HEAD_BYTES = 84
-"""Of a binary STL model: a text that may be anything, and the number of facets, four bytes."""
+"""Header of a binary STL model: 80 arbitrary bytes and the number of facets in four."""
 _STL_FACET_BYTES = 50
 _SUFFIXES = {
     ".gcode": Kind.TEXT,

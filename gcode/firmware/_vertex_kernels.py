@@ -1,4 +1,4 @@
-"""Vertices on whole steps that the printer's answer tells from the command as little as possible.
+"""Choose vertices on whole motor steps whose rounding disturbs the printer's motion least.
 
 A place on whole steps lies up to half a step beside the command. When the motion passes there is
 free, though, so what counts is the distance across, and of the places around a command in motion

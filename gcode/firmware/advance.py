@@ -1,7 +1,8 @@
 """Pressure advance in the filament of a stream, where the firmware's own cannot be used.
 
 A firmware that adds advance during its ramps finds none in a stream of short segments, whose ramps
-last a part of a step. There its own is off, and the stream's filament is ahead by as much.
+last a part of a step. There its own is switched off, and the
+stream's filament is advanced by the same amount.
 """
 
 from __future__ import annotations
@@ -33,9 +34,8 @@ def feed_at_ends(
     """
     rows = np.maximum(np.searchsorted(timeline.row_start_s, segments.end_s, "right") - 1, 0)
     speed = _speed_at(piece.phases, rows, segments.end_s - timeline.row_start_s[rows])
-    direction = piece.phases.direction[rows]
-    prints = (direction[:, 3] > 0.0) & np.any(direction[:, :2] != 0.0, axis=1)
-    return rows, np.where(prints, direction[:, 3] * speed, 0.0), prints
+    prints = piece.phases.prints[rows]
+    return rows, np.where(prints, piece.phases.direction[rows, 3] * speed, 0.0), prints
 
 
 def final_segments(segments: Segments) -> NDArray[np.bool_]:
@@ -51,6 +51,6 @@ def _speed_at(
     down = np.clip(
         after_s - phases.accel_s[rows] - phases.cruise_s[rows], 0.0, phases.decel_s[rows]
     )
-    ends = after_s > phases.accel_s[rows] + phases.cruise_s[rows] + phases.decel_s[rows] + 1e-9
+    ends = after_s > phases.lasts_s[rows] + 1e-9
     speed = phases.start_mm_s[rows] + phases.accel_mm_s2[rows] * (up - down)
     return np.where(ends, 0.0, np.maximum(speed, 0.0))

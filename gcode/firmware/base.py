@@ -37,8 +37,7 @@ __all__ = [
 ]
 
 _CORNER_SHARE = 0.6
-"""Of the motors' step of speed, what a corner of a stream may take; the ramps around it have the
-rest."""
+"""Share of the motors' permitted step of speed for a corner; the ramps around it need the rest."""
 
 
 class Planner(Protocol):

@@ -157,7 +157,10 @@ def as_moves(
     speed_mm_s: NDArray[np.float64],
     limits_id: NDArray[np.int32],
 ) -> Moves:
-    """Return moves for a planner; lines count from 1 and stand for nothing."""
+    """Return moves for a planner from places (n, 4), speeds (n,) and rows of a table (n,).
+
+    Their lines count from 1 and stand for nothing.
+    """
     n = len(speed_mm_s)
     zeros, none = np.zeros(n, np.int32), np.full(n, -1, np.int32)
     count = np.arange(n, dtype=np.int64)
@@ -186,7 +189,7 @@ def encoded_piece(
     phases: Phases,
 ) -> Encoded:
     """Return the encoded piece with the times that the firmware's plan of its moves gives."""
-    duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    duration_s = phases.lasts_s
     start_s = timeline.start_s[0] + phases.t_s
     group_start_s = _group_starts(timeline, moves.group, start_s, duration_s)
     own = moves.row >= 0
@@ -208,12 +211,12 @@ def encoded_piece(
 
 def group_durations(phases: Phases, groups: Sequence[Group]) -> NDArray[np.float64]:
     """Return how long each group takes; `phases` has a row for every row of the piece."""
-    duration = phases.accel_s + phases.cruise_s + phases.decel_s
-    return np.array([duration[g.first : g.last].sum() for g in groups])
+    lasts_s = phases.lasts_s
+    return np.array([lasts_s[g.first : g.last].sum() for g in groups])
 
 
 def to_units(position_mm: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return positions in 1e-6 mm."""
+    """Return positions of any shape in 1e-6 mm."""
     return np.round(position_mm * UNITS_PER_MM).astype(np.int64)
 
 

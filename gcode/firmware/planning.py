@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.types import EventKind, Events, Phases, ProgramBlock
+from stillpath.gcode.types import EventKind, Events, Phases, ProgramBlock, joined
 
 __all__ = [
     "STOPPING",
@@ -29,13 +29,13 @@ STOPPING = frozenset({EventKind.STOP, EventKind.UNKNOWN, EventKind.SHAPER})
 LONGEST_MOVE_S = 1200.0
 """A single move that takes longer is taken for a mistake; a bed that is lowered takes minutes."""
 LONGEST_PRINT_S = 3.6e6
-"""So is a print that takes longer: a small file must not keep a computer busy for days."""
+"""Longer prints are refused: a small file must not keep a computer busy for days."""
 
 _HALF = 0.501
-"""Of a step: what rounding may bring, and the last digits."""
+"""Half a step, the most that rounding changes, with room for the last digits."""
 
 _STOPS = np.array([kind in STOPPING for kind in EventKind])
-"""By the number of an event's kind."""
+"""Whether the motion rests, indexed by the number of an event's kind."""
 
 
 def stops(events: Events) -> NDArray[np.bool_]:
@@ -107,7 +107,7 @@ def check_moves_end(phases: Phases, line: Callable[[int], int]) -> None:
     GcodeError
         For the slowest of them.
     """
-    lasts_s = phases.accel_s + phases.cruise_s + phases.decel_s
+    lasts_s = phases.lasts_s
     if np.all(lasts_s <= LONGEST_MOVE_S):
         return
     row = int(np.argmax(lasts_s))
@@ -151,16 +151,7 @@ def between_stops(block: ProgramBlock) -> Iterator[tuple[int, int, float | None]
 def join_phases(parts: Sequence[Phases]) -> Phases:
     """Put phases one after the other."""
     parts = [part for part in parts if len(part)]
-    if len(parts) == 1:
-        return parts[0]
-    if not parts:
-        return empty_phases()
-    return Phases(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in Phases.__dataclass_fields__
-        )
-    )
+    return joined(parts) if parts else empty_phases()
 
 
 def empty_phases(n: int = 0) -> Phases:

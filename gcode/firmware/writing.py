@@ -1,7 +1,7 @@
 """The written file: our lines among those of the original, with the printer's state kept right.
 
-Lines that are not ours leave byte for byte. Whatever the stream needs different (limits, firmware
-shaper, modes) is set before its first line and restored before any line that could depend on it.
+Lines of the original are written byte for byte. Whatever the stream needs different (limits, modes,
+firmware shaper) is set before its first line, and restored before any line that may depend on it.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ class StreamWriter:
         lead = self._off(verbatim, extruder_mm)
         if self._marked is not None:
             self._marked = verbatim.limits_after
-        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)):
-            line = verbatim.line_text(int(events.byte_start[row]), int(events.byte_end[row]))
+        for row in np.flatnonzero(np.isin(events.kind, _SHAPED)).tolist():
+            line = verbatim.line(events, row)
             conflict = self._stream_commands.conflict(line)
             if conflict is not None:
                 raise GcodeError(conflict, line=int(events.line[row]))
@@ -262,7 +262,7 @@ class StreamWriter:
     def _event(self, piece: Piece, k: int, kind: int, extruded_mm: float) -> bytes:
         """Text of event k of a piece; `extruded_mm` is where the extruder stands as written."""
         events = piece.events
-        line = piece.line_text(int(events.byte_start[k]), int(events.byte_end[k]))
+        line = piece.line(events, k)
         if kind == EventKind.LIMITS:
             return _held_back(line)
         if kind != EventKind.MODE or self._modal is None:
@@ -287,7 +287,7 @@ class StreamWriter:
 
     def _rest_line(self, piece: Piece, row: int, extruded_mm: float) -> bytes:
         moves = piece.moves
-        line = piece.line_text(int(moves.byte_start[row]), int(moves.byte_end[row]))
+        line = piece.line(moves, row)
         code = line.split(b";", 1)[0]
         state = piece.modal[int(moves.modal_id[row])]
         # The file's own moves run under its own limits.
@@ -444,8 +444,7 @@ class StreamWriter:
         worth that: the next stream takes care of its vibration. Nor is what somebody chose to leave
         out, but its filament is the slicer's, and needs the firmware's pressure advance.
         """
-        travel = verbatim.moves.end_mm - verbatim.moves.start_mm
-        prints = bool(np.any((travel[:, :2] != 0.0).any(axis=1) & (travel[:, 3] > 0.0)))
+        prints = bool(np.any(verbatim.moves.prints))
         # A line that sets a part of the shaper finds the other parts as they were.
         foreign = bool(np.any(np.isin(verbatim.events.kind, _SHAPED)))
         aside = isinstance(verbatim, LeftOut)  # between streams again and again

@@ -63,8 +63,8 @@ class SlicerFacts:
         Empty where the file does not say.
     flavor : str
         Which firmware the slicer wrote for, in its own words: ``klipper``, ``marlin2``, ``RepRap``.
-    estimate_s, silent_estimate_s, first_layer_s : float or None
-        The slicer's estimate for the print, for the silent mode, for the first layer.
+    estimate_s : float or None
+        The slicer's estimate for the print.
     settings : mapping of str to str
         As they stand in the file.
     """
@@ -73,8 +73,6 @@ class SlicerFacts:
     version: str = ""
     flavor: str = ""
     estimate_s: float | None = None
-    silent_estimate_s: float | None = None
-    first_layer_s: float | None = None
     settings: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def numbers(self, key: str) -> tuple[float, ...]:
@@ -130,7 +128,7 @@ def read_facts(file: BinaryIO) -> SlicerFacts:
 
 def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
     """Return what the two ends of a text say."""
-    estimate, silent, first_layer = _estimates(head, tail)
+    estimate_s = _estimate_s(head, tail)
     # Nearly all of it are moves, which no pattern below looks at.
     head, tail = _comments(head), _comments(tail)
     slicer, version = _identity(head)
@@ -140,9 +138,7 @@ def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
         slicer=slicer,
         version=version,
         flavor=settings.get("gcode_flavor", _text(flavor[1]).strip() if flavor else ""),
-        estimate_s=estimate,
-        silent_estimate_s=silent,
-        first_layer_s=first_layer,
+        estimate_s=estimate_s,
         settings=MappingProxyType(settings),
     )
 
@@ -161,23 +157,16 @@ def _identity(head: bytes) -> tuple[str, str]:
     return "", ""
 
 
-def _estimates(head: bytes, tail: bytes) -> tuple[float | None, float | None, float | None]:
+def _estimate_s(head: bytes, tail: bytes) -> float | None:
     totals: list[float] = []
-    silent = first_layer = None
     for part in (head, tail):
         for line in _time_lines(part):
             told = [time for time in read_times(line[0]) if not line[0].startswith(b"M73")]
             # Of several in a line the last one is the whole.
-            for time in told[-1:]:
-                if time.kind is TimeKind.FIRST_LAYER and not time.silent:
-                    first_layer = time.seconds
-                elif time.kind is TimeKind.TOTAL and time.silent:
-                    silent = time.seconds
-                elif time.kind is TimeKind.TOTAL:
-                    totals.append(time.seconds)
+            if told and told[-1].kind is TimeKind.TOTAL and not told[-1].silent:
+                totals.append(told[-1].seconds)
     known = [total for total in totals if total not in (0.0, _PLACEHOLDER_S)]
-    estimate = next(iter(known or totals), None)
-    return estimate, silent, first_layer
+    return next(iter(known or totals), None)
 
 
 def _time_lines(text: bytes) -> Iterator[re.Match[bytes]]:

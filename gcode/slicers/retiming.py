@@ -129,7 +129,7 @@ class Retiming:
                 self._layer_delay_s = float(delay_s[second[0]])
         at = 0
         for row in _candidates(item):
-            line = item.line_text(int(item.events.byte_start[row]), int(item.events.byte_end[row]))
+            line = item.line(item.events, row)
             kind = _what_it_tells(line)
             if kind is None:
                 continue

@@ -1,7 +1,7 @@
 """Stillpath as a post-processing script of Cura.
 
 Copy this file into the folder ``scripts`` of Cura's configuration folder (*Help, Show
-configuration folder*) and start Cura anew; *Extensions, Post processing, Modify G-code* then offers
+configuration folder*) and restart Cura; *Extensions, Post processing, Modify G-code* then offers
 it. Cura's own Python runs it, so it needs nothing but the standard library: the work is done by the
 program `stillpath-post`, or by a server. Set-up: docs/slicer-setup.md.
 """
@@ -186,7 +186,7 @@ class Stillpath(Script):
             Logger.log("e", "Stillpath: %s", error)
             _show(
                 f"The print is NOT compensated: {error}\n\nCura takes the G-code as processed: "
-                "slice anew to try again.",
+                "slice again to try again.",
                 "ERROR",
             )
             return data
@@ -411,7 +411,7 @@ class Service:
         if not host:
             raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
         if not (key.isascii() and key.isprintable()):
-            raise Failure("the key holds characters that no key has; copy it anew")
+            raise Failure("the key holds characters that no key has; copy it again")
         self._address = address
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
@@ -615,7 +615,7 @@ def _host_of(address: str) -> str:
     try:
         parts = urlsplit(address)
         fits = parts.scheme in ("http", "https") and parts.port != 0 and parts.path.isascii()
-    except ValueError:  # a port that is no number, half an IPv6 address
+    except ValueError:  # a port that is not a number, half an IPv6 address
         return ""
     return (parts.hostname or "") if fits and address.isprintable() and " " not in address else ""
 

@@ -116,7 +116,7 @@ class Stillpath:
             with contextlib.suppress(Refused):  # deleted meanwhile
                 job = self._enqueue(entry["file"], False, force=True)
                 if entry.get("print_after"):
-                    job["held"] = "Moonraker was started anew meanwhile"
+                    job["held"] = "Moonraker was restarted meanwhile"
         self._worker = asyncio.create_task(self._work())
 
     async def close(self) -> None:
@@ -385,7 +385,7 @@ class Stillpath:
         if now.get("state") in _BUSY and now.get("filename") == name:
             raise Refused(f"{name} is being printed; compensate again after the print")
         if result.exists() and not _is_stamped(result):
-            raise Refused(f"{name} is there and was not made by Stillpath; rename it")
+            raise Refused(f"{name} already exists and was not made by Stillpath; rename it")
 
     async def _after(self, job: dict[str, Any]) -> None:
         """Print the result if that is wanted and the printer is idle."""

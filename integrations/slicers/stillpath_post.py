@@ -524,7 +524,7 @@ class Service:
         if not host:
             raise Failure(f"{address!r} is not the address of a server, like http://127.0.0.1:8000")
         if not (key.isascii() and key.isprintable()):
-            raise Failure("the key holds characters that no key has; copy it anew")
+            raise Failure("the key holds characters that no key has; copy it again")
         self._address = address
         self._headers = {"Authorization": f"Bearer {key}"} if key else {}
         self._timeout_s = timeout_s
@@ -728,7 +728,7 @@ def _host_of(address: str) -> str:
     try:
         parts = urlsplit(address)
         fits = parts.scheme in ("http", "https") and parts.port != 0 and parts.path.isascii()
-    except ValueError:  # a port that is no number, half an IPv6 address
+    except ValueError:  # a port that is not a number, half an IPv6 address
         return ""
     return (parts.hostname or "") if fits and address.isprintable() and " " not in address else ""
 

@@ -141,7 +141,7 @@ def low_frequency_delay(f_hz: Array, response: ComplexArray) -> float:
 
 
 def on_grid(response: FrequencyResponse, f_hz: Array) -> FrequencyResponse:
-    """Return the response at `f_hz`, linear between its points."""
+    """Return the response at `f_hz`, shape (n,), linear between its points."""
     own = response.f_hz
     if np.array_equal(own, f_hz):
         return response

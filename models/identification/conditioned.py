@@ -1,4 +1,4 @@
-"""What runs with a weight on the bed, or with the nozzle at places, say of how an axis changes."""
+"""How an axis changes with weight on the bed or with position, from runs under such conditions."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def estimate_aligned(
 
 
 def response_at(aligned: AlignedLog, f_hz: Array) -> LocalResponse:
-    """Return what an aligned log says of the frequencies `f_hz`."""
+    """Return the response of an aligned log at the frequencies `f_hz`, shape (n,)."""
     record = _transformed(
         aligned.command_mm_s2, aligned.measured_mm_s2, aligned.rate_hz, taper=_TAPER
     )

@@ -49,12 +49,12 @@ _CLEARLY = 0.7
 _EXPLAINED = 1.3
 """A residual below this multiple of the noise is noise."""
 _NO_WORSE = 1.05
-"""What may be lost for a model that is minimum phase, or has a pair less."""
+"""Largest growth of the residual for a model that is minimum phase, or has a pair less."""
 _ZERO_BAND = 0.8
 """Zeros above this share of the band trade off with the delay: to be non-minimum phase they must
 pay like a pair of poles, and beyond the band nothing proves it."""
 _EARLIER_S = 25e-3
-"""The delay that the phase's slope shows has the plant's own in it, so the true one is earlier:
+"""The slope of the phase contains the delay of the plant itself, so the dead time is shorter: by
 2 zeta/w of every pole pair, 20 ms for two well damped ones at 20 Hz."""
 _LATER_S = 2e-3
 _DELAY_STEP_S = 0.5e-3
@@ -64,7 +64,7 @@ _START_POINTS = 160
 _POLES_BAND = (0.5, 1.6)
 """Poles may lie outside the band by these factors."""
 _ZEROS_BAND = (0.5, 10.0)
-"""Zeros so far above that there are as good as none."""
+"""The same for zeros; at the upper end they are as good as none."""
 _ZETA = (3e-3, 3.0)
 _TINY = 1e-9
 _FAR_ZERO = 3.0
@@ -118,9 +118,7 @@ def fit_response(
     return replace(_as_fit(data, chosen), trials=trials)
 
 
-def refit_response(
-    measured: FrequencyResponse, like: Fit, *, band_hz: tuple[float, float] | None = None
-) -> Fit:
+def refit_response(measured: FrequencyResponse, like: Fit) -> Fit:
     """Fit a plant with the pairs of `like`, starting from it: a member of its set.
 
     A zero keeps its side of the imaginary axis.
@@ -132,7 +130,7 @@ def refit_response(
     """
     if not isinstance(like.spec, PairsSpec):
         raise ModelError("a plant of pairs is needed to start from; fit a response first")
-    data = response_data(measured, band_hz)
+    data = response_data(measured)
     structure = PairStructure(len(like.spec.poles), len(like.spec.zeros), data.unit_hz)
     theta = structure.parameters(like.spec)
     ratio = data.response / structure.response(theta, data.f_hz)

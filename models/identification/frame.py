@@ -20,17 +20,16 @@ __all__ = ["LIKELY", "frame_hz_of", "likely_of", "shaken", "without_frame"]
 P = TypeVar("P", bound=PlantSpec)
 
 _HIGHEST_HZ, _BELOW, _SHARE = 30.0, 0.7, 0.25
-"""What may be a frame: no higher, well below the strongest mode, of no more share."""
+"""A frame's mode is at most this high, this ratio to the strongest mode, and this large a share."""
 LIKELY = 0.8
-"""That a weak mode far below the strongest is the frame's. A response shows it, but may be wrong
-about whose it is. Designed for the nozzle, what the frame does makes prints worse by more than it
-can win (docs/tried.md)."""
+"""Probability that a weak mode far below the strongest is the frame's. A response shows the mode,
+not whose it is. Taking the frame's for the nozzle's costs more than the reverse (docs/tried.md)."""
 _UNLIKE, _UNLIKE_LIKELY = 1.4, 0.3
 """A frame stands on the same feet in X and in Y, and its frequencies there are alike: within 1.3
-times in spectra of virtual printers. What lies further apart is not one frame, and rather something
+times in spectra of virtual printers. Modes further apart are not of one frame, and rather something
 that the nozzle feels."""
 _BESIDE = 0.25
-"""Logarithm of the ratio of a pair of zeros to the pair of poles that it belongs to."""
+"""Largest |log| of the ratio of a pair of zeros to the pair of poles that it belongs to."""
 
 
 def shaken(crowd: Sequence[P], rng: np.random.Generator, likely: float) -> list[P]:

@@ -83,8 +83,6 @@ _KINDS: dict[type, Kind] = {
 _BEST_FIRST = (PlantModel, AccelerationLog, DrivenLog, FrequencyResponse, Spectrum)
 """Where an axis has measurements of several kinds, the first kind is used."""
 
-"""How readers mark notes that the user must look at."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:

@@ -1,4 +1,4 @@
-"""What a person should know of a measurement and of the model that was fitted to it."""
+"""Notes and warnings about a measurement and about the model that was fitted to it."""
 
 from __future__ import annotations
 

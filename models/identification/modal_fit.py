@@ -45,9 +45,9 @@ _AS_GOOD, _EXPLAINED, _IRRELEVANT = 1.05, 1.3, 0.005
 half a percent: no axis is more linear than that."""
 _CLEARLY = 0.7
 _LEAST_PEAK, _LEAST_SHARE = 0.1, 0.005
-"""What a mode adds to |G| at its own frequency, and far below it."""
+"""Least that a mode must add to |G|: at its own frequency, or far below it."""
 _ASSUMED = (1e-3, 0.01)
-"""Relative deviation of frequency and damping by what damping is assumed to act on."""
+"""Relative change of frequency and damping due to the assumption of where damping acts."""
 _POLES_BAND, _ZETA, _SHARE = (1.1, 1.6), (3e-3, 1.0), (-2.0, 2.5)
 _UNSEEN_ZETA = 0.03
 _EARLIER_S, _DELAY_STEP_S = 10e-3, 0.25e-3

@@ -42,7 +42,7 @@ class ModalStructure:
         return 3 * self.modes - 1 + self.grounded
 
     def split(self, theta: Array) -> tuple[Array, Array, Array]:
-        """Return frequencies (in units), damping ratios and shares."""
+        """Return frequencies (in units), damping ratios and shares, shape (modes,) each."""
         n = self.modes
         shares = theta[2 * n : 3 * n - 1]
         return np.exp(theta[:n]), np.exp(theta[n : 2 * n]), np.append(shares, 1.0 - shares.sum())
@@ -83,7 +83,7 @@ class ModalStructure:
         return np.asarray(gradient / response[:, None])
 
     def parameters(self, f_hz: Array, zeta: Array, share: Array, grounded: float = 0.0) -> Array:
-        """Return the vector of the modes given; shares are made to add up to 1."""
+        """Return the vector of modes, shape (modes,) each; shares are made to add up to 1."""
         share = share + (1.0 - share.sum()) / len(share)
         last = [grounded] if self.grounded else []
         return np.concatenate([np.log(f_hz / self.unit_hz), np.log(zeta), share[:-1], last])
@@ -94,7 +94,7 @@ class ModalStructure:
         return self.parameters(f_hz, zeta, share, spec.modes[0].grounded)
 
     def spec(self, theta: Array) -> RelativeModesSpec:
-        """Return the plant, its modes rising in frequency."""
+        """Return the plant of a vector (size,), its modes rising in frequency."""
         f, zeta, share = self.split(theta)
         grounded = float(np.clip(theta[-1], 0.0, 1.0)) if self.grounded else 0.0
         return RelativeModesSpec(

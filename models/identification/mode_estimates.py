@@ -1,4 +1,4 @@
-"""Resonances of a fit with their standard deviations, and which of them are none."""
+"""Resonances of a fit with their standard deviations, and which of them are not real."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def band_warnings(modes: tuple[ModeEstimate, ...], band_hz: tuple[float, float])
 
 
 def correlation_factor(residual: NDArray[np.inexact]) -> float:
-    """Return 1 + 2 sum rho_k over the first lags whose correlation is clear."""
+    """Return 1 + 2 sum rho_k of residuals (m,) over the first lags with a clear correlation."""
     m = len(residual)
     power = float(np.real(np.vdot(residual, residual)))
     if power == 0:

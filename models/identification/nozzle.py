@@ -34,17 +34,17 @@ ComplexArray = NDArray[np.complex128]
 _POINTS = 160
 _STARTS_HZ = (9.0, 13.0, 18.0, 25.0)
 _START = (0.15, 0.08)
-"""Damping of the feet and mass ratio."""
+"""Start values: damping of the feet, mass ratio."""
 _F_HZ, _ZETA, _MU = (6.0, 35.0), (0.03, 0.5), (0.0, 0.5)
 _ZETA_SPREAD = 0.4
-"""Of feet, in the logarithm: a response may hardly tell."""
+"""Prior standard deviation of log damping of the feet: a response may hardly show it."""
 _MODES_ZETA, _MODES_SHARE, _MODES_BAND = (5e-3, 0.8), (-2.0, 2.5), (0.9, 1.6)
 _LATE_S = 10e-3
 _MODES_START, _BEYOND, _PROMINENCE = 0.06, 1.3, 0.2
 _BELOW = 0.8
-"""A frame's frequency against that of the main mode."""
+"""Highest frequency of a frame, relative to the main mode."""
 _LEAST_MU, _CLEARLY = 0.01, 0.9
-"""A frame is there if it is this heavy and this much less is left with it."""
+"""A frame exists from this mass ratio on, if it brings the residual below the second share."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Frame:
     level: float = 1.0
 
     def reaction(self, f_hz: Array) -> ComplexArray:
-        """Return R."""
+        """Return R at the frequencies, shape (len(f_hz),)."""
         s = 1j * f_hz / self.f_hz
         return np.asarray(self.mass_ratio * s * s / (s * s + 2 * self.zeta * s + 1))
 

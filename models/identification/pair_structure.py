@@ -108,7 +108,7 @@ class PairStructure:
         )
 
     def spec(self, theta: Array) -> PairsSpec:
-        """Return the plant, its pairs rising in frequency."""
+        """Return the plant of a vector (size,), its pairs rising in frequency."""
         tau, log_f, log_z, log_fz, zz = self.split(theta)
         poles = sorted(zip(np.exp(log_f) * self.unit_hz, np.exp(log_z), strict=True))
         zeros = sorted(zip(np.exp(log_fz) * self.unit_hz, zz, strict=True))

@@ -1,4 +1,4 @@
-"""Plants whose slow motion is not late: what a recording without a common clock can say."""
+"""Plants without delay of slow motion: all that a recording without a common clock can tell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stillpath.models.plants import PairsSpec, PlantSpec, PolePair, RelativeMode
 __all__ = ["advanced", "delay_of", "prompt"]
 
 _MOST_ZETA = 10.0
-"""Of a pair of real zeros: beyond, one of them lies decades away."""
+"""Largest damping ratio of a pair of real zeros: beyond, one of them lies decades away."""
 
 
 def prompt(fit: Fit) -> PlantSpec:

@@ -34,8 +34,8 @@ _POINTS = 120
 _LEAST_SD = 0.005
 """Relative; no axis is more linear than that."""
 _LOST, _NOTHING = 3.0, 0.9
-"""Times the usual residual of a draw, and of what there is to explain: a fit that leaves more has
-lost its way."""
+"""A fit has failed if its residual exceeds this multiple of the usual one of a draw, or this share
+of the response."""
 _RUN_TO_RUN = (0.007, 0.12)
 """Relative standard deviation of frequencies and damping within a session, on real axes."""
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 GAIN = (1e-9, 1e9)
-"""Of any two units."""
+"""Bounds of the gain, wide enough for any two units."""
 _ROUNDS = 60
 
 
@@ -29,7 +29,7 @@ class Structure(Protocol):
         """Unit of frequencies."""
 
     def response(self, theta: Array, f_hz: Array) -> ComplexArray:
-        """Return G at the frequencies."""
+        """Return G at the frequencies, shape (len(f_hz),)."""
 
     def log_gradient(self, theta: Array, f_hz: Array) -> ComplexArray:
         """Return the derivatives of log G, shape (len(f_hz), len(theta))."""
@@ -58,7 +58,7 @@ class Candidate(Generic[S]):
         return float(self.vector[1] / (2 * np.pi * self.structure.unit_hz))
 
     def model(self, f_hz: Array) -> ComplexArray:
-        """Return what would be measured."""
+        """Return the response that would be measured, shape (len(f_hz),)."""
         nuisance = np.exp(self.vector[0] - 1j * f_hz / self.structure.unit_hz * self.vector[1])
         return np.asarray(nuisance * self.structure.response(self.theta, f_hz))
 

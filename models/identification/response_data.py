@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import low_frequency_delay
 from stillpath.models.identification.types import FrequencyResponse
+from stillpath.models.runs import runs
 
 __all__ = ["LEAST_COHERENCE", "ResponseData", "coherent", "coherent_part", "response_data"]
 
@@ -115,8 +116,7 @@ def response_data(
 def coherent(coherence: Array) -> NDArray[np.bool_]:
     """Return which points are coherent, or not known not to be; short runs of them are not."""
     coherent = ~(coherence < LEAST_COHERENCE)
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], coherent, [False]]).astype(int)))
-    for first, end in ends.reshape(-1, 2):
+    for first, end in runs(coherent):
         if end - first < _LEAST_RUN * len(coherence):
             coherent[first:end] = False
     return np.asarray(coherent, np.bool_)

@@ -31,6 +31,7 @@ from stillpath.models.identification.ripple_observability import (
 from stillpath.models.plants import DiscretePlant
 from stillpath.models.response_kernels import dense_response
 from stillpath.models.ripple import AxisRipple, RippleHarmonic, RippleSide, RippleSource
+from stillpath.models.runs import runs
 
 __all__ = ["PassLog", "RippleLearning", "WaveBasis", "learn_ripple", "update_ripple"]
 
@@ -88,15 +89,12 @@ class RippleLearning:
     ----------
     ripple : AxisRipple
     observability : tuple of Observability
-    residual_rms : float
-        What the waves do not explain, in the unit of the log.
     explained : float
         Share of the log's deviation (rms) that the waves explain, 0..1.
     """
 
     ripple: AxisRipple
     observability: tuple[Observability, ...]
-    residual_rms: float
     explained: float
 
 
@@ -157,7 +155,7 @@ def learn_ripple(
     ripple = _axis_ripple(_sources(basis, amplitudes, sd_mm), homing_repeatability_mm)
     total = _rms_beside(matrix[:, 2 * waves :], aim)
     explained = 1.0 - min(residual / total, 1.0) if total > 0 else 0.0
-    return RippleLearning(ripple, seen, residual, explained)
+    return RippleLearning(ripple, seen, explained)
 
 
 def _solved(matrix: Array, aim: Array, waves: int) -> tuple[Complex, Array, float]:
@@ -332,13 +330,9 @@ def _steady(command: Array, plant: DiscretePlant) -> slice:
         return slice(0, 0)
     same = np.abs(np.diff(speed)) <= _STEADY * np.abs(speed).max()
     same &= np.abs(speed[1:]) > 0.05 * np.abs(speed).max()
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]])))
-    starts, ends = edges[::2], edges[1::2]
-    if len(starts) == 0:
-        return slice(0, 0)
-    longest = int(np.argmax(ends - starts))
-    settled = int(starts[longest]) + math.ceil(plant.settling_time_s(1e-3) / plant.dt_s)
-    return slice(min(settled, int(ends[longest])), int(ends[longest]))
+    start, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
+    settled = start + math.ceil(plant.settling_time_s(1e-3) / plant.dt_s)
+    return slice(min(settled, end), end)
 
 
 def _speed(log: PassLog, steady: slice, dt_s: float) -> float:

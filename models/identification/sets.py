@@ -40,6 +40,7 @@ __all__ = [
     "PARAMETRIC_SPREAD",
     "Origin",
     "delay_warning",
+    "measured_modes",
     "parametric_members",
     "plant_set_from",
     "provenance_of",
@@ -76,14 +77,14 @@ _UNKNOWN = Origin()
 _MOST_MEMBERS = 15
 _SIGMAS = 3.0
 _NO_DIFFERENCE = 0.02
-"""Relative; at low frequency a delay and a zero beyond the band trade off by as much."""
+"""Relative difference of responses that is none: a delay and a far zero trade off by as much."""
 _BAD_MEMBER = 3.0
 _FEW_REPEATS = 1.25
-"""Two or three repeats show less scatter than there is."""
+"""Factor on the scatter of two or three repeats, which show less than there is."""
 _POINTS = 200
 _DELAYS_DIFFER_S = 0.2e-3
 _MOST_GROUNDED = 0.5
-"""Of the damping that may act against the frame, in viscous guides."""
+"""Largest share of the damping that may act against the frame (viscous guides)."""
 
 
 def response_set(
@@ -253,20 +254,25 @@ def provenance_of(
         residual=fit.residual,
         delay_s=fit.delay_s,
         gain=fit.gain,
-        modes=tuple(
-            MeasuredMode(
-                f_hz=m.f_hz,
-                zeta=m.zeta,
-                f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
-                zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
-            )
-            for m in fit.modes
-        ),
+        modes=measured_modes(fit),
         trust_below_hz=fit.trust_below_hz,
         phase="not measured" if fit.magnitude_only else "aligned at low frequency",
         slow_delay_s=delays_s,
         coherent_share=share,
         coherent_band_hz=band_hz,
+    )
+
+
+def measured_modes(fit: Fit) -> tuple[MeasuredMode, ...]:
+    """Return the modes of a fit as documents have them: without what is not known."""
+    return tuple(
+        MeasuredMode(
+            f_hz=m.f_hz,
+            zeta=m.zeta,
+            f_sd_hz=m.f_sd_hz if np.isfinite(m.f_sd_hz) else None,
+            zeta_sd=m.zeta_sd if np.isfinite(m.zeta_sd) else None,
+        )
+        for m in fit.modes
     )
 
 

@@ -46,7 +46,7 @@ from stillpath.models.identification.types import (
 )
 from stillpath.models.plants import RelativeModesSpec
 
-__all__ = ["Explained", "Explanations", "explain_spectra", "explanations", "refit_spectrum"]
+__all__ = ["Explained", "Explanations", "explanations", "refit_spectrum"]
 
 Array = NDArray[np.float64]
 
@@ -184,19 +184,6 @@ def explanations(
     )
 
 
-def explain_spectra(
-    spectra: Sequence[Spectrum],
-    excitation: Excitation,
-    *,
-    column: str | None = None,
-    frame_likely: float = LIKELY,
-    max_order: int = 4,
-) -> Explained:
-    """Find the plants that explain spectra of an axis: `explanations`, and the set of them."""
-    found = explanations(spectra, excitation, column=column, max_order=max_order)
-    return found.explained(frame_likely)
-
-
 def _explanations(
     search: Search, found: Sequence[Candidate], progress: Callable[[float], None] | None
 ) -> tuple[list[Candidate], list[Candidate]]:
@@ -220,7 +207,7 @@ def refit_spectrum(
     Raises
     ------
     ModelError
-        As `explain_spectra`.
+        As `explanations`.
     """
     name = _column(spectrum, column)
     search = Search(spectrum, name, excitation, [spectrum], len(like.modes))

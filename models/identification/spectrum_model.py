@@ -56,7 +56,7 @@ class SpectrumModel:
         return float(self.f_hz[0]), float(self.f_hz[-1])
 
     def log_spectrum(self, structure: ModalStructure, vector: Array) -> Array:
-        """Return log S for the parameters [log gain, log noise, modes ...]."""
+        """Return log S, shape (bins,), for the parameters [log gain, log noise, modes ...]."""
         return self.log_spectrum_and_gradient(structure, vector)[0]
 
     def log_spectrum_and_gradient(

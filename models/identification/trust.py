@@ -19,13 +19,13 @@ __all__ = ["check_axes", "check_informative", "keeps_time"]
 
 _LEAST_SHARE, _LEAST_COUNT = 0.1, 30
 _PRINTERS_HZ = 150.0
-"""Where modes of printers are: further up nothing need follow."""
+"""Printers have their modes below this frequency: a model need not follow above it."""
 _MOST_UNSURE = 0.05
 """Relative standard deviation of the frequency of the mode that rings most."""
 _MOST_LEVEL = 2.0
 _MOST_APART_S = 2e-3
-"""Between the delays of two axes: no drive, belt or sensor makes more than one of them late by so
-much, a wrong clock or noise does."""
+"""Largest plausible difference between the delays of two axes: beyond it, a wrong clock or noise
+is the cause rather than a drive, belt or sensor."""
 _MEASURE = (
     "Measure the whole band: Klipper's TEST_RESONANCES with OUTPUT=raw_data, or a swept sine from "
     "5 to 130 Hz, with the sensor on what moves (the head; the bed of a bed slinger)"

@@ -94,8 +94,7 @@ def wanted_accel(
         NaN for moves that print nothing in X or Y.
     file : ndarray, shape (n,)
     """
-    way = moves.end_mm - moves.start_mm
-    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
+    prints = moves.prints
     used, place = np.unique(moves.limits_id, return_inverse=True)
     file = np.array([adviser.accel_mm_s2(limits[k]) for k in used.tolist()])[place.reshape(-1)]
     wanted = np.where(prints, file, np.nan)

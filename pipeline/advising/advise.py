@@ -357,7 +357,7 @@ class _Job:
         before, shaper = original.channels()
         if self._before.is_on or any(label != OFF.label for label in asked.shapers):
             before = before.model_copy(update={"label": "as sliced, with the firmware's shaper"})
-        after = advised.channels()[0].model_copy(update={"label": "advised"})
+        after = advised.channels("advised")[0]
         features = _merged(original.features(names), advised.features(names))
         return Result(
             version=__version__,

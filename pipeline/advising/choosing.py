@@ -28,8 +28,9 @@ from stillpath.pipeline.advising.advice import (
     is_visible,
     wanted_accel,
 )
-from stillpath.pipeline.advising.trials import Trial, members_of
+from stillpath.pipeline.advising.trials import Trial
 from stillpath.pipeline.measuring.reference_shaper import FREQUENCIES_HZ
+from stillpath.pipeline.measuring.set_errors import machine_numbers
 from stillpath.pipeline.pacing.samples import FileSamples
 from stillpath.pipeline.piece_compensator import DT_S
 
@@ -38,16 +39,16 @@ __all__ = ["AsSliced", "Choice", "choose", "ladder"]
 DAMPING = 0.1
 _LOW_MM_S2, _RATIO = 500.0, 1.2
 _LOWEST_MM_S2, _LOW_RATIO = 100.0, 1.5
-"""Below `_LOW_MM_S2` walls go only if nothing else brings them within their bound."""
+"""Walls go below `_LOW_MM_S2` only if nothing else brings them within their bound."""
 _AIM = 0.95
-"""Part of a bound that the samples may use."""
+"""Share of a bound that the samples may use."""
 _POINTS, _MEMBERS = 1000, 5
-"""What frequencies are tuned with; all members decide in the end."""
+"""Points and members with which frequencies are tuned; all members decide in the end."""
 _COARSE = 6
 _TUNED_LEVELS = 5
 _MENDING_ROUNDS = 4
 _UNLIKE = 2.0
-"""How much more or less than the whole file samples may be said to err."""
+"""Largest ratio between the samples' errors and those of the whole file, either way."""
 _SAME_TIME, _ROUNDING = 0.002, 1.001
 LEVEL_STEP = 0.02
 
@@ -176,7 +177,7 @@ def choose(
     shaped : bool
         A shaper may be advised.
     """
-    members = members_of(machine, DT_S)
+    members = machine_numbers(machine, DT_S)
     as_sliced = Trial(samples, {}, machine, adviser, DT_S, members)
     features = [f for f in as_sliced.features if _free(f, sliced.names)]
     visible = {f for f in features if is_visible(sliced.names[f] if f >= 0 else "")}
@@ -346,7 +347,7 @@ def _candidates(
     levels = sliced.levels
     count = len(levels)
     made = [_Candidate([sliced.shaping] * count, ours=False)]
-    members = members_of(machine, DT_S)
+    members = machine_numbers(machine, DT_S)
     few = [members[0], *members[1 :: max(1, -(-(len(members) - 1) // _MEMBERS))]]
     tuned = np.unique(np.linspace(0, count - 1, min(count, _TUNED_LEVELS)).round().astype(int))
     logs: dict[str, list[tuple[float, float]]] = {kind: [] for kind in kinds}

@@ -141,11 +141,7 @@ class AdviceWriter:
     def _event(self, block: ProgramBlock, row: int) -> bytes:
         events = block.events
         kind = int(events.kind[row])
-        first, last = (
-            int(events.byte_start[row]) - block.text_offset,
-            int(events.byte_end[row]) - block.text_offset,
-        )
-        line = block.text[first:last]
+        line = block.line(events, row)
         lead = b""
         if kind == EventKind.UNKNOWN:
             lead = self._give_back()

@@ -73,8 +73,7 @@ class FirstReading:
             self._layer = layer
 
     def _see_stores(self, block: ProgramBlock) -> None:
-        events, offset = block.events, block.text_offset
+        events = block.events
         for k in np.flatnonzero(events.kind == EventKind.UNKNOWN).tolist():
-            line = block.text[int(events.byte_start[k]) - offset : int(events.byte_end[k]) - offset]
-            if self._adviser.stores(line.decode("utf-8", "replace")):
+            if self._adviser.stores(block.line(events, k).decode("utf-8", "replace")):
                 self.stored_lines.append(int(events.line[k]))

@@ -17,7 +17,6 @@ from stillpath.gcode.plan import plan_moves
 from stillpath.gcode.sampler import sample_phases
 from stillpath.gcode.types import Phases
 from stillpath.models.machine import Machine
-from stillpath.models.plants import plant_set
 from stillpath.models.schedule import OperatingPoint
 from stillpath.models.shaping import AxisShaper, Shaping
 from stillpath.pipeline.advising.advice import Advice, Bound, wanted_accel
@@ -26,7 +25,7 @@ from stillpath.pipeline.pacing.samples import FileSamples, Sample
 from stillpath.simulation.measures import PathDistances
 from stillpath.simulation.scheduled import MachineStream
 
-__all__ = ["Trial", "members_of"]
+__all__ = ["Trial"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -34,15 +33,6 @@ Ints = NDArray[np.int64]
 _REST_S = 0.15
 _POINTS = 600
 """Points that are measured of every feature."""
-
-
-def members_of(machine: Machine, dt_s: float) -> list[int | None]:
-    """Return the numbers of the machines of the set: the nominal one (None), and the members.
-
-    As `pipeline.measuring.set_errors` has them: member k of X with member k of Y.
-    """
-    sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
-    return [None, *range(min(len(one.members) for one in sets))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +60,7 @@ class Trial:
     adviser : Adviser
     dt_s : float
     members : sequence
-        Of `members_of`.
+        Of `pipeline.measuring.set_errors.machine_numbers`.
     point : OperatingPoint, optional
         Where the machine is; None: where it is when the samples are printed.
 
@@ -198,11 +188,9 @@ def _motion(
         phases = _planned(sample, advice, machine, adviser)
         if len(phases) == 0:
             continue
-        way = phases.direction
-        prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0)
         numbers = phases.move_index - phases.move_index[0]
-        feature = np.where(prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
-        duration = phases.accel_s + phases.cruise_s + phases.decel_s
+        feature = np.where(phases.prints, sample.piece.moves.feature[numbers], -2).astype(np.int32)
+        duration = phases.lasts_s
         for one in np.unique(feature).tolist():
             seconds[one] = seconds.get(one, 0.0) + float(np.sum(duration[feature == one]))
         total_s = float(phases.t_s[-1] + duration[-1] - phases.t_s[0])

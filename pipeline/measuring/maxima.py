@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 RINGING_S = 0.1
-"""So long ringing counts after the end of a line."""
+"""How long after the end of a line ringing still counts."""
 _STILL_MM = 1e-9
 
 

@@ -42,10 +42,10 @@ __all__ = ["STRIDE", "Measurement", "channel_names"]
 Array = NDArray[np.float64]
 
 STRIDE = 6
-"""Contour errors are measured at every sixth sample, since they change over tens of samples; the
-largest of what is written are looked for between them, too (`maxima`)."""
+"""Contour errors are measured at every sixth sample, since they change over tens of samples; maxima
+of the written motion are searched between them, too (`maxima`)."""
 _SMALL_BYTES = 200_000
-"""Of smaller files every sample is measured: there are too few for chance to even out."""
+"""Smaller files are measured at every sample: they have too few for chance to even out."""
 _TRACK_BINS = 400
 
 
@@ -215,9 +215,9 @@ class Measurement:
         if self._beside is None:
             self._track.add(errors.index, errors.error_mm, self._dt_s)
 
-    def channels(self) -> list[Channel]:
-        """Return the figures of every channel."""
-        labels = {"before": "as sliced", "after": "compensated", "shaper": self._shaper_label}
+    def channels(self, after: str = "compensated") -> list[Channel]:
+        """Return the figures of every channel; `after` is the label of the executed motion."""
+        labels = {"before": "as sliced", "after": after, "shaper": self._shaper_label}
         meter, most_mm = self._meter, self._maxima.max_mm
         return [
             Channel(

@@ -12,25 +12,25 @@ grid with more points finds their floor, and all points decide between the best.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import itertools
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import SHAPERS, shape, shaper_pulses
+from stillpath.compensation.shapers import SHAPERS, shape_xy, shaper_pulses
 from stillpath.models.machine import Machine
 from stillpath.models.plants import DiscretePlant, discretise
 from stillpath.models.reference_motion import reference_limits, reference_motion_of
 from stillpath.models.typed_in import stated_hz
-from stillpath.pipeline.files import replacing
+from stillpath.pipeline.files import kept
 from stillpath.simulation.measures import PathDistances, Tally, contour_error, tracking_error
 from stillpath.simulation.response import response
 
@@ -75,6 +75,11 @@ class BestShaper:
     zeta: float
     contour_rms_um: float
     tracking_rms_um: float
+
+    @property
+    def pulses(self) -> list[tuple[Array, Array]]:
+        """Weights and delays [s] of its pulses, for X and for Y."""
+        return [shaper_pulses(self.type, f_hz, self.zeta) for f_hz in (self.fx_hz, self.fy_hz)]
 
     @property
     def label(self) -> str:
@@ -142,7 +147,7 @@ def evaluate_shaper(
     use = extruding if extruding.any() else np.ones(len(extruding), bool)
     y_d_mm, use = _with_rests(y_d_mm, use, dt_s)
     pulses = [shaper_pulses(kind, f_hz, _ZETA) for f_hz in (fx_hz, fy_hz)]
-    u = np.stack([shape(row, dt_s, p) for row, p in zip(y_d_mm, pulses, strict=True)])
+    u = shape_xy(y_d_mm, dt_s, pulses)
     y = response(_plants(machine, dt_s), u)
     contour, tracking = Tally(), Tally()
     contour.add(contour_error(y_d_mm, y, dt_s, stride=2), use[::2])
@@ -191,16 +196,19 @@ def _tuned_shaper(machine: Machine, directory: Path, dt_s: float) -> BestShaper:
     if round(dt_s * 1e6) == _SHIPPED_US and basis in _shipped():
         return _shipped()[basis]
     path = directory / f"shaper-{basis}-{round(dt_s * 1e6)}us-v{_VERSION}.json"
-    with contextlib.suppress(OSError, ValueError, TypeError):
-        found = BestShaper(**json.loads(path.read_text(encoding="utf-8")))
-        if found.type in SHAPERS and min(found.fx_hz, found.fy_hz) > 0:
-            return found
-    y_d, extruding = reference_motion_of(machine, dt_s)
-    best = tune_shaper(machine, y_d, dt_s, extruding)
-    directory.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(asdict(best)), encoding="utf-8")
-    return best
+
+    def tuned() -> BestShaper:
+        y_d, extruding = reference_motion_of(machine, dt_s)
+        return tune_shaper(machine, y_d, dt_s, extruding)
+
+    return kept(path, _read, tuned)
+
+
+def _read(found: dict[str, Any]) -> BestShaper:
+    shaper = BestShaper(**found)
+    if shaper.type not in SHAPERS or min(shaper.fx_hz, shaper.fy_hz) <= 0:
+        raise ValueError("no shaper with frequencies")
+    return shaper
 
 
 def tuning_digest(machine: Machine) -> str:
@@ -219,13 +227,6 @@ def _shipped() -> dict[str, BestShaper]:
     return {row["digest"]: BestShaper(**row["shaper"]) for row in found["machines"].values()}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Points:
-    """Samples at which a trial is measured."""
-
-    index: Ints
-
-
 class _Trial:
     """One motion on one machine, ready to be measured under any shaper at any points."""
 
@@ -239,7 +240,8 @@ class _Trial:
         self._answer = response(_plants(machine, dt_s), self._y_d)
         chosen = np.flatnonzero(use)
         self._chosen = chosen.astype(np.int64)
-        self._points: dict[int, _Points] = {}
+        self._points: dict[int, Ints] = {}
+        """Samples at which the trial is measured, by their key."""
         self._shaped: dict[tuple[int, str, int, int], Array] = {}
         self._known: dict[tuple[int, str, int, int], float] = {}
 
@@ -250,14 +252,14 @@ class _Trial:
             # A stride that shares no rhythm with the motion: one random sample per cell.
             offset = np.random.default_rng(1).integers(0, step, len(self._chosen) // step)
             cells = np.arange(len(offset)) * step + offset
-            self._points[count] = _Points(self._chosen[cells])
+            self._points[count] = self._chosen[cells]
         return count
 
     def rms(self, kind: str, i: int, j: int, points: int) -> float:
         """Rms contour error [mm] with frequency number i on X and j on Y."""
         key = (points, kind, i, j)
         if key not in self._known:
-            at = self._points[points].index
+            at = self._points[points]
             y = np.stack([self._axis(0, kind, i, points), self._axis(1, kind, j, points)])
             error = self._distances.at(y, at)
             self._known[key] = float(np.sqrt(error @ error / len(error)))
@@ -271,7 +273,7 @@ class _Trial:
         key = (points, kind, axis, number)
         if key not in self._shaped:
             pulses = shaper_pulses(kind, float(FREQUENCIES_HZ[number]), _ZETA)
-            index = self._points[points].index
+            index = self._points[points]
             self._shaped[key] = shaped_at(self._answer[axis], self._dt_s, pulses, index)
         return self._shaped[key]
 

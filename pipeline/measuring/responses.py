@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.compensation.shapers import shape
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.pipeline.measuring.points import MotionSamples
@@ -67,9 +67,7 @@ class Responses:
         self._machine, self._dt_s, self._names = machine, dt_s, names
         self._compensated = "after" in names
         self._point = EMPTY
-        self._pulses = [
-            shaper_pulses(shaper.type, f, shaper.zeta) for f in (shaper.fx_hz, shaper.fy_hz)
-        ]
+        self._pulses = shaper.pulses
         self._reach = 2 + max(int(np.ceil(times[-1] / dt_s)) for _, times in self._pulses)
         # Plants that change do so where the motion has come to.
         self._least = 1 if machine.schedules else _LEAST_SAMPLES

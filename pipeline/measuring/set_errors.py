@@ -14,14 +14,14 @@ from stillpath.models.schedule import EMPTY, OperatingPoint
 from stillpath.simulation.measures import ContourErrors, ContourMeter, GroupTally
 from stillpath.simulation.scheduled import MachineStream
 
-__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors"]
+__all__ = ["LANDING_S", "ClassError", "ErrorSum", "SetErrors", "machine_numbers"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 LANDING_S = 0.05
-"""What is extruded so soon after a travel counts for the travel too, which shook the machine."""
+"""Extrusion this soon after a travel counts for the travel too, which shook the machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,24 +61,29 @@ class ErrorSum:
         return ClassError(float(np.sqrt(mean)), self.seconds)
 
 
-class SetErrors:
-    """Measure motion with the nominal plants and all members of the set.
+def machine_numbers(machine: Machine, dt_s: float) -> list[int | None]:
+    """Return the numbers of the machines of a set: the nominal one (None), and the members.
 
     Member number k of X and of Y make one machine; the axis with more has some that are left out.
+    """
+    sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
+    return [None, *range(min(len(one.members) for one in sets))]
+
+
+class SetErrors:
+    """Measure motion with all machines of a set (`machine_numbers`).
 
     Parameters
     ----------
     machine : Machine
     dt_s : float
     stride : int
-        Every which sample is measured.
+        Every `stride`-th sample is measured.
     """
 
     def __init__(self, machine: Machine, dt_s: float, *, stride: int) -> None:
         self._machine, self._dt_s, self._stride = machine, dt_s, stride
-        sets = [plant_set(machine.axes[axis], dt_s) for axis in ("x", "y")]
-        members = min(len(one.members) for one in sets)
-        self._numbers: list[int | None] = [None, *range(members)]
+        self._numbers = machine_numbers(machine, dt_s)
         self._streams: list[MachineStream] = []
         self._point = EMPTY
         self._never = round(LANDING_S / dt_s) + 1

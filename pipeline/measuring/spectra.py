@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 BLOCK = 1024
 _KEPT = 64
-"""Blocks; when there are as many, every second one is dropped, and looked at from now on."""
+"""Blocks; when there are as many, every second one is dropped, and from then on only every second
+one is taken."""
 _LEAST_HZ, _BEYOND = 150.0, 1.4
 """Spectra go up to this, or this many times the highest resonance."""
 

@@ -41,20 +41,21 @@ __all__ = ["SpeedBudget"]
 _SLOWEST = 0.05
 """Least pace of the shaper, which may have to be slower than the file."""
 _ABOVE, _FULL, _ROOM = 1.001, 0.97, 0.9
-"""Parts of a bound: from where it is exceeded, a class comes down, and may go up."""
+"""Error over its bound: too large above the first, lower the pace above the second, raise it below
+the last."""
 _HELPLESS = 0.99
-"""The same from where others come down for a class that cannot."""
+"""Above this the others slow down for a class that is already at its own pace."""
 _SLOWER, _FASTER = 0.9, 1.08
 _FURTHEST = 2.0
-"""Paces go up to so many times what the samples said."""
+"""Highest pace while writing, relative to the one chosen on samples."""
 _GENTLER = (1.0, 0.6, 0.3)
-"""Exponents of factors that are tried one after the other where no command can follow."""
+"""Exponents applied in turn to a piece's factors where no command can follow it."""
 _SURE_S = 5.0
-"""Errors of so much extruding time say something of a class."""
+"""Extruding time after which the error of a class is meaningful."""
 _ATTEMPTS = 4
-"""How often a file is written at most; the last time at its own paces."""
+"""Most times that a file is written; the last time at its own paces."""
 _MILDER, _POWER = 0.9, 0.5
-"""Part of its bound that a class is brought to then, if errors rise with this power."""
+"""The next attempt aims at this part of the bound, if error ~ acceleration^_POWER."""
 
 
 @dataclass(slots=True)

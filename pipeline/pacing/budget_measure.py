@@ -25,7 +25,7 @@ from stillpath.pipeline.result import Channel, GroupFigures
 __all__ = ["BudgetMeasurement"]
 
 _STRIDE = 24
-"""Of the errors of the set, whose plants are many."""
+"""The set has many plants: their errors are measured at every 24th sample."""
 
 
 class BudgetMeasurement(Measurement):
@@ -82,7 +82,7 @@ class BudgetMeasurement(Measurement):
         Parameters
         ----------
         written, sliced : MotionSamples
-        classes : ndarray of int32
+        classes : ndarray of int32, shape (len(written.moves),)
             What the errors of each of `written.moves` count for.
         """
         super().add(written)
@@ -107,10 +107,10 @@ class BudgetMeasurement(Measurement):
         """Return the errors of the written file by class of moves, so far."""
         return self._set.sums()
 
-    def channels(self) -> list[Channel]:
-        """Return the figures of every channel."""
+    def channels(self, after: str = "compensated") -> list[Channel]:
+        """Return the figures of every channel; `after` is the label of the executed motion."""
         sliced = {channel.name: channel for channel in self._sliced.channels()}
-        return [sliced.get(channel.name, channel) for channel in super().channels()]
+        return [sliced.get(channel.name, channel) for channel in super().channels(after)]
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""

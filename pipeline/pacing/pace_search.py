@@ -18,20 +18,20 @@ __all__ = ["PaceChoice", "allowed_um", "search"]
 
 _TRIALS = 10
 _AIM, _WITHIN, _ROOM = 0.95, 0.98, 0.92
-"""Parts of a bound: what is aimed at, what is within it, and below what a class is raised."""
+"""Error over its bound: the aim, the largest accepted, and below which a class is raised."""
 _NO_WORSE = 1.1
-"""What exceeds the budget at its own pace may become so many times worse."""
+"""A class that exceeds the budget at its own pace may become this many times worse."""
 _LANDING = 2.0
-"""So many budgets may what is extruded right after a travel have; its feature has one for all."""
+"""Budgets allowed to extrusion right after a travel; its feature keeps one budget overall."""
 _LEAP = 8.0
-"""A class is raised at most so many times at once."""
+"""Largest factor by which one step raises a class."""
 _STEEPEST, _FLATTEST = 2.5, 0.2
-"""Limits of the power of acceleration with which an error is taken to rise."""
+"""Bounds of p in error ~ acceleration^p, as estimated from two trials."""
 _SHAKEN = 0.7
-"""The same of what a class causes in those after it."""
+"""The p assumed for the error that a class causes in the classes printed after it."""
 _SAME = 1.02
 _WORTH = 0.002
-"""Time that a raise must save for another one to be tried."""
+"""Share of the time that a raise must save for another one to be tried."""
 
 Trial = Callable[[Factors], Tried]
 

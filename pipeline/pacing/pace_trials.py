@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.compensation.cautious import Caution
-from stillpath.compensation.shapers import shape, shaper_pulses
+from stillpath.compensation.shapers import shape_xy
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import intended
 from stillpath.gcode.firmware.registry import adapter
@@ -157,8 +157,6 @@ def compensated(
 
 def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
     """Return how samples move with the best firmware shaper."""
-    frequencies = (shaper.fx_hz, shaper.fy_hz)
-    pulses = [shaper_pulses(shaper.type, f_hz, shaper.zeta) for f_hz in frequencies]
     pad = round(_SHAPER_REACH_S / DT_S)
 
     def motion(sample: Sample, piece: Piece) -> Motion:
@@ -166,11 +164,9 @@ def shaped(shaper: BestShaper) -> Callable[[Sample, Piece], Motion]:
         count = max(round(phases.duration_s / DT_S), 1)
         position, row = sample_phases(phases, (0.0, DT_S, count))
         path = np.pad(position[:2], ((0, 0), (pad, pad)), mode="edge")
-        command = [shape(p, DT_S, one) for p, one in zip(path, pulses, strict=True)]
-        direction = phases.direction[row]
-        prints = (direction[:, 3] > 0.0) & ((direction[:, 0] != 0.0) | (direction[:, 1] != 0.0))
+        command = shape_xy(path, DT_S, shaper.pulses)
         classes = np.pad(sample.classes[row], pad, constant_values=AS_SLICED)
-        return path, np.stack(command), np.pad(prints, pad), classes
+        return path, command, np.pad(phases.prints[row], pad), classes
 
     return motion
 

@@ -1,7 +1,8 @@
 """Some seconds of every class of moves, taken from all over a file.
 
-Memory is bounded: of each class so many places are kept, and when they run out every second one
-goes and every second one is taken from then on. The same file gives the same samples.
+Memory is bounded: each class keeps a limited number of samples. When there are more, every second
+one is dropped, and from then on only every second one is taken. The same file gives the same
+samples.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from stillpath.pipeline.operating_point import Operation
 
 __all__ = ["FileSamples", "Sample", "take_samples"]
 
-_BLOCK_BYTES = 1 << 17
 _LASTS_S = 4.0
 _TOTAL_S = 120.0
 _FEWEST, _MOST = 3, 12
@@ -117,21 +117,17 @@ def _items(
     source: BinaryIO, machine: Machine, dialect: Dialect, progress: Callable[[float], None] | None
 ) -> Iterator[Piece | VerbatimPart]:
     reader, splitter = Interpreter(machine, dialect=dialect), Splitter(machine)
-    while data := source.read(_BLOCK_BYTES):
-        for block in reader.push(data):
-            yield from splitter.push(block)
+    for block in reader.blocks(source):
+        yield from splitter.push(block)
         if progress is not None:
             progress(float(source.tell()))
-    for block in reader.flush():
-        yield from splitter.push(block)
     yield from splitter.flush()
 
 
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
     """Return what is known of the first layer when these moves have come."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
-    way = moves.end_mm - moves.start_mm
-    prints = ((way[:, 0] != 0.0) | (way[:, 1] != 0.0)) & (way[:, 3] > 0.0) & (moves.layer >= 0)
+    prints = moves.prints & (moves.layer >= 0)
     if np.isfinite(known.z_mm) or not np.any(prints):
         return FirstLayer(below, known.z_mm)
     return FirstLayer(below, float(moves.end_mm[np.argmax(prints), 2]))
@@ -161,9 +157,7 @@ def _take(
 
 def _around(phases: Phases, row: int) -> tuple[int, int]:
     """Return rows [first, last) around one, from rest to rest if there are rests nearby."""
-    xy = (phases.direction[:, 0] != 0.0) | (phases.direction[:, 1] != 0.0)
-    begin_s = phases.t_s
-    end_s = begin_s + phases.accel_s + phases.cruise_s + phases.decel_s
+    xy, begin_s, end_s = phases.moves_xy, phases.t_s, phases.end_s
     starts = np.flatnonzero(xy & np.append(True, ~xy[:-1]))
     ends = np.flatnonzero(xy & np.append(~xy[1:], True))
     first = int(starts[np.searchsorted(starts, row, "right") - 1])

@@ -1,6 +1,6 @@
 """From a request to a job that computes its answer, and back, while the caller waits for it.
 
-The same request, made again, is answered by the same job: so who waited in vain asks again.
+A repeated request is answered by the same job, so a caller whose wait timed out just asks again.
 """
 
 from __future__ import annotations

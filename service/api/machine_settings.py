@@ -97,7 +97,7 @@ async def put_settings(
             return _new(text, file, name, given)
         if not marlin_settings.looks_like_m503(text):
             raise ModelError(
-                f"{name!r} is there already, and a printer.cfg makes a new machine: give another "
+                f"{name!r} already exists, and a printer.cfg makes a new machine: give another "
                 "name, or compare the two with `stillpath machines check`"
             )
         return marlin_settings.with_m503(before, text, file)

@@ -73,7 +73,7 @@ def back_up(data_dir: Path, target: Path) -> Manifest:
     if not data_dir.is_dir():
         raise BackupError(f"there is no data directory {data_dir}; name it with --data-dir")
     if target.exists():
-        raise BackupError(f"{target} is there already; name a new file")
+        raise BackupError(f"{target} already exists; name a new file")
     if target.resolve().is_relative_to(data_dir.resolve()):
         raise BackupError(f"{target} lies in the data directory; name a file elsewhere")
     if (data_dir / _RESTORING).exists():
@@ -253,7 +253,9 @@ def _unpack(source: Path, folder: Path) -> Manifest:
     except (tarfile.TarError, EOFError, ValidationError, UnicodeError) as error:
         raise BackupError(f"{source} is damaged ({_first_line(error)}); take another") from None
     if manifest is None:
-        raise BackupError(f"{source} has no end: it was broken off, or is no backup; take another")
+        raise BackupError(
+            f"{source} has no end: it was broken off, or is not a backup; take another"
+        )
     for name, known in manifest.files.items():
         if found.pop(name, None) != known:
             raise BackupError(f"{source}: {name} is damaged or missing; take another backup")

@@ -79,7 +79,7 @@ class DocumentTable:
             if beside is not None and not self._holds(connection, _ROW.path == self._key(beside)):
                 raise FileNotFoundError(f"{self.place(beside)} is gone")
             if self._holds(connection, _ROW.path == self._key(path)):
-                raise FileExistsError(f"{self.place(path)} is there already")
+                raise FileExistsError(f"{self.place(path)} already exists")
             connection.execute(documents.insert().values(self._row(path, text)))
 
     def create_folder(self, folder: str, contents: Mapping[str, str]) -> None:
@@ -132,7 +132,7 @@ class DocumentTable:
 
     def _must_be_empty(self, connection: Connection, folder: str) -> None:
         if self._holds(connection, _is_below(self._key(folder))):
-            raise FileExistsError(f"{self.place(folder)} is there already")
+            raise FileExistsError(f"{self.place(folder)} already exists")
 
 
 def _is_below(key: str) -> ColumnElement[bool]:

@@ -437,7 +437,7 @@ def _changes(known: _Remembered, asked: Asked) -> Iterator[Finding]:
             if _plain(was) != _plain(is_now):
                 text = (
                     f"[{section}] {option} has changed since {day}, from {_word(was)} to "
-                    f"{_word(is_now)}; if it changes the motion, measure the machine anew, else "
+                    f"{_word(is_now)}; if it changes the motion, measure the machine again, else "
                     f"accept it (`stillpath printers accept {known.printer}`)"
                 )
                 place = f"[{section}] {option}"

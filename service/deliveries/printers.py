@@ -173,7 +173,7 @@ def what_started(printer: Printer, reply: Reply) -> str | None:
 
 def _printer(path: Path, name: str, section: Any) -> Printer:
     if not isinstance(section, dict):
-        raise PrinterFileError(f"{path}: printer.{name} is no section")
+        raise PrinterFileError(f"{path}: printer.{name} is not a section")
     try:
         return Printer(**{**section, "name": name})
     except ValidationError as error:

@@ -294,7 +294,7 @@ def _check(key: Key) -> None:
     if not 1 <= len(key.name) <= 120 or not key.name.isprintable():
         raise KeyRefused(f"name {key.name[:80]!r}: give 1 to 120 printable characters")
     if not key.scopes:
-        raise KeyRefused(f"a key without scopes opens nothing; there is {', '.join(Scope)}")
+        raise KeyRefused(f"a key without scopes opens nothing; there are {', '.join(Scope)}")
     if key.expires_at is not None and key.expires_at <= key.created_at:
         raise KeyRefused("the key would have expired already; give a later moment")
 

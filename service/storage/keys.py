@@ -19,7 +19,7 @@ def check_key(key: str) -> None:
     bad = any(part in ("", ".", "..") for part in parts) or any(c in key for c in "\\:\0\n\r")
     if bad or len(key.encode()) > _LONGEST:
         raise ValueError(
-            f"{key!r} is no key of the storage: names joined by '/', at most {_LONGEST} bytes"
+            f"{key!r} is not a key of the storage: names joined by '/', at most {_LONGEST} bytes"
         )
 
 
@@ -31,5 +31,5 @@ def check_prefix(prefix: str) -> None:
     ValueError
     """
     if not prefix.endswith("/"):
-        raise ValueError(f"{prefix!r} is no prefix of keys: it must end with '/'")
+        raise ValueError(f"{prefix!r} is not a prefix of keys: it must end with '/'")
     check_key(prefix[:-1])

@@ -177,8 +177,8 @@ def _open(url: str) -> S3Store:
     unknown = sorted(set(given) - set(_PARAMETERS))
     if parts.scheme != "s3" or not parts.netloc or unknown:
         raise ValueError(
-            f"{url!r} is no address of a bucket: s3://bucket/prefix, with ?endpoint= and &region= "
-            "where they are not in AWS_ENDPOINT_URL and AWS_REGION"
+            f"{url!r} is not the address of a bucket: s3://bucket/prefix, with ?endpoint= and "
+            "&region= where they are not in AWS_ENDPOINT_URL and AWS_REGION"
         )
     chosen = {name: values[0] for name, values in given.items()}
     return S3Store(

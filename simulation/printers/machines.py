@@ -120,7 +120,7 @@ class Printer:
         return np.asarray(self.nozzle @ self.follow(command_mm, dt_s).position_mm)
 
     def follow(self, command_mm: Array, dt_s: float = STEP_S) -> Motion:
-        """Return the motion of all bodies."""
+        """Return the motion of all bodies under a command (2, n)."""
         return self.bodies.follow(command_mm, dt_s)
 
     def frequency_response(self, f_hz: Array) -> NDArray[np.complex128]:

@@ -1,7 +1,7 @@
 """Klipper's resonance test on a virtual printer, and the files that it leaves.
 
-The accelerometer is as real ones are: its gains are off, it is turned, it hisses, it has steps, its
-rate is not the one on the label, and its clock starts somewhere.
+The accelerometer has the faults of real ones: wrong gains, a rotated mounting, noise, quantisation,
+a sampling rate that is not quite the nominal one, and a clock with an arbitrary origin.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Accelerometer:
     offset_s: float = 0.0
 
     def record(self, time_s: Array, accel_mm_s2: Array, rng: np.random.Generator) -> Record:
-        """Return what it says of accelerations (3, n) at `time_s`, gravity included."""
+        """Return its record of accelerations (3, n) at times (n,), gravity included."""
         own_s = np.arange(time_s[0], time_s[-1], 1.0 / self.rate_hz)
         seen = np.stack([np.interp(own_s, time_s, row) for row in accel_mm_s2])
         seen[2] += _GRAVITY_MM_S2

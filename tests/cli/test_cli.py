@@ -287,7 +287,7 @@ def test_pipes_and_devices_are_neither_read_nor_replaced(pipeline, source, tmp_p
     ):
         assert run(command) == 2
         assert f"{pipe} is a pipe or a device; " in one_line(capsys)
-    with pytest.raises(OSError, match="is no regular file"), replacing(pipe):
+    with pytest.raises(OSError, match="is not a regular file"), replacing(pipe):
         pass
     assert sorted(path.name for path in tmp_path.iterdir()) == ["part.gcode", "pipe"]
 

@@ -74,7 +74,7 @@ def test_failures_are_seen_and_the_layers_stay(cura: Cura, script: Any):
     assert "NOT compensated" in text
     # The server's seventh line is Cura's fifth: two lines were ours.
     assert "line 5: X1e400 is too large" in text
-    assert "slice anew" in text
+    assert "slice again" in text
     assert cura.logged
 
 

@@ -160,11 +160,11 @@ def _taps(change: Callable[[list[float]], Any]) -> Callable[[dict[str, Any]], No
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], str], str]] = {
     "truncated": (lambda g: json.dumps(g)[:-200], "is not a whole export"),
     "empty": (lambda g: "", "is not a whole export"),
-    "a list": (lambda g: "[1]", "is no export for this version"),
+    "a list": (lambda g: "[1]", "is not an export for this version"),
     "nested": (lambda g: "[" * 90_000, "is not a whole export"),
     "too large": (lambda g: json.dumps(g) + " " * 300_000, "larger than any export"),
     "changed": (_unsigned(_taps(lambda t: t.__setitem__(3, 0.2))), "its digest differs"),
-    "foreign": (_signed(lambda g: g.update(schema="serval/1")), "is no export for this version"),
+    "foreign": (_signed(lambda g: g.update(schema="serval/1")), "is not an export for"),
     "kinematics": (_signed(lambda g: g.update(kinematics="corexy")), "the export is for corexy"),
     "delta": (_signed(lambda g: g.update(kinematics="delta")), "the export is for delta"),
     "limits": (
@@ -181,7 +181,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], str], str]] = {
     ),
     "moves": (_signed(_taps(lambda t: t.__setitem__(80, t[80] + 0.01))), "do not sum to 1"),
     "late": (_signed(_taps(lambda t: t.reverse() or t.insert(0, t.pop()))), "in time"),
-    "words": (_signed(_taps(lambda t: t.__setitem__(0, "1"))), "tap is no number"),
+    "words": (_signed(_taps(lambda t: t.__setitem__(0, "1"))), "tap is not a number"),
     "no taps": (_signed(lambda g: g["axes"].pop("y")), "is not a whole export"),
     "wild": (
         _signed(_taps(lambda t: (t.__setitem__(0, t[0] + 49), t.__setitem__(160, t[160] - 49)))),

@@ -202,7 +202,7 @@ def test_what_may_not_be_printed_any_more(tmp_path: Path):
     assert "busy.sp.gcode was not started: the printer was printing when the file came" in told
     server = with_component(tmp_path, second, print_after="True")
     assert server.started == []
-    assert "was not started: Moonraker was started anew" in server.console[-1]
+    assert "was not started: Moonraker was restarted" in server.console[-1]
 
 
 @pytest.mark.parametrize(

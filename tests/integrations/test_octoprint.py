@@ -121,7 +121,7 @@ def test_failures_are_told_with_the_reason(octoprint: OctoPrint):
     # Somebody's own file is not written over.
     octoprint.upload("mine.sp.gcode", "G1 X1\n")
     ended = octoprint.ended(octoprint.upload("mine.gcode", SQUARE))
-    assert "mine.sp.gcode is there and was not made by Stillpath" in ended["message"]
+    assert "mine.sp.gcode already exists and was not made by Stillpath" in ended["message"]
     assert (octoprint.uploads / "mine.sp.gcode").read_text() == "G1 X1\n"
 
 

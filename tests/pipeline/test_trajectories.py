@@ -138,8 +138,8 @@ def test_a_section_that_the_last_check_reverts_is_as_sliced(
 @pytest.mark.parametrize(
     ("start_s", "stop_s", "message"),
     [
-        (2.0, 1.0, "2 s to 1 s is no period"),
-        (-1.0, None, "no period"),
+        (2.0, 1.0, "2 s to 1 s is not a period"),
+        (-1.0, None, "not a period"),
         (1e5, None, r"nothing moves from 100000 s on: the print ends at [\d.]+ s"),
     ],
 )
@@ -168,7 +168,7 @@ def test_from_the_command_line(
     assert len(load(target)["t_s"]) == 200
     assert run([*given, "--format", "xlsx"]) == 2
     assert run([*given, "--budget-um", "0"]) == 2
-    assert "csv and npz" in capsys.readouterr().err
+    assert "csv or npz" in capsys.readouterr().err
     assert run([*given[:-1], str(source)]) == 2
     assert source.read_text() == SMALL
     assert run([*given, "--method", "magic"]) == 2

@@ -13,9 +13,9 @@ from stillpath.simulation.measures import (
     ContourMeter,
     GroupTally,
     MotionMeter,
+    PathDistances,
     Tally,
     contour_error,
-    distance_to_path,
     tracking_error,
 )
 
@@ -63,7 +63,7 @@ def test_contour_meter_is_brute_force(
     errors = np.concatenate([part.error_mm[0] for part in parts])
     np.testing.assert_allclose(errors, expected, atol=1e-12)
     np.testing.assert_allclose(
-        distance_to_path(y_d, y[:, index], index, 1e-3, window * 1e-3), expected, atol=1e-12
+        PathDistances(y_d, 1e-3, window * 1e-3).at(y[:, index], index), expected, atol=1e-12
     )
 
 

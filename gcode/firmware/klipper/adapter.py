@@ -98,7 +98,7 @@ class KlipperAdapter:
         return KlipperAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb so much that Z's limit leaves a stream too little."""
+        """Mark travels (n, 4) that climb so much that Z's limit leaves a stream too little."""
         length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
         flat = np.hypot(travel_mm[:, 0], travel_mm[:, 1])
         climb = np.abs(travel_mm[:, 2]) + self._machine.mesh_slope * flat

@@ -143,8 +143,7 @@ class KlipperEncoder:
             chosen = np.where(ours, feedrate / 60.0, speed)
             written = as_moves(start_mm, end_mm, chosen, limits_id)
             phases = Planner(self._firmware).plan_whole(written, limits)
-            actual = phases.accel_s + phases.cruise_s + phases.decel_s
-            miss = actual - predicted
+            miss = phases.lasts_s - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             correction += miss

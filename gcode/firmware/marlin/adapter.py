@@ -163,7 +163,7 @@ class MarlinAdapter:
         return MarlinAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb more, beside the bed mesh, than Z can follow a stream."""
+        """Mark travels (n, 4) that climb more, with the bed mesh, than Z can follow in a stream."""
         length = np.sqrt(np.sum(travel_mm[:, :3] ** 2, axis=1))
         climb = np.abs(travel_mm[:, 2])
         steep = climb > STEEPEST * length

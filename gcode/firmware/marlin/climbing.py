@@ -22,9 +22,9 @@ from stillpath.gcode.timeline import Timeline
 __all__ = ["climb_in_long_moves"]
 
 _DIP_STEPS = 0.5
-"""The fit of a climb may sink a little."""
+"""Steps of Z by which the fit of a climb may sink."""
 _SHARE = 0.7
-"""Of the time that is not slowed: from here, what is lost is less than what joined moves miss."""
+"""Moves with this share of the time that Z needs stay: slowing costs less than joining them."""
 
 
 def climb_in_long_moves(

@@ -53,27 +53,27 @@ from stillpath.models.machine import CommandLimits, MotorLimits
 __all__ = ["DEVIATION_MM", "STEEPEST", "MarlinEncoder", "stream_limits"]
 
 STEEPEST = 0.01
-"""Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
+"""Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 300_000.0
-"""The filament carries linear advance, and must not be what limits X and Y; within the 32 bits of
-Marlin's acceleration_rate."""
+"""So high that linear advance never limits X and Y, yet within the 32 bits of Marlin's
+acceleration_rate."""
 STREAM_MESH_ACCEL_MM_S2 = 20_000.0
-"""Of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
+"""Acceleration of Z where it follows a mesh: a step of 2.5 um in a third of a ms."""
 STREAM_E_JERK_MM_S = 100.0
 DEVIATION_MM = (0.01, 0.3)
-"""What M205 J takes (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
+"""Range of M205 J (Marlin/src/gcode/config/M200-M205.cpp, 2.0.x and 2.1.x)."""
 
 _MOST_FEED = 3.0
-"""Filament per mm, above which the firmware takes a move for a retraction and advances none."""
+"""Filament per mm of path above which the firmware sees a retraction, without linear advance."""
 _ROOM, _DIAGONAL = 1.05, 1.5
-"""So much faster than a command may be: an axis between vertices on whole steps, and the way that
-X and Y make together."""
+"""Speeds above the command's: of one axis, since vertices lie on whole steps, and of X and Y
+together along a diagonal."""
 _CALM = 0.6
-"""Of the motors' step of speed: what makes up for lost time comes on top."""
+"""Share of the motors' permitted step of speed; making up for lost time needs the rest."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
 _BYTES_PER_LINE = 32.0
-"""Of a line of ours with its line number, checksum and the host's share of the acknowledgement."""
+"""Length of a written line with line number, checksum and its share of the acknowledgement."""
 
 
 def stream_limits(
@@ -204,7 +204,7 @@ class MarlinEncoder:
         steps, path = self._blocks(start_mm, end_mm)
 
         phases = self._plan(start_mm, end_mm, speed, limits_id, table)
-        actual = phases.accel_s + phases.cruise_s + phases.decel_s
+        actual = phases.lasts_s
         correction, feedrate, predicted = (np.zeros(len(rows)) for _ in range(3))
         accel = self._command.accel_mm_s2
         floor_mm_s = np.sqrt(0.5 * accel * path / np.maximum(steps, 1.0))
@@ -230,7 +230,7 @@ class MarlinEncoder:
             )
             chosen = np.where(ours, feedrate / 60.0, speed)
             phases = self._plan(start_mm, end_mm, chosen, limits_id, table)
-            actual = phases.accel_s + phases.cruise_s + phases.decel_s
+            actual = phases.lasts_s
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
@@ -361,9 +361,8 @@ def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Enc
     """Begin stretches later by what their first step from rest takes too long."""
     ours, phases = moves.row < 0, encoded.phases
     first = ours & np.append(True, ~ours)[:-1]
-    duration_s = phases.accel_s + phases.cruise_s + phases.decel_s
     delay_s = np.zeros(len(timeline.groups))
-    delay_s[moves.group[first]] = (duration_s - moves.planned_s)[first]
+    delay_s[moves.group[first]] = (phases.lasts_s - moves.planned_s)[first]
     counts = [group.last - group.first for group in timeline.groups]
     return replace(
         encoded,
@@ -378,7 +377,7 @@ def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.f
     own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
     which, direction = piece.moves.limits_id, piece.phases.direction
     xy = np.abs(direction[:, :2])
-    moves = np.any(xy > 0.0, axis=1) & (direction[:, 3] > 0.0) & (direction[:, 3] <= _MOST_FEED)
+    moves = piece.phases.prints & (direction[:, 3] <= _MOST_FEED)
     largest = np.min(own[which, :2] / np.maximum(xy, 1e-9), axis=1)
     accel = np.minimum(largest, own[which, 2])
     advance = np.where(moves, k_s[which] * direction[:, 3] * accel, 0.0)

@@ -98,6 +98,6 @@ class RepRapAdapter:
         return RepRapAdviser(self._firmware, dialect)
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb more, beside the bed mesh, than Z can follow a stream."""
+        """Mark travels (n, 4) that climb more, with the bed mesh, than Z can follow in a stream."""
         way = np.sqrt(np.sum(travel_mm[:, :2] ** 2, axis=1))
         return np.asarray(np.abs(travel_mm[:, 2]) > STEEPEST * way)

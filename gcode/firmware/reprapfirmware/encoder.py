@@ -41,27 +41,27 @@ from stillpath.models.machine import CommandLimits
 __all__ = ["STEEPEST", "RepRapEncoder", "stream_limits"]
 
 STEEPEST = 0.01
-"""Slope that a stream may climb beside the bed mesh's; Z's limits are raised for both."""
+"""Steepest climb of a stream on top of the bed mesh's slope; Z's limits are raised for both."""
 STREAM_E_ACCEL_MM_S2 = 60_000.0
-"""The filament carries pressure advance, and must not be what limits X and Y."""
+"""So high that pressure advance never limits X and Y."""
 _CORNER, _RAMP = 0.47, 0.375
-"""Of the motors' step of speed: what a corner may make, and the ramp of a ms on a CoreXY."""
+"""Shares of the motors' permitted step of speed: for a corner, and for a ramp of 1 ms on CoreXY."""
 LEAST_SPEED_MM_S = 0.01
-"""The least that the firmware can be set to; slower moves are hurried."""
+"""Lowest minimum speed that the firmware accepts; it speeds up slower moves."""
 _E_JERK_SHARE = 2.0
-"""Of the extruder's own jerk: between acceleration and deceleration the firmware's own pressure
-advance steps by twice the jerk."""
+"""Multiple of the extruder's own jerk: between acceleration and deceleration the firmware's own
+pressure advance steps by twice the jerk."""
 _DIAGONAL = 1.5
-"""A CoreXY motor may run so much faster than the path, and Z's direction change so much more."""
+"""How much faster than the path a CoreXY motor may run, and how much more Z's direction changes."""
 _PASSES = 4
 _EXACT_S = 2e-6
 _POLL_S = 2e-3
 """The firmware looks every 2 ms whether moves are to be frozen."""
 _SPARSE = 1.3
-"""Half a ring is made to last so much longer than it must."""
+"""Half a ring is planned to last this much longer than the firmware needs."""
 _SLOW_MM_S, _SLOW_MM = 10.0, 0.1
-"""Slower segments are not longer, unless their neighbours are as fast. A peak of speed that does
-not stand out by a tenth is cut off, which costs up to a tenth of the segment's way."""
+"""Segments slower than this are at most this long, unless their neighbours are as fast: a peak of
+speed of less than a tenth is cut off, which costs up to a tenth of the segment's length."""
 
 
 def stream_limits(
@@ -193,7 +193,7 @@ class RepRapEncoder:
             phases = planner.plan_whole(written, limits)
             # Rests, whose moves brake for what comes later, are foreseen a little wrong; and a peak
             # of speed that is nearly cut off may be or not be, whatever was foreseen.
-            miss = phases.accel_s + phases.cruise_s + phases.decel_s - predicted
+            miss = phases.lasts_s - predicted
             wrong_s = float(np.max(np.abs(np.cumsum(miss)), initial=0.0))
             if wrong_s < least_s:
                 best, plan, least_s = feedrate.copy(), phases, wrong_s
@@ -284,7 +284,7 @@ class RepRapEncoder:
     def _check_rate(self, phases: Phases, piece: Piece) -> None:
         """Refuse what the firmware's queue could not keep up with."""
         half, least = self._half_ring, self._half_ring_s
-        lasts = phases.accel_s + phases.cruise_s + phases.decel_s
+        lasts = phases.lasts_s
         if len(lasts) <= half:
             return
         total = np.cumsum(np.append(0.0, lasts))

@@ -63,7 +63,7 @@ class StillpathPlugin(
             self._logger.error(self._ledger.trouble)
         for entry in self._ledger.open():
             self._logger.info("%s is taken up again", entry.path)
-            self._ledger.disarm(entry, "OctoPrint was started anew meanwhile")
+            self._ledger.disarm(entry, "OctoPrint was restarted meanwhile")
         self._worker = Worker(self._ledger, self._host, folder / "work", self._logger)
 
     def on_after_startup(self) -> None:

@@ -166,4 +166,4 @@ def _number(text: str, title: str) -> float:
     try:
         return float(text.replace(",", "."))
     except ValueError:
-        raise Failure(f"the setting {title} is {text!r}, which is no number") from None
+        raise Failure(f"the setting {title} is {text!r}, which is not a number") from None

@@ -178,7 +178,7 @@ class OnServer(Service):
         # Whether address, key and machine are right is known before a long upload.
         self._ask("GET", f"/v1/machines/{machine}", self._FIRST_PATIENCE_S)
         self._note(tries=self._entry.tries + 1, job="", is_ours=False)
-        # Sent twice after a lost answer, or by an OctoPrint that was started anew: one job.
+        # Sent twice after a lost answer, or by an OctoPrint that was restarted: one job.
         key = f"{self._entry.id}-{self._entry.tries}"
         options = {"machine": self._entry.machine, **self._entry.options, "name": name}
         job, is_new = self._upload(source, options, key, self._timeout_s)

@@ -133,7 +133,7 @@ class OctoPrintHost(Host):
         # OctoPrint's get_additional_metadata returns nothing (1.11.8, filemanager/__init__.py).
         ours = (self._files.get_metadata(_LOCAL, target) or {}).get(METADATA) or {}
         if "source" not in ours:
-            raise Failure(f"{target} is there and was not made by Stillpath; rename it")
+            raise Failure(f"{target} already exists and was not made by Stillpath; rename it")
 
     def _describe(self, entry: Entry, added: str, made: Made) -> None:
         """Write down where the file comes from, and where its report is."""

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 _RATES_HZ = (10.0, 1e6)
 _LONGEST_S = 3600.0
 _NEXT, _FINE, _OFTEN = 0.02, 3, 20
-"""Share of the range that is looked at beside an extreme, the steps of the sensor that it must
-hold, and the samples that an extreme may have."""
+"""Saturation: the share of the range beside an extreme that is examined, the sensor steps that it
+must contain, and the most samples that may lie at the extreme."""
 _GAP_SAMPLES = 2.5
 """Two periods are one lost sample, which is let pass; half a period allows for jitter."""
 

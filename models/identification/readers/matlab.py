@@ -1,4 +1,4 @@
-"""Variables of MATLAB files, versions 5 to 7, from bytes that nobody vouches for.
+"""Variables of MATLAB files, versions 5 to 7, from untrusted bytes.
 
 Source: MathWorks, "MAT-File Format" (R2019b), level 5. scipy.io.loadmat reads the same files,
 but believes their sizes: damaged bytes can end the whole process there (scipy 1.17).

@@ -220,7 +220,7 @@ def _polynomial(given: Any, name: str) -> list[float]:
     if np.any(values.imag):
         raise ModelError(f"{name} has complex coefficients; they must be real")
     if values.ndim > 1 and sum(size > 1 for size in values.shape) > 1:
-        raise ModelError(f"{name} is a table of {values.shape}: one input and one output, please")
+        raise ModelError(f"{name} has shape {values.shape}; one input and one output are needed")
     return _few([float(c) for c in values.real.reshape(-1)], name)
 
 
@@ -274,7 +274,7 @@ def _from_matrices(lower: Mapping[str, Any], dt_s: float | None) -> dict[str, An
     b, c = (_matrix(lower[name], name.upper()).reshape(-1) for name in ("b", "c"))
     d = _matrix(lower.get("d", 0.0), "D").reshape(-1)
     if len(d) != 1:
-        raise ModelError(f"D has {len(d)} entries; one input and one output, please")
+        raise ModelError(f"D has {len(d)} entries; one input and one output are needed")
     zeros, poles, gain = zeros_poles_gain(_matrix(lower["a"], "A"), b, c, float(d[0]), dt_s)
     return {
         "kind": "zpk",

@@ -140,7 +140,7 @@ function moreOptions() {
     h("div.fields", null, ofWritten,
       field("dialect", "File is written for", dialect),
       field("plate", "Plate of a 3MF package", plate)),
-    h("label.check", { for: "fresh" }, fresh, "Compute anew even if the same file was done before"));
+    h("label.check", { for: "fresh" }, fresh, "Compute again even if the same file was done before"));
   const showFor = (/** @type {boolean} */ live) => ofWritten.forEach((part) => {
     part.hidden = live;
   });

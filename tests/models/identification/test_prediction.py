@@ -9,7 +9,7 @@ import pytest
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.prediction import predicted_psd, predicted_spectrum
-from stillpath.models.identification.spectrum_fit import explain_spectra
+from stillpath.models.identification.spectrum_fit import explanations
 from stillpath.models.identification.synthetic import Sensor, simulate_spectrum
 from stillpath.models.identification.types import Spectrum
 from stillpath.models.plants import PairsSpec, PolePair
@@ -43,7 +43,7 @@ def test_amplitudes_count_by_their_square() -> None:
 def test_a_fit_predicts_its_own_file() -> None:
     """Also a sharp mode, which the window widens, and a sensor with another scale."""
     measured = simulated(PairsSpec(poles=(PolePair(f_hz=45.0, zeta=0.02),)), gain=0.9)
-    fit = explain_spectra([measured], LEGACY).fit
+    fit = explanations([measured], LEGACY).explained().fit
     f, seen, predicted = predicted_psd(measured, "x", LEGACY, fit)
     at_bins = np.interp(f, measured.f_hz, measured.psd["x"])
     np.testing.assert_allclose(seen, at_bins, rtol=1e-9)
@@ -56,5 +56,8 @@ def test_a_column_that_is_not_there() -> None:
     measured = simulated(SMOOTH)
     with pytest.raises(ModelError, match="nothing"):
         predicted_psd(
-            measured, "nothing", LEGACY, explain_spectra([measured], LEGACY, max_order=1).fit
+            measured,
+            "nothing",
+            LEGACY,
+            explanations([measured], LEGACY, max_order=1).explained().fit,
         )

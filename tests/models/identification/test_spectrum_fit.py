@@ -10,10 +10,11 @@ import pytest
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.excitation import drive_spectrum, klipper_psd
-from stillpath.models.identification.frame import without_frame
+from stillpath.models.identification.frame import LIKELY, without_frame
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.spectrum_fit import (
-    explain_spectra,
+    Explained,
+    explanations,
     refit_spectrum,
 )
 from stillpath.models.identification.spectrum_model import (
@@ -51,6 +52,18 @@ def simulated(
     plants = {"x": modal(modes, gains), "y": modal(((50.0, 0.1),), (1.0,))}
     rng = np.random.default_rng(0)
     return simulate_spectrum(plants, test, sensor=Sensor(noise_mm_s2=noise), rng=rng)
+
+
+def explain_spectra(
+    spectra: list[Spectrum],
+    test: Excitation,
+    *,
+    column: str | None = None,
+    frame_likely: float = LIKELY,
+    max_order: int = 4,
+) -> Explained:
+    found = explanations(spectra, test, column=column, max_order=max_order)
+    return found.explained(frame_likely)
 
 
 def check_usable(fit: Fit) -> None:

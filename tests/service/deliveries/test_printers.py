@@ -245,7 +245,7 @@ def test_a_sender_killed_in_between(tmp_path: Path, prints: bool):
         (printer("a", "moonraker", "http://h", budget_um=0), "budget_um"),
         (printer("a", "moonraker", "http://h", apikey="sesame"), "apikey"),
         ("printer = 1", "sections"),
-        ("[printer]\na = 1", "no section"),
+        ("[printer]\na = 1", "not a section"),
         ("[other]\na = 1", "sections"),
         ("not toml", "cannot be read"),
     ],

@@ -70,7 +70,7 @@ def test_host_and_scheme_only_from_the_trusted() -> None:
 
 def test_a_setting_that_is_no_address() -> None:
     assert Settings(trusted_proxies=["10.1.2.3/8"]).trusted_proxies == ["10.0.0.0/8"]
-    with pytest.raises(ValidationError, match="'proxy' is no address or network"):
+    with pytest.raises(ValidationError, match="'proxy' is not an address or network"):
         Settings(trusted_proxies=["proxy"])
 
 

@@ -48,7 +48,7 @@ def read_export(path):
     try:
         content = json.loads(data.decode("utf-8"), parse_constant=_no_constant)
         if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-            raise Refused("%s is no export for this version (%s)" % (path, SCHEMA))
+            raise Refused("%s is not an export for this version (%s)" % (path, SCHEMA))
         if content.get("digest") != digest(content):
             raise Refused("%s was changed after it was exported: its digest differs" % (path,))
         return Export(content)
@@ -74,7 +74,7 @@ def _no_constant(text):
 def _number(content, name, least, most):
     value = content[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise Refused("%s is no number" % (name,))
+        raise Refused("%s is not a number" % (name,))
     if not least <= value <= most:
         raise Refused("%s is %s, not from %s to %s" % (name, value, least, most))
     return float(value)

@@ -1,0 +1,33 @@
+"""Files that a user names: read whole, but not beyond a size that such a file cannot have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stillpath.models.errors import ModelError
+
+__all__ = ["read_bytes"]
+
+
+def read_bytes(path: Path, largest: int, otherwise: str) -> bytes:
+    """Read a file.
+
+    Parameters
+    ----------
+    path : Path
+    largest : int
+        Most bytes that are read.
+    otherwise : str
+        What to say of a larger file, as "not a machine".
+
+    Raises
+    ------
+    ModelError
+        The file is larger, or cannot be read.
+    """
+    try:
+        if path.stat().st_size > largest:
+            raise ModelError(f"{path}: over {largest} bytes, {otherwise}")
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"cannot read {path}: {error.strerror}") from None
