@@ -163,10 +163,10 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
     if not typed:
         return None
     return (
-        f"Of {' and '.join(typed)} only a resonance was typed in. It moves as through the shaper "
-        f"{shaper.label}, as a firmware that shapes would move it by itself: without a "
-        "measurement no better command is known. Figures are guesses for axes that ring there; "
-        "measure the machine (docs/identification.md)."
+        f"{' and '.join(typed)}: only the resonance was typed in, so the file moves as through the "
+        f"shaper {shaper.label}, which a firmware with input shaping does by itself. A better "
+        "command needs a measurement (docs/identification.md). The figures are guesses for "
+        "machines that ring there."
     )
 
 

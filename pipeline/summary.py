@@ -100,7 +100,10 @@ class Summary:
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
-        if self.writer is not None:
+        typed = stated_note(self.machine, self.shaper) if self.choice is not None else None
+        if typed is not None:
+            yield typed
+        elif self.writer is not None:
             # First, as it says that the file had better not be printed.
             yield from self._outdone({c.name: c.judged_rms_um for c in channels})
         yield from self.totals.warnings
@@ -114,10 +117,7 @@ class Summary:
             yield from budget.warnings(pairs.sums(), self.reader.feature_names)
 
     def _notes(self) -> Iterator[str]:
-        typed = stated_note(self.machine, self.shaper) if self.choice is not None else None
-        if typed is not None:
-            yield typed
-        elif self.choice is not None:
+        if self.choice is not None and any(self.choice.shares):
             yield prediction_note(self.machine, self.choice)
         yield from self.operation.notes()
         if self.writer is not None:
