@@ -1,4 +1,4 @@
-"""What every compensator offers."""
+"""Interface of all compensators."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Compensator(Protocol):
         ...
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is during the next piece; it stands still now."""
+        """Set the operating point of the next piece; the machine stands still now."""
         ...
 
     def ease(self, accel_share: float) -> bool:

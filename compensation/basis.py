@@ -1,4 +1,4 @@
-"""Basis functions: what a command is composed of.
+"""Basis functions, of which commands are linear combinations.
 
 A basis is a matrix Psi of shape (m, n) with orthonormal columns, so that the coefficients' norm is
 the effort; n counts functions (the n + 1 of paper 003). In full preview they compose the command

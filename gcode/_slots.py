@@ -1,4 +1,4 @@
-"""Where the interpreter's state lies in its arrays, and what its numbers mean.
+"""Layout of the interpreter's state in its arrays, and the meaning of its numbers.
 
 Python and kernels share two small arrays: `f` (float64, slots ``F_``) and `i` (int64, ``I_``).
 """

@@ -75,7 +75,7 @@ class BandContent:
         self._prints = _span(printed, extruding, count * BLOCK, total).copy()
 
     def jump(self) -> None:
-        """Say that what comes does not follow what was."""
+        """Begin anew: what follows is not connected to the motion so far."""
         self._path, self._prints = np.zeros((2, 0)), np.zeros(0, dtype=bool)
 
     def beyond_um(self, f_hz: float) -> Array:

@@ -144,7 +144,7 @@ def caution_for(
 
 
 def prediction_note(machine: Machine, choice: Choice) -> str:
-    """Say what the figures of a report are, and how far apart the plants behind them lie."""
+    """Return a note on what a report predicts, and how far its plants differ."""
     measured = []
     for axis, plants in sorted(machine.axes.items()):
         about = plants.provenance

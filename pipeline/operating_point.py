@@ -1,4 +1,4 @@
-"""Where a machine is as a file goes on: the print's mass on its bed, and the height."""
+"""The operating point along a file: the print's mass on its bed, and the height."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a job reads its file: by the dialect of the machine's firmware, or by the one asked for."""
+"""Opens a job's file in the dialect of the machine's firmware, or in a requested one."""
 
 from __future__ import annotations
 

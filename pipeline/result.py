@@ -1,4 +1,4 @@
-"""What a job found, in figures measured on the written file."""
+"""The result of a job, in figures measured on the written file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which sections of a print are worth compensating: where an error shows, and what leads there."""
+"""Selects the sections worth compensating: where errors are visible, and the motion before them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The firmware's own input shaper, as it changes along a file: from planned motion to command.
+"""Applies the firmware's own input shaper, as it changes along a file, to planned motion.
 
 Every step of the path is spread over time by the pulses that are in force when it is made. A file
 can only change them where the machine rests, so this is what the firmware does, and nothing jumps.

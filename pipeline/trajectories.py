@@ -1,4 +1,4 @@
-"""What the nozzle does, sample by sample: commanded and simulated motion as a table.
+"""Motion of the nozzle sample by sample: commanded and simulated, as a table.
 
 The pipeline runs again on the sliced file, up to the end of what is asked for.
 """

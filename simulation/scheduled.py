@@ -1,4 +1,4 @@
-"""What a machine does with a command while its plants change."""
+"""Response of a machine to a command while its plants change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What to look at before a job: how old the measurement is, whether the printer was changed."""
+"""Checks before a job: the age of the measurement, and whether the printer was changed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _DEFAULT_ZETA = 0.07
 _FREQUENCY_SCALE = (0.8, 0.9, 1.0, 1.1, 1.2)
 _DAMPING_SCALE = (0.5, 1.0, 1.5)
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
-"""What motors are taken to bear when nobody says: these multiples of the acceleration, speed and
+"""Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
 _LEAST_STEP_MM_S = 20.0
 _NOT_MORE = 1.001
@@ -151,7 +151,7 @@ class StatedMachine:
     title : str
         Empty: the name.
     f_hz : (float, float)
-        Resonances of X and Y; None: nobody knows.
+        Resonances of X and Y; None: unknown.
     zeta : float
         Damping ratio of both.
     """

@@ -1,4 +1,4 @@
-"""What every feedback design returns: coefficients, the blocks they make, and what to expect.
+"""The result of every feedback design: coefficients, their blocks, and the expected performance.
 
 A design hands its blocks (`models.diagrams`) and its add-on factor 1 - PQ to `judged`, which
 predicts the loop with it, checks every member of the plant set, and refuses what must not be

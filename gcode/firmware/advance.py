@@ -39,7 +39,7 @@ def feed_at_ends(
 
 
 def final_segments(segments: Segments) -> NDArray[np.bool_]:
-    """Tell which segments end their stretch."""
+    """Mark segments that end their stretch."""
     return np.append(segments.group[1:] != segments.group[:-1], True)
 
 

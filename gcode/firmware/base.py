@@ -1,4 +1,4 @@
-"""What one firmware offers to the pipeline: how it plans, and how it is made to execute a stream.
+"""Interface of a firmware to the pipeline: its planner, and how it is made to execute a stream.
 
 `FirmwareAdapter` is the seam. The pipeline asks `gcode.firmware.registry.adapter` for the adapter
 of a machine and knows no firmware by name; whatever differs between firmwares is behind these
@@ -213,10 +213,10 @@ class Adviser(Protocol):
         """Return the lines that set it."""
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line of a file sets it."""
+        """Return whether a line of a file sets it."""
 
     def stores(self, text: str) -> bool:
-        """Tell whether a line of a file stores for good what is in force."""
+        """Return whether a line of a file stores for good what is in force."""
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set the shapers of X and Y."""
@@ -295,7 +295,7 @@ class FirmwareAdapter(Protocol):
         """Return its words for shaper and acceleration, for files read by a dialect."""
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb so much that a stream could not keep their times.
+        """Mark moves that climb so steeply that a stream could not keep their times.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What the planners of all firmwares share: moves wait in a queue until they are settled."""
+"""The queue of all planners, in which moves wait until their speeds are final."""
 
 from __future__ import annotations
 

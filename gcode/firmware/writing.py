@@ -1,4 +1,4 @@
-"""The written file: our lines among those of the original, with the printer's state kept right.
+"""Writes the file: our lines among those of the original, keeping track of the printer's state.
 
 Lines of the original are written byte for byte. Whatever the stream needs different (limits, modes,
 firmware shaper) is set before its first line, and restored before any line that may depend on it.
@@ -91,7 +91,7 @@ class StreamWriter:
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
         self._left_off: set[str] = set()
-        """Axes whose shaper nobody states, so that it stays off behind a stream."""
+        """Axes whose shaper is not stated, so that it stays off behind a stream."""
 
     def shaper_warnings(self) -> Iterator[str]:
         """Yield what became of the firmware's shaper, and of those that the file itself sets."""

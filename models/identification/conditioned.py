@@ -1,4 +1,4 @@
-"""How an axis changes with weight on the bed or with position, from runs under such conditions."""
+"""Changes of an axis with weight on the bed or with position, from runs under such conditions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resonances of a fit with their standard deviations, and which of them are not real."""
+"""Resonances of a fit with their standard deviations; separates real from spurious ones."""
 
 from __future__ import annotations
 

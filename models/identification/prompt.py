@@ -1,4 +1,4 @@
-"""Plants without delay of slow motion: all that a recording without a common clock can tell."""
+"""Plants without delay of slow motion, which a recording without a common clock cannot show."""
 
 from __future__ import annotations
 

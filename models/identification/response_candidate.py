@@ -1,4 +1,4 @@
-"""A plant with parameters, seen through gain and delay of a recording, and how it is polished."""
+"""A parametric plant, seen through gain and delay of a recording, and its refinement."""
 
 from __future__ import annotations
 

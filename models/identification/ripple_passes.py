@@ -1,4 +1,4 @@
-"""From files of passes to a machine with its ripple, and from later passes to a better one.
+"""A machine with its ripple from files of passes, and its refinement by later passes.
 
 A pass is a table of text with a row per sample of the sensor:
 

@@ -1,4 +1,4 @@
-"""What an axis may turn into: the set of plants that robust modes design for.
+"""Plant sets for robust design: the plants that an axis may have.
 
 Several measurements give their own members; a single one is varied by what experience says of
 such a measurement.

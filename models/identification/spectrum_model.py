@@ -1,4 +1,4 @@
-"""What Klipper's spectrum would be for a plant: drive, plant, window, noise."""
+"""The spectrum that Klipper would record for a plant: drive, plant, window, noise."""
 
 from __future__ import annotations
 

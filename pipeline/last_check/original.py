@@ -115,7 +115,7 @@ class Original:
     ----------
     text : Text
     perhaps : deque of bytes
-        Lines before the one that is wanted of which nobody knows whether they move X or Y.
+        Lines before the wanted one that may or may not move X or Y.
     """
 
     def __init__(self, source: BinaryIO, reader: Reader) -> None:
@@ -233,7 +233,7 @@ class Original:
         before_line : int
             Where to stop.
         perhaps : deque of bytes
-            Takes those of which nobody knows whether they move X or Y.
+            Receives the lines that may or may not move X or Y.
 
         Returns
         -------

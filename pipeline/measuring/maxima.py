@@ -1,4 +1,4 @@
-"""The largest contour errors: what a measurement of every sixth sample would miss.
+"""The largest contour errors, which a measurement of every sixth sample would miss.
 
 A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
 it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
@@ -60,7 +60,7 @@ class Maxima:
         self.jump()
 
     def jump(self) -> None:
-        """Say that the position is lost."""
+        """Forget the position."""
         self._printed = self._moved = -self._reach - 1
         self._of = (-1, -1)
         self._at: Array | None = None
@@ -120,7 +120,7 @@ class Maxima:
         self._groups = np.append(self._groups, np.stack(of)[:, at], axis=1)[:, order]
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Finish: the motion has ended."""
         self._note(self._errors.flush())
 
     def _note(self, errors_mm: Array) -> None:

@@ -1,4 +1,4 @@
-"""The best that the firmware's own shapers can do for a machine: the figure to beat.
+"""The best of the firmware's own shapers for a machine: the figure to beat.
 
 Definition: types zv, mzv, ei, 2hump_ei, 3hump_ei with damping 0.1; one frequency an axis on a
 2 % grid from 20 to 200 Hz; the type and pair that minimise the rms contour error over extruding

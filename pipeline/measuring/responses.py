@@ -1,4 +1,4 @@
-"""What a machine does with the commands of a print: as sliced, compensated, and the best shaper's.
+"""Responses of a machine to the commands of a print: as sliced, compensated, and best shaper.
 
 Motion is pushed as it comes and answered some samples later, as a shaper looks ahead; short motion
 waits for more, since between two pieces there are often a few moves only.
@@ -82,7 +82,7 @@ class Responses:
         """To the path, from `reach` samples before what is held to where it is known."""
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is from now on."""
+        """Set the operating point of the motion that follows."""
         self._point = point
         for stream in self._streams.values():
             stream.operate_at(point)

@@ -1,4 +1,4 @@
-"""How quick every class of moves may be within a budget of contour error.
+"""Speed of every class of moves within a budget of contour error.
 
 The paces of classes of moves (features, travel) are chosen on samples from all over the file
 (`pace_search`): as compensated as they will be, with the moves planned for the firmware, and judged
@@ -215,7 +215,7 @@ class SpeedBudget:
         return replace(self)
 
     def _keeps_budget(self, one: int) -> bool:
-        """Tell whether a class keeps the budget at its own pace, in the samples."""
+        """Return whether a class keeps the budget at its own pace, in the samples."""
         return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
     def _used(self, one: int, found: ErrorSum) -> float:

@@ -1,4 +1,4 @@
-"""Samples of a file at other paces: how large their errors become, and how long they take."""
+"""Trials of samples at other paces: their errors and durations."""
 
 from __future__ import annotations
 

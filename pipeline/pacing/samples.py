@@ -106,7 +106,7 @@ def take_samples(
         operation.passed(item.moves)
         if isinstance(item, Piece):
             _take(item, number, point, places, machine, first_layer)
-    # Until the second layer comes, nobody knows whether and how the file tells its layers.
+    # Whether and how the file marks its layers is unknown before the second layer begins.
     wanted = [one for (below, _), one in sorted(places.items()) if below == first_layer.below]
     each = int(np.clip(_TOTAL_S / _LASTS_S / max(len(wanted), 1), _FEWEST, _MOST))
     chosen = {entry[:3]: entry[3] for one in wanted for entry in one.some(each)}

@@ -1,4 +1,4 @@
-"""Klipper's resonance test on a virtual printer, and the files that it leaves.
+"""Klipper's resonance test on a virtual printer, and the files that it writes.
 
 The accelerometer has the faults of real ones: wrong gains, a rotated mounting, noise, quantisation,
 a sampling rate that is not quite the nominal one, and a clock with an arbitrary origin.

@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make Klipper execute it.
+"""Encodes a compensated command as the G1 lines that make Klipper execute it.
 
 Klipper re-plans every line, under the acceleration and corners that the motors bear: so the stream
 may break off at any line. What ramps cost at steps of speed is predicted by its law and taken off

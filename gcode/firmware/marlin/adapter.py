@@ -1,4 +1,4 @@
-"""What Marlin offers to the pipeline."""
+"""Marlin's interface to the pipeline."""
 
 from __future__ import annotations
 

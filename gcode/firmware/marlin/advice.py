@@ -1,4 +1,4 @@
-"""Marlin's words for a shaper and an acceleration, read and written."""
+"""Marlin's commands for shaper and acceleration, read and written."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class MarlinAdviser:
         return (f"M204 P{accel_mm_s2:.10g}".encode(),)
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line sets M204 P."""
+        """Return whether a line sets M204 P."""
         return any(
             c.name == "M204" and bool(c.words.keys() & {"P", "S"})
             for c in split_line(text, self._dialect)
         )
 
     def stores(self, text: str) -> bool:
-        """Tell whether a line holds M500: it writes accelerations and shaper to the EEPROM."""
+        """Return whether a line holds M500: it writes accelerations and shaper to the EEPROM."""
         return any(c.name == "M500" for c in split_line(text, self._dialect))
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:

@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make Marlin execute it.
+"""Encodes a compensated command as the G1 lines that make Marlin execute it.
 
 Marlin moves in whole steps and times them in whole ticks. The vertices lie on whole steps, so that
 its rounding changes nothing, and far enough apart that it executes each; the feedrates are those of

@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make RepRapFirmware execute it.
+"""Encodes a compensated command as the G1 lines that make RepRapFirmware execute it.
 
 The speed along the path is continuous in this firmware: a step of it costs time, a step of
 direction costs none within the jerk limits. The stream runs under what the motors bear, so that it

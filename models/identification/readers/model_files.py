@@ -1,4 +1,4 @@
-"""Models that others fitted: JSON of ours or of python-control's quantities, and MATLAB files."""
+"""Models fitted elsewhere: JSON of ours or of python-control's quantities, and MATLAB files."""
 
 from __future__ import annotations
 

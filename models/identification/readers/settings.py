@@ -1,4 +1,4 @@
-"""What measurement files do not carry: asked for, or assumed by the date of the firmware."""
+"""Facts that measurement files lack: asked for, or assumed by the date of the firmware."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def excitation_for(
     Raises
     ------
     ModelError
-        If nobody says which axis was tested, or it is not in the plane.
+        If the tested axis is not stated, or does not lie in the plane.
     """
     return _resolved(measurement, settings or ReadSettings()).excitation
 
