@@ -78,7 +78,7 @@ class Compensator(Protocol):
 
 
 class Memoryless:
-    """Base of compensators that take every piece by itself: nothing vibrates when it begins."""
+    """Base of compensators without state between pieces: nothing vibrates when a piece begins."""
 
     lead_s = 0.0
     tail_s = 0.0

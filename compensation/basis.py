@@ -46,7 +46,7 @@ ZERO = 1e-13
 
 
 def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
-    """Clamped uniform B-splines as they are written down, shape (samples, n).
+    """Clamped uniform B-splines, shape (samples, n).
 
     Paper 003, F.2 and F.3: local, not negative, sum 1 at every sample.
 

@@ -136,7 +136,7 @@ def designed(options: Options, mode: str, design: Callable[[str], T]) -> T:
 def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
 ) -> tuple[Caution, Choice] | None:
-    """Return what the default takes of the shaper, and why; None where it takes none."""
+    """Return the default's share of the shaper, and why; None without a shaper."""
     vibration = options.method.removesuffix("+ripple")
     if vibration != "fbf" or options.robust != "auto" or design_mode(machine, options) == "off":
         return None
@@ -305,7 +305,7 @@ def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
 
 
 def _delayed(y: Array, samples: float) -> Array:
-    """Return a motion (2, n) with X late by so many samples; below 0 Y is late instead."""
+    """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
     row = 0 if samples > 0.0 else 1
     late = y.copy()
     at = np.arange(y.shape[1], dtype=float)

@@ -75,7 +75,7 @@ class Operation:
         self.printed_kg += self._kg_per_mm * laid_mm
 
     def notes(self) -> list[str]:
-        """Return what the plants followed, in words."""
+        """Return notes on the mass and height that the plants followed."""
         notes = []
         for axis, schedule in self._machine.schedules.items():
             follows = []

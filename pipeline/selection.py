@@ -45,7 +45,7 @@ def smaller(options: Options) -> Options | None:
 
 
 class Selection:
-    """Leave sections as sliced whose features nobody sees.
+    """Leave sections with invisible features as sliced.
 
     A section (`gcode.dividing`) is compensated as a whole if it prints any feature that counts, or
     one that the slicer does not name. Travel right before such a section is compensated with it:

@@ -164,7 +164,7 @@ class _Window:
 
 
 class _Passed(Exception):
-    """All that was asked for is written."""
+    """All that was requested is written."""
 
 
 @contextlib.contextmanager

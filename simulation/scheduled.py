@@ -69,7 +69,7 @@ class MachineStream:
             stream.stand()
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Go on with the plants of this point, which still vibrate from what was before."""
+        """Continue with the plants of this point, which still vibrate from the motion before."""
         if self._streams and not self._machine.schedules:
             return
         level = self._grid.level(point)

@@ -361,7 +361,7 @@ def _equation(block: Block) -> dict[str, object]:
 
 
 def _c_comment(block: Block) -> str:
-    """Tell what a block does: output = H(z) (sum of signals), and when."""
+    """Describe a block: output = H(z) (sum of signals), and its rate."""
     wires = " ".join(f"{gain:+.17g} {name}" for name, gain in block.inputs)
     plain = block.order == 0 and block.num == block.den == (1.0,)
     through = f"({wires})" if plain else f"H[{len(block.num)}/{len(block.den)}] ({wires})"

@@ -21,7 +21,7 @@ __all__ = ["feed_at_ends", "final_segments"]
 def feed_at_ends(
     piece: Piece, timeline: Timeline, segments: Segments
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return what the plan feeds where each segment ends.
+    """Return the plan's row and extruder speed at the end of each segment.
 
     Returns
     -------

@@ -61,7 +61,7 @@ class Planner(Protocol):
         """
 
     def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
-        """Plan moves that follow the last ones without a stop; return what is settled by now."""
+        """Plan moves that follow the last ones without a stop; return those that are final."""
 
     def plan_whole(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
         """Plan moves that follow the last ones, all at once, and come to rest."""
@@ -216,13 +216,13 @@ class Adviser(Protocol):
         """Return whether a line of a file sets it."""
 
     def stores(self, text: str) -> bool:
-        """Return whether a line of a file stores for good what is in force."""
+        """Return whether a line of a file stores the current settings permanently."""
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set the shapers of X and Y."""
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what a line of a file leaves in force."""
+        """Return the shaper in force after a line of a file."""
 
 
 class FirmwareAdapter(Protocol):
@@ -234,14 +234,14 @@ class FirmwareAdapter(Protocol):
 
     @property
     def step_mm(self) -> tuple[float, float, float, float]:
-        """Largest distance of a place x y z e that is asked for from where the machine stops.
+        """Largest distance x y z e between a commanded position and where the machine stops.
 
         0 for a firmware that keeps places to the last digit of the file, one step otherwise.
         """
 
     @property
     def shortest_move_mm(self) -> float:
-        """Length in X Y below which a move is not executed by itself; 0: every move is."""
+        """Length in X Y below which a move is merged with its neighbours; 0: none is."""
 
     @property
     def extruder_alone_stops(self) -> bool:
@@ -251,7 +251,7 @@ class FirmwareAdapter(Protocol):
         """Limits before the first line of a file."""
 
     def stream_limits(self, own: Limits) -> Limits:
-        """Return what a stream runs under where the file has set `own`.
+        """Return the limits of a stream where the file has set `own`.
 
         What a file sets and a stream must keep (pressure advance, say) is copied. A piece ends
         where these limits change.

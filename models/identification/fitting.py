@@ -188,7 +188,7 @@ def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
 
 
 def _zero_delay(fit: _Candidate) -> Array:
-    """Return what the zero at each parameter that holds its side delays slow motion by, or 0."""
+    """Return the delay of slow motion by the zero whose side each parameter's sign is, else 0."""
     tau, _, _, log_fz, zz = fit.structure.split(fit.theta)
     out = np.zeros(fit.structure.size)
     out[0] = abs(tau)

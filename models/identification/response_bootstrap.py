@@ -132,7 +132,7 @@ class _Draws:
 
 
 def _within(response: FrequencyResponse, fit: Fit) -> FrequencyResponse:
-    """Return what was fitted of a response, all of it coherent."""
+    """Return the fitted part of a response, all of it coherent."""
     f, low_high = response.f_hz, fit.band_hz
     used = coherent(response.coherence) & (f >= low_high[0]) & (f <= low_high[1])
     used &= np.isfinite(response.response) & (np.abs(response.response) > 0)

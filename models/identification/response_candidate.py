@@ -79,7 +79,7 @@ def with_gain(data: ResponseData, structure: S, theta: Array, delay_s: float) ->
 
 
 def judged(data: ResponseData, candidate: Candidate[S]) -> Candidate[S]:
-    """Return the candidate with what it leaves.
+    """Return the candidate with its residual.
 
     Candidates are ranked by the modulus of the error, which no phase of reference changes; the fit
     softens real and imaginary part one by one (`least_error`), as scipy does.

@@ -139,7 +139,7 @@ def _check_axis(machine: Machine, axis: RippleAxis, basis: Sequence[WaveBasis]) 
 
 
 def _plant(machine: Machine, axis: RippleAxis) -> DiscretePlant:
-    """Return what a motor's motion answers: along a diagonal the mean of both axes."""
+    """Return the plant of a motor's motion: along a diagonal the mean of both axes."""
     if axis in ("x", "y"):
         return discretise(machine.axes[axis].nominal, _DT_S)
     x, y = (discretise(machine.axes[name].nominal, _DT_S) for name in ("x", "y"))

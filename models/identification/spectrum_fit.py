@@ -256,7 +256,7 @@ def refit_spectrum(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """Parameters [log gain, log noise, modes ...] of a structure, and what they leave.
+    """Parameters [log gain, log noise, modes ...] of a structure, and their residual.
 
     `cost` is twice the negative log of likelihood times prior, and what parameters cost;
     `covariance` that of the vector where both are taken to be normal around the fit (Laplace).
@@ -420,7 +420,7 @@ class _Search:
     def polished(
         self, start: _Candidate, whitening: Array, log_psd: Array, rounds: int
     ) -> _Candidate:
-        """Minimise whitened errors and what is unlikely of the parameters."""
+        """Minimise whitened errors and the improbability of the parameters (prior)."""
         model, structure, n = self.model, start.structure, start.structure.modes
         band_hz = (_MODES_BAND[0] * model.f_hz[0], _MODES_BAND[1] * model.f_hz[-1])
         low, high = structure.bounds(band_hz, _ZETA_BAND, _SHARE_BAND)

@@ -78,7 +78,7 @@ class Advice:
 
 
 def is_visible(name: str) -> bool:
-    """Return whether a feature is seen on the print: walls, and what nobody has named."""
+    """Return whether a feature is visible on the print: walls, and unnamed features."""
     feature = feature_of(name)
     return feature is None or feature in _VISIBLE
 

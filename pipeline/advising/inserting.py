@@ -197,7 +197,7 @@ class AdviceWriter:
         return b"".join(self._line(line, f"shaper{layer}") for line in lines)
 
     def _give_shaper_back(self) -> bytes:
-        """Set the shaper that the machine states, and then what the file has set."""
+        """Restore the shaper of the machine document, and then the file's settings."""
         stated = self._adviser.stated
         lines = () if stated is None else self._adviser.shaper_lines(stated)
         lines = (*lines, *self._own_shaper.values())
@@ -205,7 +205,7 @@ class AdviceWriter:
         return b"".join(self._line(line, "the printer's own shaper") for line in lines)
 
     def _sets_all(self, lines: Sequence[bytes]) -> bool:
-        """Return whether nothing of ours is left after these lines: no axis keeps its type."""
+        """Return whether these lines replace all of our settings: no axis keeps its type."""
         left = Shaping(_OURS, _OURS)
         with contextlib.suppress(ValueError):
             for line in lines:

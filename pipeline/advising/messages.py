@@ -10,7 +10,7 @@ __all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings"]
 
 
 def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) -> list[str]:
-    """Say what is not known of the printer's shaper.
+    """Return warnings about unknown settings of the printer's shaper.
 
     Parameters
     ----------

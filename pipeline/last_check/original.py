@@ -183,7 +183,7 @@ class Original:
         return line if self.reader.leaves_alone(line.rstrip()) else b""
 
     def wanted(self) -> Wanted:
-        """Carry out what a stream may stand for, and the line after it, which must stay."""
+        """Execute what a stream may replace, and the line after it, which must stay."""
         if self._ahead is not None:
             wanted, place, perhaps = self._ahead
             if wanted.line >= self.text.line:
@@ -208,7 +208,7 @@ class Original:
         return Wanted()
 
     def look_ahead(self, wanted: Wanted) -> None:
-        """Remember what is wanted next, after which the original is now.
+        """Look ahead to the next line wanted; the original stands after it.
 
         Many streams may end before it, and the file should not be searched again for each.
         """
@@ -226,7 +226,7 @@ class Original:
                 self.skip()
 
     def _next(self, before_line: int, perhaps: deque[bytes]) -> tuple[bytes, int]:
-        """Carry out moves of X and Y, and go on to what is after them.
+        """Execute moves of X and Y, and continue to the line after them.
 
         Parameters
         ----------

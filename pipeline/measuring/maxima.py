@@ -96,7 +96,7 @@ class Maxima:
         self._added += n
 
     def answered(self, path_mm: Array, answer_mm: Array) -> None:
-        """Add the next answers, shapes (2, n) and (channels, 2, n), to what was noted."""
+        """Add the next answers, shapes (2, n) and (channels, 2, n), to the samples noted before."""
         upto = self._answered + path_mm.shape[1]
         if self._exact is not None:
             self._choose(np.hypot(*(answer_mm[self._exact] - path_mm)), self._exact)
@@ -106,7 +106,7 @@ class Maxima:
         self._note(self._errors.push(path_mm, answer_mm, at))
 
     def _choose(self, tracking_mm: Array, channel: int) -> None:
-        """Choose what may be larger than what was found of its feature so far."""
+        """Choose samples whose error may exceed their feature's maximum so far."""
         n = len(tracking_mm)
         (extruding, *of), self._pending = self._pending[:, :n], self._pending[:, n:]
         chosen = np.zeros(n, np.bool_)

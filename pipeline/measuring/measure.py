@@ -233,7 +233,7 @@ class Measurement:
         ]
 
     def warnings(self) -> list[str]:
-        """Return what the figures do not stand for, in words."""
+        """Return warnings about what the figures do not cover."""
         return self._band.warnings()
 
     def layers(self) -> list[GroupFigures]:
@@ -296,7 +296,7 @@ class Measurement:
 
 
 def channel_names(*, compensated: bool) -> tuple[str, ...]:
-    """Return the names of what is measured, in the order of all tables of channels."""
+    """Return the names of the measured channels, in the order of all tables."""
     return ("before", "after", "shaper") if compensated else ("before", "shaper")
 
 

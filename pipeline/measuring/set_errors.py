@@ -90,7 +90,7 @@ class SetErrors:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what was measured; the machine stands still when motion goes on."""
+        """Discard what was measured; the machine stands still when motion resumes."""
         channels = len(self._numbers)
         self._meter = ContourMeter(self._dt_s, stride=self._stride, channels=channels)
         self._tally, self._landed = GroupTally(channels), GroupTally(channels)

@@ -182,7 +182,7 @@ class SpeedBudget:
             self._factors[one] = max(1.0, _SLOWER * self._factors[one])
 
     def gentler(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
-        """Return what the file is to be written with once more; None where it may stay."""
+        """Return the lower budget for another attempt; None if the written file may stay."""
         kept = [one for one in self._factors if one in sums and self._keeps_budget(one)]
         over = {one: self._used(one, sums[one]) for one in kept}
         over = {one: ratio for one, ratio in over.items() if ratio > _ABOVE}
@@ -230,7 +230,7 @@ class SpeedBudget:
         original_s: float,
         time_s: float,
     ) -> BudgetFigures:
-        """Return what came of it."""
+        """Return the figures of the report."""
         classes = []
         for one, found in sorted(sums.items()):
             name = _name(one, names)

@@ -125,7 +125,7 @@ def _items(
 
 
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
-    """Return what is known of the first layer when these moves have come."""
+    """Return what is known of the first layer after these moves."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
     prints = moves.prints & (moves.layer >= 0)
     if np.isfinite(known.z_mm) or not np.any(prints):

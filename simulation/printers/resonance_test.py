@@ -89,7 +89,7 @@ class Record:
 
 
 def drawn_sensor(rng: np.random.Generator, chip: str | None = None) -> Accelerometer:
-    """Draw an accelerometer as they come: gains 15 % off at most, turned by some degrees."""
+    """Draw a typical accelerometer: gains up to 15 % off, rotated by some degrees."""
     chip = chip or str(rng.choice(sorted(_CHIPS)))
     rate_hz, step_mm_s2 = _CHIPS[chip]
     gains = rng.uniform(0.85, 1.15, 3)

@@ -75,7 +75,7 @@ class KlipperAdviser:
         return (" ".join(words).encode(),)
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what a SET_INPUT_SHAPER leaves in force."""
+        """Return the shaper in force after a SET_INPUT_SHAPER."""
         command = split_line(text, self._dialect)[0]
         if command.name != "SET_INPUT_SHAPER":
             return now

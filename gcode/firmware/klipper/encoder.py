@@ -52,7 +52,7 @@ _TIME_TOLERANCE_S = 2e-6
 def stream_limits(
     firmware: Klipper, command: CommandLimits, mesh_slope: float = 0.0
 ) -> KlipperLimits:
-    """Return what a stream runs under: what the motors bear, so that it may break off anywhere.
+    """Return the limits of a stream: those of the motors, so that it may break off anywhere.
 
     Parameters
     ----------

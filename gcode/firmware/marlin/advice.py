@@ -100,7 +100,7 @@ class MarlinAdviser:
         )
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what an M593 or M493 leaves in force."""
+        """Return the shaper in force after an M593 or M493."""
         for command in split_line(text, self._dialect):
             if command.name != self.shaper_word:
                 continue
@@ -126,7 +126,7 @@ class MarlinAdviser:
 
 
 def _read_version_1(command: Command, now: Shaping) -> Shaping:
-    """Return what an M493 of version 1 leaves in force: each axis has letters of its own."""
+    """Return the shaper after an M493 of version 1, where each axis has its own letters."""
     axes = []
     for s, (axis, hertz, zeta) in ((now.x, "XAI"), (now.y, "YBJ")):
         mode, f_hz, damping = (command.words.get(letter, "") for letter in (axis, hertz, zeta))

@@ -234,7 +234,7 @@ def resonance_test(state: MachineState, command: Command) -> int:
 
 
 def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
-    """Return a handler for commands whose effect nobody here can follow.
+    """Return a handler for commands whose effect is not modelled.
 
     Parameters
     ----------

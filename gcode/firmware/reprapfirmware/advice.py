@@ -74,7 +74,7 @@ class RepRapAdviser:
         return (f'M593 P"{name}" F{s.f_hz:.6g} S{s.damping:.6g}'.encode(),)
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what an M593 leaves in force."""
+        """Return the shaper in force after an M593."""
         for command in split_line(text, self._dialect):
             if command.name != "M593" or command.uncertain:
                 continue

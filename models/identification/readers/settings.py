@@ -164,7 +164,7 @@ def excitation_for(
 def excitation_notes(
     measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
 ) -> tuple[str, ...]:
-    """Return in words what `excitation_for` assumed because nobody said it."""
+    """Return notes on what `excitation_for` assumed for lack of information."""
     return _resolved(measurement, settings or ReadSettings()).notes
 
 
