@@ -1,4 +1,4 @@
-"""Layout of the interpreter's state in its arrays, and the meaning of its numbers.
+"""Where the interpreter's state lies in its arrays, and what its numbers mean.
 
 Python and kernels share two small arrays: `f` (float64, slots ``F_``) and `i` (int64, ``I_``).
 """
