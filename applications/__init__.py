@@ -1,1 +1,1 @@
-"""What is done around a machine: identify, design, prove, add controllers, scan, print live."""
+"""Workflows around a machine: identify, design, verify, add controllers, scan, print live."""

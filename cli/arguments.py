@@ -1,4 +1,4 @@
-"""Arguments and options that several commands have, and the checks of what they are given."""
+"""Arguments and options that several commands share, and the checks of their values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command line shows: progress on stderr, figures on stdout."""
+"""Output of the command line: progress on stderr, figures on stdout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands `controller` and `loops` print."""
+"""Terminal output of the commands `controller` and `loops`."""
 
 from __future__ import annotations
 

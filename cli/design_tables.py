@@ -1,4 +1,4 @@
-"""What `stillpath design` prints."""
+"""Terminal output of `stillpath design`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command line prints of an identification."""
+"""Terminal output of an identification."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opens the machines of this user, and says who changes them. Heavy imports wait until needed."""
+"""Opens the machines of this user, and names who changes them. Heavy imports wait until needed."""
 
 from __future__ import annotations
 

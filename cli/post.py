@@ -1,4 +1,4 @@
-"""What `integrations/slicers/stillpath_post.py` does on this computer; heavy imports wait."""
+"""The work of `integrations/slicers/stillpath_post.py` on this computer; heavy imports wait."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`stillpath printers ...`: how printers that results are sent to compare with their machines."""
+"""`stillpath printers ...`: compares printers that receive results with their machine documents."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the commands of proof on metal print."""
+"""Terminal output of the commands of proof on metal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command `scan` prints."""
+"""Terminal output of the command `scan`."""
 
 from __future__ import annotations
 

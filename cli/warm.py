@@ -1,4 +1,4 @@
-"""`stillpath warm`: what is compiled at first use is compiled now, as a part of installing."""
+"""`stillpath warm`: compiles during installation what would be compiled at first use."""
 
 from __future__ import annotations
 

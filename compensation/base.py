@@ -1,4 +1,4 @@
-"""What every compensator offers."""
+"""Interface of all compensators."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Compensator(Protocol):
         ...
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is during the next piece; it stands still now."""
+        """Set the operating point of the next piece; the machine stands still now."""
         ...
 
     def ease(self, accel_share: float) -> bool:
@@ -78,7 +78,7 @@ class Compensator(Protocol):
 
 
 class Memoryless:
-    """Base of compensators that take every piece by itself: nothing vibrates when it begins."""
+    """Base of compensators without state between pieces: nothing vibrates when a piece begins."""
 
     lead_s = 0.0
     tail_s = 0.0

@@ -1,4 +1,4 @@
-"""Basis functions: what a command is composed of.
+"""Basis functions, of which commands are linear combinations.
 
 A basis is a matrix Psi of shape (m, n) with orthonormal columns, so that the coefficients' norm is
 the effort; n counts functions (the n + 1 of paper 003). In full preview they compose the command
@@ -46,7 +46,7 @@ ZERO = 1e-13
 
 
 def bspline_functions(samples: int, n: int, degree: int = 3) -> Array:
-    """Clamped uniform B-splines as they are written down, shape (samples, n).
+    """Clamped uniform B-splines, shape (samples, n).
 
     Paper 003, F.2 and F.3: local, not negative, sum 1 at every sample.
 

@@ -1,4 +1,4 @@
-"""Approximate inverses of a plant: what to do with the zeros that cannot be cancelled.
+"""Approximate inverses of a plant: several treatments of zeros that cannot be cancelled.
 
 With the plant in the shift operator q,
 

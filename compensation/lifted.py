@@ -207,7 +207,7 @@ def lifted_set_of(
 
 
 def checked_weights(weights: ArrayLike, members: int) -> Array:
-    """Return the weights of a set, shape (members,), or say what is wrong with them."""
+    """Return the weights of a set, shape (members,); raise DesignError for invalid ones."""
     shares = np.asarray(weights, np.float64)
     if members == 0:
         raise DesignError("the set of plants is empty: give at least one")

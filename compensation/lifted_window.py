@@ -95,7 +95,7 @@ class LiftedWindow:
         return self.reach[:, self.window - self.update :]
 
     def lifted_set(self) -> LiftedSet:
-        """Return what a basis needs to know: Gram matrix and mean of the integrated plants."""
+        """Return the data of a basis: Gram matrix and mean of the integrated plants."""
         markov = np.array([integrated(p.impulse_response(self.window)) for p in self.plants])
         return lifted_set(markov, self.weights)
 

@@ -1,4 +1,4 @@
-"""How good a lifted controller is when nothing is known about the path (paper 003, 2.5 to 4.4).
+"""Accuracy of a lifted controller without knowledge of the path (paper 003, 2.5 to 4.4).
 
 Frobenius norms of the error and of the controller, divided by the root of the number of samples:
 expected rms error and command for white noise of rms 1. For smooth paths they order designs and

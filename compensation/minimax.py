@@ -1,4 +1,4 @@
-"""Weights of a plant set that make least squares guard against the worst member.
+"""Weights of a plant set with which least squares protects the worst member.
 
 For a command u = C y_d the expected squared error of member j is e_j^2 = sum_w S |1 - G_j C|^2, S
 the spectrum of the path. The least weighted sum over all C,

@@ -1,4 +1,4 @@
-"""Lifted systems: what a linear plant does to M + 1 samples, as one operator (paper 003, A.2).
+"""Lifted systems: a linear plant acting on M + 1 samples, as one operator (paper 003, A.2).
 
 An operator multiplies with G and G' without forming G: by FFT where it is Toeplitz, by running the
 states forward and the costates backward where the plant changes with time, block by block where

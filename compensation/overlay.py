@@ -57,7 +57,7 @@ class Overlay:
         return self._inner.ease(accel_share)
 
     def _kept(self, u: Array, wanted: Array) -> bool:
-        """Tell whether a command keeps each axis' limits, or asks for no more than `wanted`.
+        """Return whether a command keeps each axis' limits, or asks for no more than `wanted`.
 
         What the inner compensator asks for is its own business; what is laid over it must not add
         to that.

@@ -150,7 +150,7 @@ class _Drive:
 
 
 class Designs:
-    """The designs of an axis, made when first asked for.
+    """The designs of an axis, computed when first needed.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ class Designs:
         self._rest_functions: dict[PreviewDesign, Functions] = {}
 
     def rest_functions(self, rung: int) -> Functions:
-        """Return what the windows of a rung that meet a stop need (`Condensed`)."""
+        """Return the functions for a rung's windows that contain a rest (`Condensed`)."""
         design = self.design(rung, REST_FUNCTIONS)
         if design not in self._rest_functions:
             made = functions_of(design, at_rests=True, part=self.at_rests)
@@ -182,7 +182,7 @@ class Designs:
         return self._rest_functions[design]
 
     def design(self, rung: int, most: int = 300) -> PreviewDesign:
-        """Return the design of a rung, with at most so many functions per 300 samples."""
+        """Return the design of a rung, with at most `most` functions per 300 samples."""
         step = self.ladder[rung]
         n = self._scaled(min(step.n, most))
         if (n, step.price) not in self._made:
@@ -407,7 +407,7 @@ class PreviewAxis:
         return u, last_states
 
     def _drive(self, rung: int, task: AxisTask, targets_mm: Array | None) -> _Drive:
-        """Return what a rung makes of a piece; the last one again for the same piece and rung.
+        """Return the command of a rung for a piece; the last result is reused if both are the same.
 
         A piece is often asked for again with a few more windows within bounds. Windows that begin
         as they did before are then not solved again.

@@ -1,4 +1,4 @@
-"""One window solved by itself: with rests, and within bounds.
+"""The optimisation problem of a single window: with rests, and within bounds.
 
 Over a rest [a, b) only E or Z moves and X and Y must stand still. The increments are tied down
 there: the one at a stops the command, the others are zero, and the remaining functions are solved

@@ -1,4 +1,4 @@
-"""What comments do: the marks of slicers and our own, for all lines after them."""
+"""Handles comments: the marks of slicers and our own, for all lines after them."""
 
 from __future__ import annotations
 

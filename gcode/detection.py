@@ -1,4 +1,4 @@
-"""For which firmware a file was written.
+"""Detects the firmware that a file was written for.
 
 A file never says it for sure: Klipper users slice with Marlin's flavour and add macros, and slicers
 write words of all firmwares into every file. So every sign has a weight, commands more than what
@@ -159,7 +159,7 @@ _SIGNS = (
 
 
 def detect(head: bytes, tail: bytes = b"") -> Detection:
-    """Tell for which firmware a file was written.
+    """Return the firmware that a file was written for.
 
     Parameters
     ----------

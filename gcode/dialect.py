@@ -1,4 +1,4 @@
-"""What a firmware makes of G-code, as one table of rules and words.
+"""The dialect of a firmware: one table of its rules and commands.
 
 The interpreter (`gcode.interpreter`) is one for all; a `Dialect` says where firmwares differ. Each
 firmware's own is in `gcode/firmware/*/dialect.py`; docs/dialects.md shows them side by side.

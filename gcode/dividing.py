@@ -1,4 +1,4 @@
-"""Divide a piece, where it stands or nearly does, into what is compensated and what is not."""
+"""Divide a piece, where it stands still or nearly so, into compensated and other sections."""
 
 from __future__ import annotations
 

@@ -270,7 +270,7 @@ class _Reader:
             self._filament = _number(words, "E", number, line)
 
     def _fed(self, words: Mapping[str, str], number: int, line: str) -> bool:
-        """Tell whether the extruder moves on, in files without a laser's words."""
+        """Return whether the extruder moves on, in files without a laser's words."""
         if "E" not in words:
             return False
         value = _number(words, "E", number, line)

@@ -1,4 +1,4 @@
-"""From bytes to moves and events, as the firmware of a dialect reads them.
+"""Interprets bytes as moves and events by the dialect of a firmware.
 
 `Interpreter` takes a file in pieces of any size. The kernel (`_lex_kernels.run`) carries out the
 plain lines; lines it hands back are carried out here and it goes on after them. Every byte of

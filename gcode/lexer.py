@@ -1,4 +1,4 @@
-"""Cut one line into commands and their words, as the firmware of a dialect does.
+"""Split one line into commands and their words, as the firmware of a dialect does.
 
 This is the slow and complete reading; `_lex_kernels.run` reads the plain lines itself.
 

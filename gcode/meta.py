@@ -1,7 +1,7 @@
-"""RepRapFirmware's meta commands: nobody knows before the print what they decide.
+"""RepRapFirmware's meta commands, whose decisions are unknown before the print.
 
-Lines of a block after ``if`` or ``while`` may be carried out once, often or never. Those that do
-not touch the motion are read as ever; any other stays a barrier after which the place is unknown.
+Lines of a block after ``if`` or ``while`` may be executed once, often or never. Those that do not
+touch the motion are read as usual; any other remains a barrier after which the place is unknown.
 Source: RepRapFirmware src/GCodes/GCodeBuffer/StringParser.cpp, 3.5.
 """
 

@@ -1,4 +1,4 @@
-"""Plan a piece anew with other accelerations and speeds, move class by move class.
+"""Replan a piece with other accelerations and speeds, one class of moves after the other.
 
 Geometry, filament and the order of the lines stay; so do the speeds at which plastic is laid, for
 they hold what a slicer decided: flow, cooling, overhangs, small perimeters. What changes are the
@@ -65,7 +65,7 @@ class FirstLayer:
     below : int
         Layers below are part of it; -1 where the file does not tell its layers.
     z_mm : float
-        So is what is not higher; minus infinity where nobody knows.
+        What is not higher is part of it too; minus infinity where the height is unknown.
     """
 
     below: int = 1

@@ -1,4 +1,4 @@
-"""What the firmware knows while it reads: the state that commands change.
+"""The state of the firmware while it reads, which commands change.
 
 Kernels and Python share it; the numbers are in two arrays (see `gcode._slots`). Commands that the
 kernel does not know are functions of this state, one module of them per firmware.

@@ -1,4 +1,4 @@
-"""From planned moves to the sampled path of a piece, with its rests laid on the sampling grid.
+"""The sampled path of a piece from its planned moves, with its rests on the sampling grid.
 
 A *piece* is a row of planned moves that starts and ends at rest. Inside it, moves of X and Y form
 *stretches*; between them lie *rests*, moves of the extruder or of Z alone, which are written

@@ -1,4 +1,4 @@
-"""What the interpreter says about a file: moves, events and the modal state between them.
+"""The interpreter's output: moves, events and the modal state between them.
 
 All columns of one dataclass have the same length and are plain numpy arrays; a block holds some
 thousand rows. Byte offsets count from the start of the file, line numbers from 1.

@@ -1,4 +1,4 @@
-"""What is wrong with a value that was given, in plain words: what it must be, and what it was."""
+"""Plain words for wrong values: what a value must be, and what it was."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a ring test on the machine said of its plants; stored in the machine's document."""
+"""The verdict of a ring test on the machine's plants; stored in the machine's document."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dry friction of guides: by how much it holds an axis back, and what command makes up for it.
+"""Dry friction of guides: how far it holds an axis back, and which command compensates for it.
 
 Friction of force F holds what slides F/k behind its command, k the stiffness of belt and motor: c
 micrometres, against the direction of motion. As a sliding surface is first bent and then dragged

@@ -1,4 +1,4 @@
-"""Closed-loop machines: a plant with its feedback, as they are written down and computed with.
+"""Closed-loop machines: a plant with its feedback, as documents and in computable form.
 
 Polynomials are in rising powers of z^-1 throughout. An identified servo is written down as its
 complementary sensitivity T0 = N/M, never as the open loop P = N/(M - N): of published models of

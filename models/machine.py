@@ -1,4 +1,4 @@
-"""What a machine is: kinematics, travel, limits, firmware facts and the plants of its axes.
+"""The machine document: kinematics, travel, limits, firmware facts and the plants of its axes.
 
 A machine is one JSON document. Every bound is checked where the document is read, so that the
 rest of the house can rely on it.

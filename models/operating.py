@@ -1,4 +1,4 @@
-"""A machine along its print: its plants at an operating point, and grids of such points.
+"""A machine during its print: its plants at an operating point, and grids of such points.
 
 Compensators cannot follow a plant continuously. They work on a grid of operating points between
 which no resonance moves by more than a step: mass and height are rounded to it where the machine

@@ -1,4 +1,4 @@
-"""Plants as they are written down: six kinds of JSON document and the sets made of them.
+"""Plants as documents: six kinds of JSON document and the sets made of them.
 
 Every kind is checked where it is read: finite, proper, stable, free of integrators, and with
 DC gain 1 (an axis without slip reaches every position it is told to).

@@ -1,4 +1,4 @@
-"""Plants as they are computed with: state space, exact discretisation, frequency response.
+"""Plants in computable form: state space, exact discretisation, frequency response.
 
 The command of a machine is linear between samples, so a continuous plant is discretised with a
 first-order hold (triangle hold): exact for such a command, at every sample. Discrete plants

@@ -1,4 +1,4 @@
-"""Where a model comes from and how far it can be trusted; stored beside the plants."""
+"""Origin of a model and how far it can be trusted; stored beside the plants."""
 
 from __future__ import annotations
 

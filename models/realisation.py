@@ -1,4 +1,4 @@
-"""Roots to state space, by real first- and second-order sections in cascade.
+"""State space from roots, by real first- and second-order sections in cascade.
 
 Polynomials of high order lose their roots to rounding when the poles crowd (at z = 1, or over
 decades of frequency); sections of order two with their poles in the matrix do not.

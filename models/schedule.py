@@ -1,4 +1,4 @@
-"""How the plant of an axis changes during a print: with the mass on the bed, and with position.
+"""Variation of an axis' plant during a print: with the mass on the bed, and with position.
 
 Mass (a bed that moves): stiffness k and viscous damping c are the machine's and stay, the mass
 grows from m0 to m0 + m. With w^2 = k / m and 2 zeta w = c / m, frequency and damping ratio of the

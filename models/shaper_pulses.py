@@ -1,4 +1,4 @@
-"""Input shapers as the firmware defines them: the pulses that the command is repeated with."""
+"""Input shapers as the firmware defines them: the pulses with which the command is convolved."""
 
 from __future__ import annotations
 

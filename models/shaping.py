@@ -1,4 +1,4 @@
-"""A firmware's input shaper as it is set: what the command of X and Y is repeated with."""
+"""The current setting of a firmware's input shaper, applied to the command of X and Y."""
 
 from __future__ import annotations
 

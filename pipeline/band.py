@@ -52,7 +52,7 @@ class BandContent:
         self._path, self._prints = np.zeros((2, 0)), np.zeros(0, dtype=bool)
 
     def add(self, path_mm: Array, extruding: NDArray[np.bool_]) -> None:
-        """Add planned positions, shape (2, n), that follow what was added before."""
+        """Add planned positions, shape (2, n), that follow those added before."""
         if not self._limited:
             return
         before, printed = self._path, self._prints
@@ -75,7 +75,7 @@ class BandContent:
         self._prints = _span(printed, extruding, count * BLOCK, total).copy()
 
     def jump(self) -> None:
-        """Say that what comes does not follow what was."""
+        """Begin anew: what follows is not connected to the motion so far."""
         self._path, self._prints = np.zeros((2, 0)), np.zeros(0, dtype=bool)
 
     def beyond_um(self, f_hz: float) -> Array:

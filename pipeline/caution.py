@@ -145,7 +145,7 @@ def designed(options: Options, mode: str, design: Callable[[str], T]) -> T:
 def caution_for(
     machine: Machine, options: Options, shaper: BestShaper, directory: Path, dt_s: float
 ) -> tuple[Caution, Choice] | None:
-    """Return what the default takes of the shaper, and why; None where it takes none."""
+    """Return the default's share of the shaper, and why; None without a shaper."""
     vibration = options.method.removesuffix("+ripple")
     if vibration != "fbf" or options.robust != "auto":
         return None
@@ -171,7 +171,7 @@ def stated_note(machine: Machine, shaper: BestShaper) -> str | None:
 
 
 def prediction_note(machine: Machine, choice: Choice) -> str:
-    """Say what the figures of a report are, and how far apart the plants behind them lie."""
+    """Return a note on what a report predicts, and how far its plants differ."""
     measured = []
     for axis, plants in sorted(machine.axes.items()):
         about = plants.provenance
@@ -344,7 +344,7 @@ def _received(machine: Machine, command: Array, share: float = 1.0) -> Array:
 
 
 def _delayed(y: Array, samples: float) -> Array:
-    """Return a motion (2, n) with X late by so many samples; below 0 Y is late instead."""
+    """Return a motion (2, n) with X delayed by `samples`; if negative, Y is delayed instead."""
     row = 0 if samples > 0.0 else 1
     late = y.copy()
     at = np.arange(y.shape[1], dtype=float)

@@ -40,7 +40,7 @@ class StageClock:
         return [StageTime(stage=k, cpu_s=round(v, 4)) for k, v in self.cpu_s.items()]
 
     def each(self, name: str, items: Iterator[T]) -> Iterator[T]:
-        """Yield items, and count what it takes to come by each of them."""
+        """Yield items, and count the time to obtain each of them."""
         while True:
             with self.stage(name):
                 try:

@@ -1,4 +1,4 @@
-"""Tables with one row per sample, written as they come: NumPy's npz, or CSV."""
+"""Tables with one row per sample, written as they arrive: NumPy's npz, or CSV."""
 
 from __future__ import annotations
 

@@ -130,7 +130,7 @@ class TextMotion:
 
     @property
     def warnings(self) -> list[str]:
-        """What the firmware passes over, or what is not modelled."""
+        """Commands that the firmware skips, or that are not modelled."""
         return [*passed_over(self.reader), *sorted(self._unmodelled)]
 
     def __iter__(self) -> Iterator[MotionPart]:
@@ -196,7 +196,7 @@ class TextMotion:
         return int(moves.line[move_index - first])
 
     def _shortened(self, phases: Phases) -> Phases:
-        """Leave out what the machine stands longer than it must."""
+        """Shorten stands to the longest that is measured."""
         if len(phases) == 0 or np.isinf(self._longest_stand_s):
             return phases
         end_s = phases.end_s

@@ -20,7 +20,7 @@ __all__ = ["FileRewriting", "file_rewriting"]
 
 @dataclass(slots=True)
 class FileRewriting:
-    """A file and what it is rewritten with.
+    """A file being rewritten, and the files for it.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ def file_rewriting(
     layers: Path | None,
     progress: ProgressCallback | None,
 ) -> Iterator[FileRewriting]:
-    """Yield what a file is rewritten with; the target and the folder of layers appear at the end.
+    """Open what a rewrite needs; the target and the folder of layers appear at the end.
 
     Raises
     ------

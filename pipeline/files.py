@@ -94,7 +94,7 @@ def _path_of(handle: int) -> Path:
 
 
 def _link(handle: int, target: Path) -> Path:
-    """Give an unnamed file a name beside `target`: a link cannot replace what is there."""
+    """Give an unnamed file a name beside `target`: a link cannot replace an existing file."""
     name = target.with_name(f".{target.name[:_NAME_PART]}.{secrets.token_hex(4)}.part")
     # With a folder's handle, which an absolute path does not use, Python follows links.
     os.link(_path_of(handle), name, src_dir_fd=handle, follow_symlinks=True)
@@ -102,7 +102,7 @@ def _link(handle: int, target: Path) -> Path:
 
 
 def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
-    """Return what a JSON file keeps; what is missing or cannot be read is made and written.
+    """Return the content of a JSON file; if missing or unreadable, make and write it.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def kept(path: Path, read: Callable[[Any], T], make: Callable[[], T]) -> T:
 
 
 def default_cache_dir() -> Path:
-    """Return the user's folder for what is worth keeping between jobs."""
+    """Return the user's folder for results that are kept between jobs."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
     return (Path(base) if base else Path.home() / ".cache") / "stillpath"
 

@@ -185,7 +185,7 @@ class Job:
 
     @staticmethod
     def has_budget(options: Options) -> bool:
-        """Tell whether paces are chosen."""
+        """Return whether paces are chosen."""
         return options.budget_um is not None and options.method != "none"
 
     @property

@@ -86,7 +86,7 @@ class LiveDesign:
         return float(np.abs(self.taps[axis]).sum())
 
     def ranged(self, channel: Channel, machine: Machine) -> Channel:
-        """Return what is measured of a file, with the range over the machine's set.
+        """Return the measured figures of a file, with their range over the machine's set.
 
         Parameters
         ----------

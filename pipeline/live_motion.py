@@ -35,7 +35,7 @@ class LiveMotion:
     def push(
         self, samples: MotionSamples, shaping: Shaping, point: OperatingPoint
     ) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
-        """Take planned motion; yield what is ready, `executed_mm` being the command.
+        """Take planned motion; yield finished samples, with the command as `executed_mm`.
 
         Raises
         ------
@@ -52,7 +52,7 @@ class LiveMotion:
             yield from self._extended(samples.executed_mm)
 
     def flush(self) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
-        """Yield what is held, as if the machine stood still from now on."""
+        """Yield the remaining samples, as if the machine stood still from now on."""
         if self._known is not None:
             last = self._known[:, -1:]
             yield from self._extended(np.repeat(last, self._live.margin, axis=1))

@@ -43,7 +43,7 @@ def simulate_live(
     layers: Path | None = None,
     trace: Callable[[Trace], None] | None = None,
 ) -> Result:
-    """Predict what a file does that is printed as sliced, with the extra inside Klipper.
+    """Predict the print of the sliced file with the extra inside Klipper.
 
     Parameters and errors are those of `pipeline.simulate.simulate_file`.
 
@@ -116,7 +116,7 @@ def predict_live(
     cache_dir: Path | None = None,
     progress: ProgressCallback | None = None,
 ) -> LivePrediction:
-    """Predict for a file that is to be compensated what it does if it is printed live instead.
+    """Predict, for a file that is being compensated, the print with live compensation instead.
 
     The figures are those of `simulate_live`.
 

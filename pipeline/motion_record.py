@@ -24,7 +24,7 @@ _CHUNK = 1 << 17
 
 
 class MotionRecord:
-    """Samples of pieces, and what becomes of motion that nobody changes.
+    """Samples of pieces, and the handling of motion that is not changed.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class MotionRecord:
         return self._samples(piece, row, path, sliced, phases.prints[row], sliced)
 
     def pass_by(self, verbatim: VerbatimPart, part: Phases | float | None) -> None:
-        """Measure what a verbatim part does: motion, standing [s], or (None) losing its place."""
+        """Measure a verbatim part: motion, standing still [s], or (None) a lost position."""
         if part is None:
             self._measurement.jump()
             if self._changing is not None:

@@ -1,4 +1,4 @@
-"""Where a machine is as a file goes on: the print's mass on its bed, and the height."""
+"""The operating point along a file: the print's mass on its bed, and the height."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Operation:
         self.printed_kg += self._kg_per_mm * laid_mm
 
     def notes(self) -> list[str]:
-        """Return what the plants followed, in words."""
+        """Return notes on the mass and height that the plants followed."""
         notes = []
         for axis, schedule in self._machine.schedules.items():
             follows = []

@@ -159,7 +159,7 @@ def unused(options: Options) -> list[str]:
 
 
 def stamp(machine: Machine, options: Options) -> str:
-    """Return what a written file says of how it was made; the same stamp, the same bytes."""
+    """Return the stamp of a written file with its options; the same stamp, the same bytes."""
     chosen = options.model_dump_json(exclude={"plate", "compare_live"})
     settings = hashlib.sha256(chosen.encode()).hexdigest()[:8]
     return (

@@ -1,4 +1,4 @@
-"""What a file is compensated with, and which of its pieces stay as sliced after the last check."""
+"""The options with which a file is compensated, and the pieces reverted after the last check."""
 
 from __future__ import annotations
 

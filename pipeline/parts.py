@@ -1,4 +1,4 @@
-"""A file in its parts, as it is read: pieces that may be compensated, and what stays verbatim."""
+"""A file as a sequence of parts: pieces that may be compensated, and verbatim parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One piece of a print: from its planned path to a command, segments and timed moves."""
+"""Compensates a piece of a print: from its planned path to command, segments and timed moves."""
 
 from __future__ import annotations
 

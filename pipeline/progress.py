@@ -1,4 +1,4 @@
-"""How a job says where it is, and how it is told to stop."""
+"""Progress of a job, and how it is cancelled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a job reads its file: by the dialect of the machine's firmware, or by the one asked for."""
+"""Opens a job's file in the dialect of the machine's firmware, or in a requested one."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def doubts(file: BinaryIO, machine: Machine, name: DialectName | None = None) ->
 
 
 def passed_over(reader: Interpreter) -> list[str]:
-    """Return what the firmware passes over or nobody can know, in a few lines."""
+    """Return, in a few lines, what the firmware skips and what is unknown."""
     found = reader.warnings
     more = [f"... and {len(found) - _SHOWN} more lines like these"] if len(found) > _SHOWN else []
     return [*found[:_SHOWN], *more]

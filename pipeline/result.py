@@ -1,4 +1,4 @@
-"""What a job found, in figures measured on the written file."""
+"""The result of a job, in figures measured on the written file."""
 
 from __future__ import annotations
 
@@ -260,7 +260,7 @@ class LastCheckFigures(_Figures):
 
 
 class PrintWay(_Figures):
-    """A way to print a file compensated: what is predicted, what it needs, what it does not do."""
+    """A way to print a file compensated: its predictions, requirements and limitations."""
 
     name: str
     """`file`: print the written file; `live`: print the file as sliced, which an extra inside

@@ -1,4 +1,4 @@
-"""Which sections of a print are worth compensating: where an error shows, and what leads there."""
+"""Selects the sections worth compensating: where errors are visible, and the motion before them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def smaller(options: Options) -> Options | None:
 
 
 class Selection:
-    """Leave sections as sliced whose features nobody sees.
+    """Leave sections with invisible features as sliced.
 
     A section (`gcode.dividing`) is compensated as a whole if it prints any feature that counts, or
     one that the slicer does not name. Travel right before such a section is compensated with it:

@@ -1,4 +1,4 @@
-"""The firmware's own input shaper, as it changes along a file: from planned motion to command.
+"""Applies the firmware's own input shaper, as it changes along a file, to planned motion.
 
 Every step of the path is spread over time by the pulses that are in force when it is made. A file
 can only change them where the machine rests, so this is what the firmware does, and nothing jumps.
@@ -45,7 +45,7 @@ class ShapedMotion:
     def push(
         self, samples: MotionSamples, shaping: Shaping, point: OperatingPoint
     ) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
-        """Take unshaped motion; yield what is ready, `executed_mm` being the command."""
+        """Take unshaped motion; yield finished samples, with the command as `executed_mm`."""
         if len(samples) == 0:
             return
         self._held.append((samples, point))
@@ -53,7 +53,7 @@ class ShapedMotion:
         yield from self._ready()
 
     def flush(self) -> Iterator[tuple[MotionSamples, OperatingPoint]]:
-        """Yield what is held, as if the machine stood still from now on."""
+        """Yield the remaining samples, as if the machine stood still from now on."""
         if self._last is not None:
             self._spread(np.repeat(self._last[:, None], self._reach, axis=1), OFF)
             yield from self._ready()
@@ -69,7 +69,7 @@ class ShapedMotion:
         self._away: deque[Array] = deque()
 
     def _spread(self, path: Array, shaping: Shaping) -> None:
-        """Add what a shaper makes of the steps of a path, beyond the steps themselves."""
+        """Add the difference between shaped and unshaped steps of a path."""
         last = path[:, :1] if self._last is None else self._last[:, None]
         steps = np.diff(np.concatenate([last, path], axis=1))
         self._last = path[:, -1].copy()

@@ -1,4 +1,4 @@
-"""The motion that a file makes, without changing it: to a table of samples, or to a report."""
+"""Simulates the motion of a file without changing it: to a table of samples, or to a report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The result of a job: its figures and what must be said with them."""
+"""Summarises a job: its figures, and the warnings that belong to them."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ class Totals:
         return max(self.passed_s - self.put_back_s, 0.0)
 
     def left_out(self, where: str) -> Iterator[str]:
-        """Yield what was left as sliced because the job asked for less than all."""
+        """Yield warnings about what was left as sliced by the options of the job."""
         if where != "all":
             yield (
                 f"where={where}: {self.left_out_s:.0f} s of motion are left as sliced, "

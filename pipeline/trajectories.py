@@ -1,4 +1,4 @@
-"""What the nozzle does, sample by sample: commanded and simulated motion as a table.
+"""Motion of the nozzle sample by sample: commanded and simulated, as a table.
 
 The pipeline runs again on the sliced file, up to the end of what is asked for.
 """
@@ -164,7 +164,7 @@ class _Window:
 
 
 class _Passed(Exception):
-    """All that was asked for is written."""
+    """All that was requested is written."""
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Accept or reject a compensated piece: executed as commanded, and no worse than as sliced."""
+"""Accepts or rejects a compensated piece: executed as commanded, and no worse than as sliced."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ def captioned(
 
 
 def draw(chart: Chart, width: float, height: float) -> str:
-    """Return the chart as an SVG element of so many units, text being some 12 of them high."""
+    """Return the chart as an SVG element; its text is about 12 units high."""
     names = [line.name for line in chart.lines if line.name]
     right = 10.0 + (_END_GAP + _CHARACTER * max(map(len, names)) if names else 0.0)
     points = [
@@ -162,7 +162,7 @@ def _x_ticks(low: float, high: float, width: float, *, log: bool) -> list[float]
 def _named_ends(
     ends: Sequence[tuple[float, float, Line]], room: tuple[float, float], right: float
 ) -> Iterator[str]:
-    """Yield names beside the ends (y, x) of lines, so far apart that all can be read."""
+    """Yield names beside the ends (y, x) of lines, spread so that all are legible."""
     ends = sorted(ends, key=_first)
     places = _spread([end[0] for end in ends], *room)
     for place, (y, x, line) in zip(places, ends, strict=True):

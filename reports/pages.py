@@ -36,7 +36,7 @@ def write_texts(directory: Path, texts: Mapping[str, str]) -> None:
 
 
 def style_of(*own: tuple[str, str]) -> str:
-    """Return the style of a page that is drawn without script, and what it adds of its own.
+    """Return the style of a page without script, followed by the page's own.
 
     Parameters
     ----------

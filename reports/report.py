@@ -140,7 +140,7 @@ def _widest(groups: Sequence[GroupFigures]) -> float:
 
 
 def _data(result: Result) -> str:
-    """Return what the script draws, as JSON that is safe inside a script element."""
+    """Return the data for the script, as JSON that is safe inside a script element."""
     data = {
         "channels": [{"name": c.name, "label": _short(c.label)} for c in result.channels],
         "scale_um": _legend_top(result),
@@ -197,7 +197,7 @@ def _mapped(values: dict[str, float]) -> dict[str, float | None]:
 
 
 def _short(label: str) -> str:
-    """Drop what a label says in brackets: the headline tells it once."""
+    """Drop the brackets of a label, whose content the headline has already."""
     return label.split(" (")[0]
 
 

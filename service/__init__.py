@@ -1,1 +1,1 @@
-"""What listens, stores, schedules and authenticates: HTTP, jobs, database, deliveries."""
+"""The server: HTTP, jobs, database, authentication, deliveries."""

@@ -1,4 +1,4 @@
-"""Says that kernels are being compiled, which happens once on a computer and takes minutes.
+"""Reports that kernels are being compiled, which happens once on a computer and takes minutes.
 
 Numba compiles a kernel when it is first called and keeps it on disk. Until it is there the work
 stands still, and what was measured of its pace says nothing of the time left.

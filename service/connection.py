@@ -1,4 +1,4 @@
-"""The connection of a client to the service: what may pass by itself is tried again."""
+"""The connection of a client to the service, with retries of what may fail temporarily."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must be set before numpy and numba are imported, in every process of ours."""
+"""Environment variables that must be set before numpy and numba are imported, in every process."""
 
 from __future__ import annotations
 

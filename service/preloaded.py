@@ -1,4 +1,4 @@
-"""What a process needs to compensate: to import this module loads it (`service.processes`)."""
+"""Importing this module loads all that a process needs to compensate (`service.processes`)."""
 
 from __future__ import annotations
 

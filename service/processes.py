@@ -1,4 +1,4 @@
-"""Processes that compensate are forked from one that has loaded the libraries already.
+"""Processes that compensate are forked from one that has already loaded the libraries.
 
 To load numba, scipy and our own modules takes longer than many a print does. One process loads
 them, and all others begin as its copies: they start at once, and share its memory.

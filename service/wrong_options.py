@@ -1,4 +1,4 @@
-"""What is wrong with options and settings, by the names that their user gave them."""
+"""Messages on wrong options and settings, by the names that the user gave them."""
 
 from __future__ import annotations
 

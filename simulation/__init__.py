@@ -1,1 +1,1 @@
-"""What a machine does with a command: plant response and error measures."""
+"""The effect of a command on a machine: plant response and error measures."""

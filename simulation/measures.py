@@ -1,4 +1,4 @@
-"""Errors of an executed motion against the planned one, added up block by block.
+"""Errors of an executed motion against the planned one, summed block by block.
 
 Contour error: distance from the point y(t) to the planned path within +-80 ms of t. Tracking
 error: distance to the planned point of the same instant. Residual vibration: what still moves

@@ -1,4 +1,4 @@
-"""What a machine's axes do with a command: linear response, block by block."""
+"""Linear response of a machine's axes to a command, block by block."""
 
 from __future__ import annotations
 

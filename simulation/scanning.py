@@ -1,4 +1,4 @@
-"""What a scanner leaves of its tracks: errors along and across every hatch line."""
+"""Errors of a scanner along and across every hatch line."""
 
 from __future__ import annotations
 

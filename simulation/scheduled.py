@@ -1,4 +1,4 @@
-"""What a machine does with a command while its plants change."""
+"""Response of a machine to a command while its plants change."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class MachineStream:
             stream.stand()
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Go on with the plants of this point, which still vibrate from what was before."""
+        """Continue with the plants of this point, which still vibrate from the motion before."""
         if self._streams and not self._machine.schedules:
             return
         level = self._grid.level(point)

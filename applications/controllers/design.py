@@ -1,4 +1,4 @@
-"""From options to a judged controller, its figures, and the machine's answer with and without."""
+"""Designs and judges an add-on controller, and simulates the machine with and without it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads what `stillpath controller --json` wrote, as a real controller would load it."""
+"""Loads a controller from the JSON of `stillpath controller --json`, as a real controller would."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be asked of an add-on controller: one document per method, told apart by `method`.
+"""Options of add-on controllers: one document per method, discriminated by `method`.
 
 The limits keep a design within seconds: a request of the service must not compute for minutes.
 """

@@ -1,4 +1,4 @@
-"""What a machine does in time, under its disturbance, without and with an add-on."""
+"""Response of a machine over time under its disturbance, without and with an add-on controller."""
 
 from __future__ import annotations
 

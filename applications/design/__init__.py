@@ -1,1 +1,1 @@
-"""A look at the design for one axis: the plant, the metrics, the ladder, what errors of it cost."""
+"""Report on the design for one axis: plant, metrics, ladder, and the cost of model errors."""

@@ -1,4 +1,4 @@
-"""Looks at the design for one axis of a machine, from the plant to what errors of it cost.
+"""Computes the design report for one axis of a machine, from the plant to the cost of model errors.
 
 The command lives on increments (docs/method.md), so the metrics and the ladder are those of the
 plant with two integrators in front, lifted over the preview window. Sources: dissertation of K. S.

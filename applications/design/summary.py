@@ -1,4 +1,4 @@
-"""What page and terminal tell first about a design, in figures and in words."""
+"""Summary of a design at the top of page and terminal, in figures and in words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From what was identified to the figures that a page draws."""
+"""Computes the figures on the page from an identification."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ripple from files of passes: what `stillpath identify --ripple` does; nothing is stored here."""
+"""Ripple from files of passes, for `stillpath identify --ripple`; nothing is stored here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The file that the extra of Klipper reads: filter, limits and predictions of a machine."""
+"""The file for the Klipper extra: filter, limits and predictions of a machine."""
 
 from __future__ import annotations
 

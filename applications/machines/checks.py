@@ -1,4 +1,4 @@
-"""What to look at before a job: how old the measurement is, whether the printer was changed."""
+"""Checks before a job: the age of the measurement, and whether the printer was changed."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 _DEFAULT_HZ = 50.0
 _DEFAULT_ZETA = 0.07
 _ACCEL_ROOM, _SPEED_ROOM, _CORNERS = 1.5, 1.2, 6.0
-"""What motors are taken to bear when nobody says: these multiples of the acceleration, speed and
+"""Limits assumed for motors where none are stated: these multiples of the acceleration, speed and
 corner speed that the printer allows a file."""
 _LEAST_STEP_MM_S = 20.0
 _NOT_MORE = 1.001
@@ -150,7 +150,7 @@ class StatedMachine:
     title : str
         Empty: the name.
     f_hz : (float, float)
-        Resonances of X and Y; None: nobody knows.
+        Resonances of X and Y; None: unknown.
     zeta : float
         Damping ratio of both.
     """

@@ -1,4 +1,4 @@
-"""What two states of a machine differ in, in words and figures."""
+"""Differences between two states of a machine, in words and figures."""
 
 from __future__ import annotations
 

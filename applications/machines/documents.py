@@ -1,4 +1,4 @@
-"""Where small documents lie by name: what is asked of such a place, and a folder as one.
+"""Storage of small documents by name: its interface, and a folder that implements it.
 
 `service.database.documents` is the other, for several computers.
 """

@@ -1,4 +1,4 @@
-"""Whether a machine has changed since it was first measured."""
+"""Changes of a machine since it was first measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the plants of a machine answer over frequency, thinned for display."""
+"""Frequency responses of a machine's plants, thinned for display."""
 
 from __future__ import annotations
 

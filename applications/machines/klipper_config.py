@@ -1,4 +1,4 @@
-"""Reads what a Klipper printer.cfg says of the motion; nothing is executed, no include followed.
+"""Reads the motion settings of a Klipper printer.cfg; nothing is executed, no include followed.
 
 Rules and defaults are those of klippy/configfile.py, toolhead.py, kinematics/extruder.py,
 extras/input_shaper.py, firmware_retraction.py and gcode_arcs.py (2024 to 2026).

@@ -1,4 +1,4 @@
-"""What Marlin prints for M503, read as the firmware section of a machine."""
+"""Reads Marlin's answer to M503 as the firmware section of a machine."""
 
 from __future__ import annotations
 

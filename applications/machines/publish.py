@@ -1,4 +1,4 @@
-"""Files that are written once: whole or not at all, and never over another."""
+"""Writes files once: whole or not at all, and never over another."""
 
 from __future__ import annotations
 

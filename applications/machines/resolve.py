@@ -1,4 +1,4 @@
-"""From a machine's name to the machine: built in, the user's own, or a file."""
+"""Finds a machine by its name: built in, the user's own, or a file."""
 
 from __future__ import annotations
 

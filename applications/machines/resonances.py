@@ -1,4 +1,4 @@
-"""The resonances of a plant, and which of two plants' belong together."""
+"""The resonances of a plant, and the matching of those of two plants."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the store of machines remembers: revisions and approvals, as they stand on disk."""
+"""Revisions and approvals of machines as stored on disk."""
 
 from __future__ import annotations
 

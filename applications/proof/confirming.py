@@ -1,4 +1,4 @@
-"""Logs of a ring test against the plants of a machine: confirmed, not confirmed, or neither.
+"""Judges the plants of a machine by logs of a ring test: confirmed, not confirmed, or neither.
 
 A log that does not hold the motion of the file, or too little of it above its own noise, says
 nothing; only one that does can speak for or against the plants.
@@ -174,7 +174,7 @@ class _Axis:
         self._logs: list[AxisLog] = []
 
     def add_reason(self, reason: str) -> None:
-        """Say why a log says nothing of the axis."""
+        """Add why a log does not judge the axis."""
         self._reasons.append(reason)
 
     def add(self, source: SourceFile, log: AxisLog | None) -> None:
@@ -370,7 +370,7 @@ class _Axis:
 def _delays_compared(axes: list[AxisRing]) -> list[AxisRing]:
     """Take back what was confirmed if the axes of one log are late by different times.
 
-    One axis by itself does not tell: nobody knows when the log began.
+    One axis alone does not show it, as the start of the log is unknown.
     """
     x, y = axes
     if x.lag_ms is None or y.lag_ms is None or x.logs[:1] != y.logs[:1]:

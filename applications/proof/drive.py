@@ -1,4 +1,4 @@
-"""At which speed and acceleration a machine's ringing can be seen on a wall."""
+"""Speed and acceleration at which a machine's ringing is visible on a wall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What reading a log back found, in figures."""
+"""Figures of a log that was read back."""
 
 from __future__ import annotations
 

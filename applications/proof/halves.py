@@ -1,4 +1,4 @@
-"""Two halves of one print, left as planned and right compensated, and what becomes of them.
+"""Prints of two halves, left as planned and right compensated, and the errors of each half.
 
 Both halves are mirror images, drawn outwards from the gap between them, so that the same walls are
 reached by the same corners. The right one is compensated by the pipeline itself, as any file is.

@@ -1,4 +1,4 @@
-"""Where in a print an accelerometer log was taken, and how the sensor was mounted.
+"""Finds the part of a print that an accelerometer log covers, and how the sensor was mounted.
 
 The nozzle's predicted acceleration p (x, y) and the log m (three columns) are related by
 m(t) = D p(t + lag) + noise with unknown 3 x 2 matrix D and a lag that drifts with the clocks. Below

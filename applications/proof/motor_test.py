@@ -1,4 +1,4 @@
-"""A search for lost steps: motions of a stream at rising limits, and what a console says of them.
+"""A search for lost steps: motions of a stream at rising limits, and reading the console's answers.
 
 Each level homes X and Y, moves as streams do (starts, stops and corners, along both axes and both
 motors of a CoreXY) and homes again. Where the host's step counters then differ by a full step from
@@ -24,7 +24,7 @@ _STROKES, _CORNERS = 8, 60
 _LONGEST_MM, _SHARE = 120.0, 0.6
 _LEG_MM, _TURN_RAD = 2.0, math.radians(30.0)
 _SMALL_CORNER = math.sqrt(8.0 * (math.sqrt(2.0) - 1.0))
-"""Around small angles velocity steps by so many times the speed through a square corner."""
+"""Step of velocity around a small angle, relative to the speed through a square corner."""
 _HEIGHT_MM = 20.0
 _DIRECTIONS = (
     (1.0, 0.0),

@@ -1,4 +1,4 @@
-"""An accelerometer log taken during a print, against what the model says of that print."""
+"""Compares an accelerometer log taken during a print with the model's prediction for that print."""
 
 from __future__ import annotations
 

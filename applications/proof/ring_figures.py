@@ -1,4 +1,4 @@
-"""What the reading of a ring test's logs found, in figures."""
+"""Figures of a ring test's logs."""
 
 from __future__ import annotations
 

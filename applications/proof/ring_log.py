@@ -1,4 +1,4 @@
-"""What an accelerometer felt of a ring test: the vibration after every stop that it saw.
+"""Reads a ring test's accelerometer log: the vibration after every stop that it covers.
 
 The log is placed by `matching`, and turned by least squares into the direction in which it moved
 while the file was about one axis. A stop counts if the log shows its braking.

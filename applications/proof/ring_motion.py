@@ -1,4 +1,4 @@
-"""The motion of a ring test's file: where it stops dead, and what the model says of that."""
+"""The motion of a ring test's file: its sudden stops, and the model's prediction for them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A hatch file on a scanner: its command with a prefilter, and what each track is left with.
+"""A hatch file on a scanner: its command with a prefilter, and the residual error of each track.
 
 Variants of the prediction, all with the same disturbance: the path as sent, after the prefilter,
 and with the add-on controller too.

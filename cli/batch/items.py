@@ -1,4 +1,4 @@
-"""What is to be done: which file for which machines, and what the result is called."""
+"""Items of a batch: a file, its machines, and the name of the result."""
 
 from __future__ import annotations
 

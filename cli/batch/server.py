@@ -1,4 +1,4 @@
-"""Files that a Stillpath server does."""
+"""Runs the files of a batch on a Stillpath server."""
 
 from __future__ import annotations
 

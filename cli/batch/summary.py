@@ -1,4 +1,4 @@
-"""What became of a batch: a table on the terminal, summary.json, .csv and .html."""
+"""Summary of a batch: a table on the terminal, summary.json, .csv and .html."""
 
 from __future__ import annotations
 

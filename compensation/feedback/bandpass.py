@@ -1,4 +1,4 @@
-"""Lattice band pass of several bands: which frequencies an add-on works at.
+"""Lattice band pass of several bands: selects the frequencies of an add-on controller.
 
 Q_BP = 1 - prod_i (1/2)(1 + k2_i)(1 + 2 k1_i z^-1 + z^-2)/(1 + k1_i (1 + k2_i) z^-1 + k2_i z^-2),
 paper 000 (16) (after Hirano, Nishimura, Mitra 1974); paper 001 prints the numerator of (6) wrongly.

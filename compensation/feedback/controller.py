@@ -1,4 +1,4 @@
-"""What every feedback design returns: coefficients, the blocks they make, and what to expect.
+"""The result of every feedback design: coefficients, their blocks, and the expected performance.
 
 A design hands its blocks (`models.diagrams`) and its add-on factor 1 - PQ to `judged`, which
 predicts the loop with it, checks every member of the plant set, and refuses what must not be
@@ -361,7 +361,7 @@ def _equation(block: Block) -> dict[str, object]:
 
 
 def _c_comment(block: Block) -> str:
-    """Tell what a block does: output = H(z) (sum of signals), and when."""
+    """Describe a block: output = H(z) (sum of signals), and its rate."""
     wires = " ".join(f"{gain:+.17g} {name}" for name, gain in block.inputs)
     plain = block.order == 0 and block.num == block.den == (1.0,)
     through = f"({wires})" if plain else f"H[{len(block.num)}/{len(block.den)}] ({wires})"

@@ -89,7 +89,7 @@ class QFilter:
         )
 
     def coefficients(self) -> tuple[CoefficientSet, ...]:
-        """Return what a controller loads."""
+        """Return the coefficients that a controller loads."""
         taps = tuple(self.gain * q for q in self.taps)
         fir = CoefficientSet("q", "fir", {"taps": taps})
         if self.band_pass is None:
@@ -124,7 +124,7 @@ class Trim:
     through_band: bool = False
 
     def settings(self) -> dict[str, object]:
-        """Return what a controller's document says of it."""
+        """Return the settings as a controller's document states them."""
         zeros = [list(zero) for zero in self.zeros]
         return {"detuning": self.detuning, "zeros": zeros, "through_band": self.through_band}
 
@@ -279,7 +279,7 @@ def add_on_blocks(loop: Loop, q: QFilter, around: Around) -> tuple[Block, ...]:
 
 
 def model_blocks(loop: Loop, around: Around = "servo") -> tuple[Block, ...]:
-    """Return blocks that write "model", what the machine would do without disturbance."""
+    """Return blocks that write "model", the output of the machine without disturbance."""
     if around == "plant":
         return (Block("model", (("u", 1.0),), loop.plant_num, loop.plant_den),)
     if loop.tracking_num == loop.servo_num:

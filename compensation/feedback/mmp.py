@@ -101,7 +101,7 @@ class Predictor:
         return np.asarray(np.mean(parts, axis=0), complex)
 
     def coefficients(self) -> CoefficientSet:
-        """Return what a controller loads."""
+        """Return the coefficients that a controller loads."""
         w = tuple(tuple(row) for row in self.w.tolist())
         return CoefficientSet("predictor", "predictor", {"ratio": self.ratio, "b": self.b, "w": w})
 

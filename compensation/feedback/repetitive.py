@@ -75,7 +75,7 @@ _LOWEST_NOTCH = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class InternalModel:
-    """L, what a repetitive controller remembers of a period.
+    """L, the memory of a repetitive controller over a period.
 
     Attributes
     ----------
@@ -394,7 +394,7 @@ def periodic_residual(servo: Complex, factor: Complex, amplitudes: Sequence[floa
 def repetitive_coefficients(
     model: InternalModel, inverse: ServoInverse
 ) -> tuple[CoefficientSet, ...]:
-    """Return what a controller loads: the memory of a period, and the inverse after it."""
+    """Return the coefficients to load: the memory of a period, and the inverse after it."""
     return (
         CoefficientSet(
             "memory",

@@ -1,4 +1,4 @@
-"""How much a container may unpack to, so that a small file cannot fill the disk."""
+"""Limits of the size to which a container may unpack, so that a small file cannot fill the disk."""
 
 from __future__ import annotations
 

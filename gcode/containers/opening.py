@@ -1,4 +1,4 @@
-"""Open any print file as plain G-code, and write it back in what it came in.
+"""Opens any print file as plain G-code, and writes it back in its original container.
 
 The text is spooled to disk, in files without a name, of which nothing is left even if the process
 is killed.

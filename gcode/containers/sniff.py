@@ -1,4 +1,4 @@
-"""What a file is by its first bytes; its name does not count.
+"""Detects the kind of a file from its first bytes; its name does not count.
 
 Slicers hand post-processing scripts files without an extension or with one of their own.
 """

@@ -21,7 +21,7 @@ __all__ = ["feed_at_ends", "final_segments"]
 def feed_at_ends(
     piece: Piece, timeline: Timeline, segments: Segments
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return what the plan feeds where each segment ends.
+    """Return the plan's row and extruder speed at the end of each segment.
 
     Returns
     -------
@@ -39,7 +39,7 @@ def feed_at_ends(
 
 
 def final_segments(segments: Segments) -> NDArray[np.bool_]:
-    """Tell which segments end their stretch."""
+    """Mark segments that end their stretch."""
     return np.append(segments.group[1:] != segments.group[:-1], True)
 
 

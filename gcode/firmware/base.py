@@ -1,4 +1,4 @@
-"""What one firmware offers to the pipeline: how it plans, and how it is made to execute a stream.
+"""Interface of a firmware to the pipeline: its planner, and how it is made to execute a stream.
 
 `FirmwareAdapter` is the seam. The pipeline asks `gcode.firmware.registry.adapter` for the adapter
 of a machine and knows no firmware by name; whatever differs between firmwares is behind these
@@ -61,7 +61,7 @@ class Planner(Protocol):
         """
 
     def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
-        """Plan moves that follow the last ones without a stop; return what is settled by now."""
+        """Plan moves that follow the last ones without a stop; return those that are final."""
 
     def plan_whole(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
         """Plan moves that follow the last ones, all at once, and come to rest."""
@@ -213,16 +213,16 @@ class Adviser(Protocol):
         """Return the lines that set it."""
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line of a file sets it."""
+        """Return whether a line of a file sets it."""
 
     def stores(self, text: str) -> bool:
-        """Tell whether a line of a file stores for good what is in force."""
+        """Return whether a line of a file stores the current settings permanently."""
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
         """Return the lines that set the shapers of X and Y."""
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what a line of a file leaves in force."""
+        """Return the shaper in force after a line of a file."""
 
 
 class FirmwareAdapter(Protocol):
@@ -234,14 +234,14 @@ class FirmwareAdapter(Protocol):
 
     @property
     def step_mm(self) -> tuple[float, float, float, float]:
-        """Largest distance of a place x y z e that is asked for from where the machine stops.
+        """Largest distance x y z e between a commanded position and where the machine stops.
 
         0 for a firmware that keeps places to the last digit of the file, one step otherwise.
         """
 
     @property
     def shortest_move_mm(self) -> float:
-        """Length in X Y below which a move is not executed by itself; 0: every move is."""
+        """Length in X Y below which a move is merged with its neighbours; 0: none is."""
 
     @property
     def extruder_alone_stops(self) -> bool:
@@ -251,7 +251,7 @@ class FirmwareAdapter(Protocol):
         """Limits before the first line of a file."""
 
     def stream_limits(self, own: Limits) -> Limits:
-        """Return what a stream runs under where the file has set `own`.
+        """Return the limits of a stream where the file has set `own`.
 
         What a file sets and a stream must keep (pressure advance, say) is copied. A piece ends
         where these limits change.
@@ -295,7 +295,7 @@ class FirmwareAdapter(Protocol):
         """Return its words for shaper and acceleration, for files read by a dialect."""
 
     def too_steep(self, travel_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Tell which moves climb so much that a stream could not keep their times.
+        """Mark moves that climb so steeply that a stream could not keep their times.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What the encoders of all firmwares share: the encoded piece, and how it is put together."""
+"""Parts that all encoders share: the encoded piece, and how it is assembled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a line of the file does, as far as its writer must know: by its text alone."""
+"""Classifies a line of the file by its text alone, as far as the writer must know."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _E_WORD_FOLDED = re.compile(_E_WORD.pattern, re.IGNORECASE)
 
 
 class LineReader:
-    """Tell what lines do, by the rules of a firmware. Comments must be cut off."""
+    """Classify lines by the rules of a firmware. Comments must be cut off."""
 
     def __init__(self, commands: StreamCommands) -> None:
         self._commands = commands
         self._e_word = _E_WORD_FOLDED if commands.folds_case else _E_WORD
 
     def is_move(self, code: bytes) -> bool:
-        """Tell whether a line holds a G0 to G3 or G5, or their words alone."""
+        """Return whether a line holds a G0 to G3 or G5, or their words alone."""
         further = not self._commands.one_command and _FURTHER_MOVE.search(code)
         subcode = self._commands.ignores_subcodes and _MOVE_WITH_SUBCODE.match(code)
         return bool(_MOVE.match(code) or further or subcode)

@@ -1,4 +1,4 @@
-"""What all planners share."""
+"""Parts that all planners share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the planners of all firmwares share: moves wait in a queue until they are settled."""
+"""The queue of all planners, in which moves wait until their speeds are final."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class QueuePlanner(ABC):
         return join_phases(parts)
 
     def push_moves(self, moves: Moves, limits: Sequence[Limits]) -> Phases:
-        """Plan moves that follow the last ones without a stop; return what is settled by now.
+        """Plan moves that follow the last ones without a stop; return those that are final.
 
         Parameters
         ----------
@@ -119,11 +119,11 @@ class QueuePlanner(ABC):
 
     @abstractmethod
     def _take(self, *, final: bool) -> Phases:
-        """Remove what is settled from the queue; with `final` everything."""
+        """Remove final moves from the queue; with `final` all moves."""
 
     @abstractmethod
     def _error(self, problem: int, moves: Moves, row: int) -> GcodeError:
-        """Say what is wrong with a move."""
+        """Return the error that describes an invalid move."""
 
 
 def with_motion(

@@ -11,7 +11,7 @@ __all__ = ["adapter"]
 
 
 def adapter(machine: Machine) -> FirmwareAdapter:
-    """Return what the machine's firmware offers.
+    """Return the adapter of the machine's firmware.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The vertices of a stream on whole steps: which ones, where and when.
+"""Places the vertices of a stream on whole steps: which ones, where and when.
 
 `_vertex_kernels.py` says how they are chosen.
 """

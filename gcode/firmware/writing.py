@@ -1,4 +1,4 @@
-"""The written file: our lines among those of the original, with the printer's state kept right.
+"""Writes the file: our lines among those of the original, keeping track of the printer's state.
 
 Lines of the original are written byte for byte. Whatever the stream needs different (limits, modes,
 firmware shaper) is set before its first line, and restored before any line that may depend on it.
@@ -91,10 +91,10 @@ class StreamWriter:
         self._behind: tuple[Limits, ModalState] | None = None
         """What the file had set after the last piece."""
         self._left_off: set[str] = set()
-        """Axes whose shaper nobody states, so that it stays off behind a stream."""
+        """Axes whose shaper is not stated, so that it stays off behind a stream."""
 
     def shaper_warnings(self) -> Iterator[str]:
-        """Yield what became of the firmware's shaper, and of those that the file itself sets."""
+        """Yield warnings about the firmware's shaper, and about those that the file itself sets."""
         if self._left_off:
             whose = f" of {min(self._left_off)}" if len(self._left_off) == 1 else ""
             yield (
@@ -327,7 +327,7 @@ class StreamWriter:
         return text
 
     def _reads(self, extruder_mm: float) -> None:
-        """Take note of what the printer's E reads."""
+        """Record the printer's E."""
         far = self._stream_commands.coarse_extruder and abs(extruder_mm) > _FAR_MM
         self._far_mm = extruder_mm if far else None
 
@@ -345,7 +345,7 @@ class StreamWriter:
         return b"" if abs(ahead_mm) < _LEAST_GAP_MM else f"G92 E{reads_mm:.7f}\n".encode()
 
     def _file_extruder(self, file_mm: float) -> bytes:
-        """Line after which the printer's E reads what the file's does."""
+        """Line after which the printer's E equals the file's."""
         if self._zero_mm == 0.0:
             return b""
         self._zero_mm = 0.0

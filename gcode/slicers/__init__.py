@@ -1,1 +1,1 @@
-"""What slicers write beside the commands: marks, their own estimates, settings."""
+"""Information of slicers beside the commands: marks, their own estimates, settings."""

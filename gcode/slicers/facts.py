@@ -1,4 +1,4 @@
-"""What a file says about itself: its slicer, the slicer's estimate of the time, its settings.
+"""Facts that a file states about itself: its slicer, the slicer's estimate of the time, settings.
 
 Only the first and the last mebibyte are looked at, as hosts do (Moonraker, `metadata.py`, 2025).
 Settings stand as ``; key = value``: between ``prusaslicer_config = begin`` and ``end`` at the end

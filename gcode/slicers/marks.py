@@ -1,4 +1,4 @@
-"""Comments by which slicers mark layers, features and objects, and users what shall stay.
+"""Comments with which slicers mark layers, features and objects, and users sections to keep.
 
 Source: the output of PrusaSlicer, SuperSlicer, OrcaSlicer, BambuStudio, Creality Print, Cura,
 ideaMaker, KISSlicer, Simplify3D and Kiri:Moto, 2021 to 2026. Objects that the firmware knows (M486,

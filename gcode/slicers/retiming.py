@@ -1,4 +1,4 @@
-"""Tell the times of the new motion in the lines where the slicer told its own.
+"""Update the times that the slicer wrote into the file to those of the new motion.
 
 The slicer counts what we do not plan (heating, homing, changes of filament), and its planner is its
 own. So its times stay, and only what the motion of the written file takes longer is added: at every

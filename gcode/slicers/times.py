@@ -1,4 +1,4 @@
-"""Times of the print as slicers write them: found in a line, and written again in the same form.
+"""Times of the print as slicers write them: found in a line, and rewritten in the same form.
 
 Forms: M73 (Marlin 2.1 documentation; P R, and Q S for the silent mode, C D to the next stop:
 PrusaSlicer 2.9, `GCodeProcessor.cpp`), and comments as they stand in the output of PrusaSlicer,
@@ -113,7 +113,7 @@ _LONGEST = 200
 
 
 def may_tell_time(line: bytes) -> bool:
-    """Tell cheaply whether `read_times` is worth a look at the line."""
+    """Return cheaply whether `read_times` is worth a look at the line."""
     if line.startswith(b"M73"):
         return True
     if not line.startswith(b";"):

@@ -1,4 +1,4 @@
-"""What the firmware of a machine is and how it is set up, one schema per firmware."""
+"""The firmware of a machine and its settings, one schema per firmware."""
 
 from __future__ import annotations
 

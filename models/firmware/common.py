@@ -1,4 +1,4 @@
-"""What every firmware's section of a machine document holds."""
+"""Fields that every firmware's section of a machine document has."""
 
 from __future__ import annotations
 

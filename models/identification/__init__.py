@@ -1,1 +1,1 @@
-"""Machine models from measurements: read, estimate, fit, and make a set of plants of it."""
+"""Machine models from measurements: read, estimate, fit, and derive a set of plants."""

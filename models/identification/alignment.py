@@ -1,4 +1,4 @@
-"""Where Klipper's resonance test lies in an accelerometer log, and along which sensor direction.
+"""Finds Klipper's resonance test in an accelerometer log, and the direction of the sensor.
 
 The regenerated command is a chirp, so its cross-correlation with the log has one sharp peak. The
 correlation is a vector (one component per sensor axis): its norm finds the start whichever way

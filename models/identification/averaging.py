@@ -1,4 +1,4 @@
-"""One measurement out of repeats."""
+"""Averages repeats into one measurement."""
 
 from __future__ import annotations
 

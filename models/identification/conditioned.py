@@ -1,4 +1,4 @@
-"""How an axis changes with weight on the bed or with position, from runs under such conditions."""
+"""Changes of an axis with weight on the bed or with position, from runs under such conditions."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def scheduled(
 
 
 def _mass(nominal: Fit, loaded: Mapping[Condition, Fit]) -> tuple[MassSchedule, tuple[str, ...]]:
-    """Return the schedule of the mode that the heaviest weight lowers, and what it predicts."""
+    """Return the schedule of the mode that the heaviest weight lowers, and its predictions."""
     condition, fit = max(loaded.items(), key=lambda item: item[0].added_kg)
     before, after = _moved(nominal.modes, fit.modes)
     empty, heavy = nominal.modes[before], fit.modes[after]
@@ -139,7 +139,7 @@ def _moved(before: Sequence[ModeEstimate], after: Sequence[ModeEstimate]) -> tup
 
 
 def _deviation_hz(mode: ModeEstimate) -> float:
-    """Return what the frequency may be off by: a fit knows its own run only."""
+    """Return the uncertainty of the frequency between runs: a fit covers only its own run."""
     repeatable = _REPEATABLE * mode.f_hz
     return math.hypot(repeatable, mode.f_sd_hz) if math.isfinite(mode.f_sd_hz) else repeatable
 

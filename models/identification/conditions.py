@@ -1,4 +1,4 @@
-"""Under which conditions a measurement was made: a label, a position, a weight on the bed."""
+"""Conditions of a measurement: a label, a position, a weight on the bed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plant from a measured frequency response.
+"""Fits a plant to a measured frequency response.
 
 Sanathanan-Koerner over a range of delays gives starts, nonlinear least squares on pairs of poles
 and zeros polishes them; the number of pairs rises while the residual falls clearly and is not yet
@@ -64,7 +64,7 @@ _START_POINTS = 160
 _POLES_BAND = (0.5, 1.6)
 """Poles may lie outside the band by these factors."""
 _ZEROS_BAND = (0.5, 10.0)
-"""The same for zeros; at the upper end they are as good as none."""
+"""The same for zeros; beyond the upper end they have no effect."""
 _ZETA = (3e-3, 3.0)
 _TINY = 1e-9
 _FAR_ZERO = 3.0
@@ -188,7 +188,7 @@ def _mirrored(data: ResponseData, fit: _Candidate, sides: Array) -> _Candidate:
 
 
 def _zero_delay(fit: _Candidate) -> Array:
-    """Return what the zero at each parameter that holds its side delays slow motion by, or 0."""
+    """Return the delay of slow motion by the zero whose side each parameter's sign is, else 0."""
     tau, _, _, log_fz, zz = fit.structure.split(fit.theta)
     out = np.zeros(fit.structure.size)
     out[0] = abs(tau)

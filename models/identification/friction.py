@@ -1,4 +1,4 @@
-"""Dry friction in logs of Klipper's test, and responses freed of it.
+"""Dry friction in logs of Klipper's test, and responses corrected for it.
 
 Where the motion turns, friction turns over, and the axis receives less than its command by 2 c
 (`models.friction`): a drive of its own, known but for its size. It has harmonics, and turns where

@@ -47,7 +47,7 @@ _WARNING = "warning: "
 
 
 def by_file(told: Iterable[tuple[str, str]]) -> list[str]:
-    """Put the names of all files before what is said of them, each text once."""
+    """Group messages by their text, with the names of all files in front of it."""
     sources: dict[str, list[str]] = {}
     for source, text in dict.fromkeys(told):
         sources.setdefault(text, []).append(source)

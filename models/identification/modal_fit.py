@@ -1,4 +1,4 @@
-"""Modes, whose delay is what guides can make it, from a measured frequency response.
+"""Fits modes, with a delay as small as guides cause it, to a measured frequency response.
 
 Pairs of poles and zeros (`fitting`) explain any response, but what they delay slow motion by trades
 off with the start of the recording, and nothing keeps it small. Where modes on relative speed
@@ -120,7 +120,7 @@ def alternatives(measured: FrequencyResponse, fit: Fit) -> tuple[Fit, ...]:
 
 
 def _all_ring(fit: Modal) -> bool:
-    """Tell whether every mode does something that a measurement can show."""
+    """Return whether every mode does something that a measurement can show."""
     _, zeta, share = fit.structure.split(fit.theta)
     return bool(np.all((np.abs(share) > _LEAST_PEAK * 2 * zeta) & (np.abs(share) > _LEAST_SHARE)))
 

@@ -1,4 +1,4 @@
-"""Resonances of a fit with their standard deviations, and which of them are not real."""
+"""Resonances of a fit with their standard deviations; separates real from spurious ones."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def filler_poles(structure: PairStructure, theta: Array) -> list[int]:
 
 
 def band_warnings(modes: tuple[ModeEstimate, ...], band_hz: tuple[float, float]) -> tuple[str, ...]:
-    """Return a sentence for every mode at the edge of what was measured, or beyond it."""
+    """Return a warning for every mode at the edge of the measured band or beyond it."""
     low, high = band_hz
     out = []
     for mode in modes:

@@ -1,4 +1,4 @@
-"""What the nozzle does over the bed, from what a sensor feels against the ground.
+"""The motion of the nozzle relative to the bed, from what a sensor measures against the ground.
 
 What moves drives the frame on its feet by reaction: the frame's motion is -R times what is felt,
 

@@ -1,4 +1,4 @@
-"""The plant that is fitted: pairs of poles and zeros, with its derivatives.
+"""The fitted plant structure: pairs of poles and zeros, with its derivatives.
 
 G(s) = (1 + tau s) prod_i (1 + 2 zz_i s/wz_i + s^2/wz_i^2) / prod_i (1 + 2 z_i s/w_i + s^2/w_i^2)
 

@@ -1,4 +1,4 @@
-"""What a model says a resonance test should have recorded."""
+"""The recording of a resonance test as a model predicts it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plants without delay of slow motion: all that a recording without a common clock can tell."""
+"""Plants without delay of slow motion, which a recording without a common clock cannot show."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST_ZETA = 10.0
 
 
 def prompt(fit: Fit) -> PlantSpec:
-    """Return the plant of a fit, advanced by what it delays slow motion by.
+    """Return the plant of a fit without its delay of slow motion.
 
     A recording does not tell when it began: of the delay at low frequency, what is the plant's and
     what the clock's is only a guess of the fit. Phases of resonances relative to slow motion are

@@ -1,4 +1,4 @@
-"""A dozen plants that stand for a crowd: those that differ most in what they do to a command."""
+"""A dozen plants that represent many: those that differ most in their effect on a command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plants that explain a frequency response: what it might have come out as, fitted again.
+"""Plants that explain a frequency response: fits to random draws from its uncertainty.
 
 The response is perturbed by what it may be wrong by, repeats are weighted anew (Bayesian bootstrap,
 Rubin 1981), and fits with a mode more or less take part where they explain as much. Every plant is
@@ -76,7 +76,7 @@ def explain_response(
     rng = np.random.default_rng(_SEED)
     drawn: list[tuple[Fit, PlantSpec]] = []
     for k in range(_DRAWS):
-        # Every second one from another structure, as nobody knows which is right.
+        # Every second one has another structure, as the right one is unknown.
         like = others[k // 2 % len(others)] if others and k % 2 else fit
         found = refit(draws.draw(rng), like)
         f, zeta = 1 + np.array(_RUN_TO_RUN) * np.clip(rng.standard_normal(2), -2.0, 2.0)
@@ -132,7 +132,7 @@ class _Draws:
 
 
 def _within(response: FrequencyResponse, fit: Fit) -> FrequencyResponse:
-    """Return what was fitted of a response, all of it coherent."""
+    """Return the fitted part of a response, all of it coherent."""
     f, low_high = response.f_hz, fit.band_hz
     used = coherent(response.coherence) & (f >= low_high[0]) & (f <= low_high[1])
     used &= np.isfinite(response.response) & (np.abs(response.response) > 0)

@@ -1,4 +1,4 @@
-"""A plant with parameters, seen through gain and delay of a recording, and how it is polished."""
+"""A parametric plant, seen through gain and delay of a recording, and its refinement."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def with_gain(data: ResponseData, structure: S, theta: Array, delay_s: float) ->
 
 
 def judged(data: ResponseData, candidate: Candidate[S]) -> Candidate[S]:
-    """Return the candidate with what it leaves.
+    """Return the candidate with its residual.
 
     Candidates are ranked by the modulus of the error, which no phase of reference changes; the fit
     softens real and imaginary part one by one (`least_error`), as scipy does.

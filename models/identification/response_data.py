@@ -1,4 +1,4 @@
-"""Which points of a measured response are fitted, and how they weigh."""
+"""Selects and weights the points of a measured response for a fit."""
 
 from __future__ import annotations
 

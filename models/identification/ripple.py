@@ -50,7 +50,7 @@ _LARGEST_MATRIX = 50_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassLog:
-    """One motion along an axis and what a sensor said.
+    """One motion along an axis and the readings of a sensor.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ def learn_ripple(
 
 
 def _solved(matrix: Array, aim: Array, waves: int) -> tuple[Complex, Array, float]:
-    """Return complex amplitudes of the waves, their standard deviations, and what is left (rms)."""
+    """Return complex amplitudes of the waves, their standard deviations, and the residual (rms)."""
     unknown, *_ = np.linalg.lstsq(matrix, aim, rcond=None)
     left = aim - matrix @ unknown
     residual = math.sqrt(float(left @ left) / len(left))
@@ -376,7 +376,7 @@ def _signed_response(plant: DiscretePlant, rate: float) -> complex:
 
 
 def _rms_beside(columns: Array, values: Array) -> float:
-    """Return the rms of what is left without the waves."""
+    """Return the rms of the residual without the waves."""
     left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
     return math.sqrt(float(left @ left) / len(left))
 

@@ -1,4 +1,4 @@
-"""Whether passes show a harmonic at all.
+"""Whether passes suffice to observe a harmonic of the ripple.
 
 A sensor slower than the ripple still sees every harmonic, folded, unless two of them fold onto one
 another, or one onto a constant. `Observability` says how far a pass is from that (reference,

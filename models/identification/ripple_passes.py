@@ -1,4 +1,4 @@
-"""From files of passes to a machine with its ripple, and from later passes to a better one.
+"""A machine with its ripple from files of passes, and its refinement by later passes.
 
 A pass is a table of text with a row per sample of the sensor:
 
@@ -139,7 +139,7 @@ def _check_axis(machine: Machine, axis: RippleAxis, basis: Sequence[WaveBasis]) 
 
 
 def _plant(machine: Machine, axis: RippleAxis) -> DiscretePlant:
-    """Return what a motor's motion answers: along a diagonal the mean of both axes."""
+    """Return the plant of a motor's motion: along a diagonal the mean of both axes."""
     if axis in ("x", "y"):
         return discretise(machine.axes[axis].nominal, _DT_S)
     x, y = (discretise(machine.axes[name].nominal, _DT_S) for name in ("x", "y"))

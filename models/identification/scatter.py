@@ -1,4 +1,4 @@
-"""By how much a spectrum may be wrong: what a model need not explain.
+"""Uncertainty of a measured spectrum: deviations that a model need not explain.
 
 Two tables of one axis, taken minutes apart, differ by more than counting noise, and differ
 smoothly: the level drifts with friction and temperature, a peak moves by a fraction of a hertz,

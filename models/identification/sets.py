@@ -1,4 +1,4 @@
-"""What an axis may turn into: the set of plants that robust modes design for.
+"""Plant sets for robust design: the plants that an axis may have.
 
 Several measurements give their own members; a single one is varied by what experience says of
 such a measurement.
@@ -182,7 +182,7 @@ def spectrum_set(
 
 
 def _with_delays(members: Sequence[RelativeModesSpec]) -> list[RelativeModesSpec]:
-    """Let guides damp every second member: nobody measured what of the damping is theirs."""
+    """Let guides damp every second member, as their share of the damping is not measured."""
     shares = np.linspace(0.0, _MOST_GROUNDED, max(len(members) // 2, 1))
     out: list[RelativeModesSpec] = []
     for k, plant in enumerate(members):
@@ -237,7 +237,7 @@ def provenance_of(
     delays_s: tuple[float, float] | None = None,
     origin: Origin = _UNKNOWN,
 ) -> Provenance:
-    """Return what a store keeps of how a plant was found.
+    """Return the provenance that a store keeps with a plant.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def provenance_of(
 
 
 def measured_modes(fit: Fit) -> tuple[MeasuredMode, ...]:
-    """Return the modes of a fit as documents have them: without what is not known."""
+    """Return the modes of a fit as in documents, without unknown figures."""
     return tuple(
         MeasuredMode(
             f_hz=m.f_hz,

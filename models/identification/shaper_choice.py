@@ -1,4 +1,4 @@
-"""What Klipper would recommend: its five shapers scored on a measured spectrum.
+"""Klipper's recommendation: its five shapers scored on a measured spectrum.
 
 Facts from klippy/extras/shaper_calibrate.py and shaper_defs.py (Klipper, 2026-08), written
 again on arrays: the spectrum is divided by frequency, a shaper is judged by the share of it that

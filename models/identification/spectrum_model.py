@@ -1,4 +1,4 @@
-"""What Klipper's spectrum would be for a plant: drive, plant, window, noise."""
+"""The spectrum that Klipper would record for a plant: drive, plant, window, noise."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class SpectrumModel:
 
     @property
     def log_drive(self) -> Array:
-        """What log S would be if the plant did just what it is told, without noise."""
+        """Logarithm of S for an ideal plant (G = 1) without noise."""
         return np.asarray(np.log(self.kernel.sum(axis=1)))
 
     def gain_of_plateau(self) -> float:

@@ -39,11 +39,11 @@ _ZETA, _ZETA_SPREAD = 0.08, 0.5
 _SHARE_SPREAD = 0.6
 _ZETA_BAND, _SHARE_BAND = (0.008, 0.4), (-2.0, 2.5)
 _MODES_BAND = (1.1, 2.4)
-"""Modes lie above the lowest bin and below so many times the highest, by these factors."""
+"""Modes lie above the lowest bin and below the highest one, times these factors."""
 _BEYOND = 0.6
 """Share of the starts with a mode beyond the band."""
 _SEEN, _UNSEEN_ZETA = 1.1, (0.005, 0.2)
-"""Modes above so many times the highest bin were not seen, and damping that they may have."""
+"""Modes above this multiple of the highest bin were not seen; bounds of their damping."""
 _PEAKS = 4
 _MUCH_WORSE = 14.0
 """Cost (twice the negative log-likelihood) beyond the best one that is no explanation any more."""
@@ -54,7 +54,7 @@ _SAME = 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """Parameters [log gain, log noise, modes ...] of a structure, and what they leave.
+    """Parameters [log gain, log noise, modes ...] of a structure, and their residual.
 
     `cost` is twice the negative log of likelihood times prior, and what parameters cost;
     `covariance` that of the vector where both are taken to be normal around the fit (Laplace).

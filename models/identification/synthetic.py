@@ -40,7 +40,7 @@ _IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """An accelerometer and what it does to a measurement.
+    """An accelerometer and its errors.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ def simulate_log(
     tail_s: float = 0.5,
     rng: np.random.Generator,
 ) -> AccelerationLog:
-    """Return what an accelerometer at the nozzle records during Klipper's resonance test.
+    """Simulate the recording of an accelerometer at the nozzle during Klipper's resonance test.
 
     Parameters
     ----------

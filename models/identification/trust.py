@@ -1,4 +1,4 @@
-"""What a measurement does not tell: models that are refused, and what to measure instead."""
+"""Limits of a measurement: models that are refused, and what to measure instead."""
 
 from __future__ import annotations
 

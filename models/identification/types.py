@@ -1,4 +1,4 @@
-"""What is measured, how it was excited, and what a fit says."""
+"""Measurements, how they were excited, and the results of fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is advised for a file: accelerations by feature, shapers by layer."""
+"""The advice for a file: accelerations by feature, shapers by layer."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Advice:
 
 
 def is_visible(name: str) -> bool:
-    """Tell whether a feature is seen on the print: walls, and what nobody has named."""
+    """Return whether a feature is visible on the print: walls, and unnamed features."""
     feature = feature_of(name)
     return feature is None or feature in _VISIBLE
 

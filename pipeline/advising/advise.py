@@ -1,4 +1,4 @@
-"""Advise a print file: its moves stay, and firmware commands for shaper and acceleration come in.
+"""Advise a print file: its moves stay, and firmware commands for shaper and acceleration are added.
 
 The sliced file is measured, samples of it are tried, the choice is written, and what was
 written is read and measured again: by the firmware's rules, with the firmware's own shaper as the
@@ -175,7 +175,7 @@ class _Job:
         return self._result(name, facts, asked, written, original, advised, figures, warnings)
 
     def _shapes(self, reading: FirstReading) -> bool:
-        """Tell whether a shaper may be advised: what is stored must be the printer's own."""
+        """Return whether a shaper may be advised: stored settings must be the printer's own."""
         return not reading.stored_lines or self._adviser.stated is not None
 
     def _chosen(
@@ -205,7 +205,7 @@ class _Job:
         *,
         shaper_left: bool,
     ) -> list[str]:
-        """Say what is stored for good, what of the shaper is not known, and what errs too much."""
+        """Return warnings: stored settings, unknown shapers, features with too large errors."""
         unshaped = "" if self._shapes(reading) else None
         given_back = self._before.label if figures.shapers else unshaped
         helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]

@@ -343,7 +343,7 @@ def _candidates(
     visible: set[int],
     progress: ShareCallback,
 ) -> list[_Candidate]:
-    """Return every type of shaper at its best frequencies, and what there was before."""
+    """Return every type of shaper at its best frequencies, and the previous setting."""
     levels = sliced.levels
     count = len(levels)
     made = [_Candidate([sliced.shaping] * count, ours=False)]
@@ -484,7 +484,7 @@ def _own_mm_s2(samples: FileSamples, adviser: Adviser) -> dict[int, float]:
 
 
 def _bound_um(sampled_um: float, whole_um: float, budget_um: float | None) -> float:
-    """Return what a feature may err in the samples, where it errs otherwise than in the file."""
+    """Return a feature's bound for the samples, whose errors differ from the whole file's."""
     if budget_um is None:
         return sampled_um
     ratio = sampled_um / max(whole_um, 1e-3)

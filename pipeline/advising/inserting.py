@@ -1,4 +1,4 @@
-"""The advised file: the lines of the original, and between them lines of our own.
+"""Write the advised file: the lines of the original, and between them lines of our own.
 
 Every line of our own stands by itself and carries `MARK`. Whoever deletes the lines with the mark
 has the original, byte for byte.
@@ -69,10 +69,10 @@ class AdviceWriter:
         self._file = adviser.accel_mm_s2(initial)
         """Acceleration that the file has set."""
         self._now: float | None = self._file
-        """What the printer has; None: nobody knows."""
+        """Acceleration of the printer; None: unknown."""
         self._layer = -1
         self._shaper: Shaping | None = None
-        """The shaper of ours that is in force; None: another, or nobody knows."""
+        """Our own shaper in force; None: another one, or unknown."""
         self._shaped = False
         self._own_shaper: dict[bytes, bytes] = {}
         """The file's own commands that set a shaper, the last of each form."""
@@ -197,7 +197,7 @@ class AdviceWriter:
         return b"".join(self._line(line, f"shaper{layer}") for line in lines)
 
     def _give_shaper_back(self) -> bytes:
-        """Set the shaper that the machine states, and then what the file has set."""
+        """Restore the shaper of the machine document, and then the file's settings."""
         stated = self._adviser.stated
         lines = () if stated is None else self._adviser.shaper_lines(stated)
         lines = (*lines, *self._own_shaper.values())
@@ -205,7 +205,7 @@ class AdviceWriter:
         return b"".join(self._line(line, "the printer's own shaper") for line in lines)
 
     def _sets_all(self, lines: Sequence[bytes]) -> bool:
-        """Tell whether nothing of ours is left after these lines: no axis keeps its type."""
+        """Return whether these lines replace all of our settings: no axis keeps its type."""
         left = Shaping(_OURS, _OURS)
         with contextlib.suppress(ValueError):
             for line in lines:

@@ -1,4 +1,4 @@
-"""What a person is told about advice: warnings and notes of the report."""
+"""Warnings and notes of the report about advice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["beyond_bounds", "kept_beyond", "shaper_warnings", "stored_settings"]
 
 
 def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) -> list[str]:
-    """Say what is not known of the printer's shaper.
+    """Return warnings about unknown settings of the printer's shaper.
 
     Parameters
     ----------
@@ -40,13 +40,13 @@ def shaper_warnings(unmodelled: Sequence[str], *, none_known: bool, left: bool) 
 
 
 def stored_settings(lines: Sequence[int], *, shaper: str | None) -> list[str]:
-    """Say what lines store for good that store what is in force.
+    """Return warnings about commands of a file that store the settings in force.
 
     Parameters
     ----------
     lines : sequence of int
     shaper : str, optional
-        What the printer gets back before them; empty: it had it all along; None: nobody knows, so
+        What the printer gets back before them; empty: it had it all along; None: unknown, so
         none is advised.
     """
     if not lines:
@@ -69,7 +69,7 @@ def beyond_bounds(
     *,
     has_budget: bool,
 ) -> list[str]:
-    """Say which features that are seen err more than they may, and why.
+    """Return warnings about visible features whose errors exceed their bounds, and why.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def beyond_bounds(
 
 
 def kept_beyond(features: Sequence[AdvisedFeature]) -> list[str]:
-    """Say what is not seen and errs more than the budget: it is not made slower for that."""
+    """Return warnings about invisible features beyond the budget, which are not slowed down."""
     names = [
         f"{f.name} ({f.after_um:.1f} um)" for f in features if not f.within_bound and not f.exact
     ]

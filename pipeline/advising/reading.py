@@ -1,4 +1,4 @@
-"""The first reading of a file that is to be advised: what is in it, and whether it is refused."""
+"""First reading of a file to be advised: collects its contents, or refuses it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Some seconds of a print, tried with other accelerations and other shapers.
+"""Trials of some seconds of a print with other accelerations and other shapers.
 
 Shaper and plant are both linear, so they commute: the plants of the set answer the plan once, and
 the answer to a shaped plan is a few shifted copies of that, needed only where it is measured.

@@ -102,7 +102,7 @@ class LastCheck:
         self.cpu_s = 0.0
 
     def write(self, data: bytes) -> int:
-        """Hand on what is written, and compare it.
+        """Forward what is written, and compare it.
 
         Raises
         ------
@@ -121,7 +121,7 @@ class LastCheck:
         return len(data)
 
     def finish(self) -> LastCheckFigures:
-        """Compare the end, and tell what was compared.
+        """Compare the end, and return what was compared.
 
         Raises
         ------

@@ -6,7 +6,7 @@ __all__ = ["LastCheckError"]
 
 
 class LastCheckError(Exception):
-    """The written file is not what it should be; it must not be delivered.
+    """The written file differs from what it should be; it must not be delivered.
 
     Attributes
     ----------

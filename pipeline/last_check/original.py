@@ -115,7 +115,7 @@ class Original:
     ----------
     text : Text
     perhaps : deque of bytes
-        Lines before the one that is wanted of which nobody knows whether they move X or Y.
+        Lines before the wanted one that may or may not move X or Y.
     """
 
     def __init__(self, source: BinaryIO, reader: Reader) -> None:
@@ -183,7 +183,7 @@ class Original:
         return line if self.reader.leaves_alone(line.rstrip()) else b""
 
     def wanted(self) -> Wanted:
-        """Carry out what a stream may stand for, and the line after it, which must stay."""
+        """Execute what a stream may replace, and the line after it, which must stay."""
         if self._ahead is not None:
             wanted, place, perhaps = self._ahead
             if wanted.line >= self.text.line:
@@ -208,7 +208,7 @@ class Original:
         return Wanted()
 
     def look_ahead(self, wanted: Wanted) -> None:
-        """Remember what is wanted next, after which the original is now.
+        """Look ahead to the next line wanted; the original stands after it.
 
         Many streams may end before it, and the file should not be searched again for each.
         """
@@ -226,14 +226,14 @@ class Original:
                 self.skip()
 
     def _next(self, before_line: int, perhaps: deque[bytes]) -> tuple[bytes, int]:
-        """Carry out moves of X and Y, and go on to what is after them.
+        """Execute moves of X and Y, and continue to the line after them.
 
         Parameters
         ----------
         before_line : int
             Where to stop.
         perhaps : deque of bytes
-            Takes those of which nobody knows whether they move X or Y.
+            Receives the lines that may or may not move X or Y.
 
         Returns
         -------

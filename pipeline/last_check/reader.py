@@ -117,11 +117,11 @@ class Reader:
 
     @property
     def knows_arcs(self) -> bool:
-        """Whether arcs in the plane of X and Y are carried out here."""
+        """Whether arcs in the plane of X and Y are executed here."""
         return self._in_plane_xy and len(self.rules.arcs) > 0
 
     def leaves_alone(self, line: bytes) -> bool:
-        """Whether a line was carried out before and does nothing to place and modes."""
+        """Whether a line was executed before and changes neither place nor modes."""
         return line in self._harmless_lines
 
     def carry_out(self, line: bytes) -> tuple[Kind, int]:
@@ -161,7 +161,7 @@ class Reader:
         return self._command(code, name, rest), 0
 
     def _is_unconditional(self, code: bytes) -> bool:
-        """Whether a line is carried out for certain: it does not stand under a condition."""
+        """Whether a line is executed for certain: it does not depend on a condition."""
         indent = len(code) - len(code.lstrip(b" \t"))
         if self._condition >= 0 and indent > self._condition:
             return False

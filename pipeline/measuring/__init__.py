@@ -1,1 +1,1 @@
-"""What is measured of planned motion: errors, spectra, layers, reference shapers."""
+"""Measurements of planned motion: errors, spectra, layers, reference shapers."""

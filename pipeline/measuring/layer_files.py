@@ -52,7 +52,7 @@ def written_layers(folder: Path, channels: Sequence[str]) -> Iterator[LayerWrite
 
 
 class LayerWriter:
-    """Write tiles as they come.
+    """Write tiles one by one.
 
     Parameters
     ----------
@@ -97,14 +97,14 @@ class LayerWriter:
             _widen(self._printed, tile, on)
 
     def anew(self) -> LayerWriter:
-        """Throw away what is written and return a writer at the beginning."""
+        """Discard what is written and return a writer at the beginning."""
         for file in (self._tiles, self._index):
             file.seek(0)
             file.truncate()
         return LayerWriter(self._tiles, self._index, self._channels)
 
     def finish(self, features: Sequence[str]) -> None:
-        """Write what only the whole print tells.
+        """Write the figures that only the whole print provides.
 
         Parameters
         ----------

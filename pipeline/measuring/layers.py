@@ -162,7 +162,7 @@ class LayerRecorder:
         self._add_points(samples, 0)
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Finish: the motion has ended."""
         if self._moves is not None:
             self._add_points(self._nothing, self._first + len(self._moves))
             self._close()
@@ -208,7 +208,7 @@ class LayerRecorder:
                 self._begin()
 
     def _lift(self, samples: _Samples) -> None:
-        """Go to where samples begin, as nobody knows how."""
+        """Jump to where samples begin, as the way there is unknown."""
         assert self._moves is not None
         xy_mm, z_mm, _, row, _ = samples
         self._place[[kernels.PEN_X, kernels.PEN_Y]] = xy_mm[:, 0]

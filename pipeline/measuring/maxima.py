@@ -1,4 +1,4 @@
-"""The largest contour errors: what a measurement of every sixth sample would miss.
+"""The largest contour errors, which a measurement of every sixth sample would miss.
 
 A line that ends at rest, for a retraction say, has not ended for the plastic: the nozzle stands on
 it and rings. Those errors count for the line's maxima, until X or Y moves on or all has died down.
@@ -60,7 +60,7 @@ class Maxima:
         self.jump()
 
     def jump(self) -> None:
-        """Say that the position is lost."""
+        """Forget the position."""
         self._printed = self._moved = -self._reach - 1
         self._of = (-1, -1)
         self._at: Array | None = None
@@ -96,7 +96,7 @@ class Maxima:
         self._added += n
 
     def answered(self, path_mm: Array, answer_mm: Array) -> None:
-        """Add the next answers, shapes (2, n) and (channels, 2, n), to what was noted."""
+        """Add the next answers, shapes (2, n) and (channels, 2, n), to the samples noted before."""
         upto = self._answered + path_mm.shape[1]
         if self._exact is not None:
             self._choose(np.hypot(*(answer_mm[self._exact] - path_mm)), self._exact)
@@ -106,7 +106,7 @@ class Maxima:
         self._note(self._errors.push(path_mm, answer_mm, at))
 
     def _choose(self, tracking_mm: Array, channel: int) -> None:
-        """Choose what may be larger than what was found of its feature so far."""
+        """Choose samples whose error may exceed their feature's maximum so far."""
         n = len(tracking_mm)
         (extruding, *of), self._pending = self._pending[:, :n], self._pending[:, n:]
         chosen = np.zeros(n, np.bool_)
@@ -120,7 +120,7 @@ class Maxima:
         self._groups = np.append(self._groups, np.stack(of)[:, at], axis=1)[:, order]
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Finish: the motion has ended."""
         self._note(self._errors.flush())
 
     def _note(self, errors_mm: Array) -> None:

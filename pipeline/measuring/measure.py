@@ -1,4 +1,4 @@
-"""Figures of a whole print, added up piece by piece: before, after, and the best shaper.
+"""Figures of a whole print, summed piece by piece: before, after, and the best shaper.
 
 Every channel is the nominal plant's answer to the motion that the firmware executes, measured
 against the same planned path; plants that follow a schedule are those of the moment. Memory stays
@@ -112,7 +112,7 @@ class Measurement:
         self._last: MotionSamples | None = None
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is from now on."""
+        """Set the operating point of the motion that follows."""
         self._answers.operate_at(point)
 
     def add(self, samples: MotionSamples) -> None:
@@ -151,7 +151,7 @@ class Measurement:
         return position
 
     def jump(self) -> None:
-        """Say that the position is lost: the machine stands still when motion goes on."""
+        """Forget the position: the machine stands still when motion resumes."""
         self._measure(self._answers.flush())
         self._band.jump()
         self._maxima.jump()
@@ -160,7 +160,7 @@ class Measurement:
         self._last = None
 
     def finish(self) -> None:
-        """Say that the motion has ended: the machine stands, and rings where it ended."""
+        """Finish: the machine rings out where the motion has ended."""
         self.stand(round(RINGING_S / self._dt_s))
         self._measure(self._answers.flush())
         self._note(self._meter.flush())
@@ -233,7 +233,7 @@ class Measurement:
         ]
 
     def warnings(self) -> list[str]:
-        """Return what the figures do not stand for, in words."""
+        """Return warnings about what the figures do not cover."""
         return self._band.warnings()
 
     def layers(self) -> list[GroupFigures]:
@@ -296,7 +296,7 @@ class Measurement:
 
 
 def channel_names(*, compensated: bool) -> tuple[str, ...]:
-    """Return the names of what is measured, in the order of all tables of channels."""
+    """Return the names of the measured channels, in the order of all tables."""
     return ("before", "after", "shaper") if compensated else ("before", "shaper")
 
 

@@ -1,4 +1,4 @@
-"""The best that the firmware's own shapers can do for a machine: the figure to beat.
+"""The best of the firmware's own shapers for a machine: the figure to beat.
 
 Definition: types zv, mzv, ei, 2hump_ei, 3hump_ei with damping 0.1; one frequency an axis on a
 2 % grid from 20 to 200 Hz; the type and pair that minimise the rms contour error over extruding
@@ -64,7 +64,7 @@ FREQUENCIES_HZ: Array = np.array([20.0 * 1.02**k for k in range(117)])
 
 @dataclass(frozen=True, slots=True)
 class BestShaper:
-    """A firmware shaper for both axes and what it reaches.
+    """A firmware shaper for both axes and its contour error.
 
     `contour_rms_um` and `tracking_rms_um` hold over extruding motion on the nominal plant.
     """
@@ -120,7 +120,7 @@ def tune_each(
     extruding: NDArray[np.bool_],
     kinds: Iterable[str] = SHAPERS,
 ) -> dict[str, BestShaper]:
-    """Find the best frequencies of every type of shaper by itself; see `tune_shaper`."""
+    """Find the best frequencies of each type of shaper separately; see `tune_shaper`."""
     trial = _Trial(machine, y_d_mm, dt_s, extruding)
     best = {}
     for kind in kinds:
@@ -156,7 +156,7 @@ def evaluate_shaper(
 
 
 def cached_shaper(machine: Machine, directory: Path, dt_s: float = 1e-3) -> BestShaper:
-    """Return the best shaper on the reference motion, tuned once for what it depends on.
+    """Return the best shaper on the reference motion; it is tuned once per set of inputs.
 
     Where nothing but a resonance was typed in, the shaper is at its frequency: of the type that
     printer.cfg states, else ZV.
@@ -279,7 +279,7 @@ class _Trial:
 
 
 def shaped_at(answer: Array, dt_s: float, pulses: tuple[Array, Array], index: Ints) -> Array:
-    """Return `shape(answer)[index]`, without the rest: what a plant answers to a shaped command.
+    """Return `shape(answer)[index]` alone: the answer of a plant to a shaped command.
 
     Parameters
     ----------

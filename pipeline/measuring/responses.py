@@ -1,4 +1,4 @@
-"""What a machine does with the commands of a print: as sliced, compensated, and the best shaper's.
+"""Responses of a machine to the commands of a print: as sliced, compensated, and best shaper.
 
 Motion is pushed as it comes and answered some samples later, as a shaper looks ahead; short motion
 waits for more, since between two pieces there are often a few moves only.
@@ -27,7 +27,7 @@ _LEAST_SAMPLES = 4096
 
 @dataclass(frozen=True, slots=True)
 class ResponseSamples:
-    """Motion with what the machine does with the command of every channel.
+    """Motion with the machine's response to the command of every channel.
 
     Attributes
     ----------
@@ -82,13 +82,13 @@ class Responses:
         """To the path, from `reach` samples before what is held to where it is known."""
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is from now on."""
+        """Set the operating point of the motion that follows."""
         self._point = point
         for stream in self._streams.values():
             stream.operate_at(point)
 
     def push(self, samples: MotionSamples) -> ResponseSamples | None:
-        """Return answers to what was pushed so far, all but the last few samples."""
+        """Return the responses to the motion so far, all but the last few samples."""
         fresh = samples.path_mm
         if samples.sliced_mm is not None:
             fresh = np.concatenate([fresh, samples.sliced_mm])
@@ -104,7 +104,7 @@ class Responses:
         return self._release(ready) if ready >= self._least else None
 
     def flush(self) -> ResponseSamples | None:
-        """Return what is held, as if the machine stood still from now on."""
+        """Return the remaining samples, as if the machine stood still from now on."""
         if self._planned.shape[1] == 0:
             return None
         end = np.repeat(self._planned[:, -1:], self._reach, axis=1)

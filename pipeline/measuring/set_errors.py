@@ -90,7 +90,7 @@ class SetErrors:
         self.begin()
 
     def begin(self) -> None:
-        """Forget what was measured; the machine stands still when motion goes on."""
+        """Discard what was measured; the machine stands still when motion resumes."""
         channels = len(self._numbers)
         self._meter = ContourMeter(self._dt_s, stride=self._stride, channels=channels)
         self._tally, self._landed = GroupTally(channels), GroupTally(channels)
@@ -99,13 +99,13 @@ class SetErrors:
         self.jump()
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is from now on."""
+        """Set the operating point of the motion that follows."""
         self._point = point
         for stream in self._streams:
             stream.operate_at(point)
 
     def jump(self) -> None:
-        """Say that the machine stands still when motion goes on."""
+        """Forget the motion so far: the machine stands still when it resumes."""
         self._fresh, self._since = True, self._never
 
     def add(self, path_mm: Array, command_mm: Array, extruding: Mask, classes: Ints) -> None:
@@ -139,7 +139,7 @@ class SetErrors:
         self._note(self._meter.push(path_mm, answers))
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Finish: the motion has ended."""
         self._note(self._meter.flush())
 
     def sums(self) -> dict[int, ErrorSum]:

@@ -71,7 +71,7 @@ class ErrorSpectra:
             self._seen += take
 
     def jump(self) -> None:
-        """Say that what comes does not follow what was."""
+        """Begin anew: what follows is not connected to the motion so far."""
         self._seen += -self._seen % BLOCK
         self._printing = 0
 

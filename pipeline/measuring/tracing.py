@@ -1,4 +1,4 @@
-"""The motion as it is measured, sample by sample, for whoever wants all of it."""
+"""The measured motion sample by sample, for callers that need all of it."""
 
 from __future__ import annotations
 

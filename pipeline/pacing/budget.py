@@ -1,4 +1,4 @@
-"""How quick every class of moves may be within a budget of contour error.
+"""Speed of every class of moves within a budget of contour error.
 
 The paces of classes of moves (features, travel) are chosen on samples from all over the file
 (`pace_search`): as compensated as they will be, with the moves planned for the firmware, and judged
@@ -182,7 +182,7 @@ class SpeedBudget:
             self._factors[one] = max(1.0, _SLOWER * self._factors[one])
 
     def gentler(self, sums: Mapping[int, ErrorSum]) -> SpeedBudget | None:
-        """Return what the file is to be written with once more; None where it may stay."""
+        """Return the lower budget for another attempt; None if the written file may stay."""
         kept = [one for one in self._factors if one in sums and self._keeps_budget(one)]
         over = {one: self._used(one, sums[one]) for one in kept}
         over = {one: ratio for one, ratio in over.items() if ratio > _ABOVE}
@@ -215,7 +215,7 @@ class SpeedBudget:
         return replace(self)
 
     def _keeps_budget(self, one: int) -> bool:
-        """Tell whether a class keeps the budget at its own pace, in the samples."""
+        """Return whether a class keeps the budget at its own pace, in the samples."""
         return self.paces.bounds_um[one] <= allowed_um(one, self.budget_um)
 
     def _used(self, one: int, found: ErrorSum) -> float:
@@ -230,7 +230,7 @@ class SpeedBudget:
         original_s: float,
         time_s: float,
     ) -> BudgetFigures:
-        """Return what came of it."""
+        """Return the figures of the report."""
         classes = []
         for one, found in sorted(sums.items()):
             name = _name(one, names)

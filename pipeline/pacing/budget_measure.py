@@ -1,4 +1,4 @@
-"""Figures of a print that became quicker, beside those of the print as it was sliced.
+"""Figures of a print that became faster, beside those of the print as it was sliced.
 
 What is written runs in a time of its own. The errors of the sliced file, and of it with the
 best shaper, are those at the file's own speeds, and are measured there.
@@ -65,7 +65,7 @@ class BudgetMeasurement(Measurement):
         self._set = SetErrors(machine, dt_s, stride=_STRIDE)
 
     def operate_at(self, point: OperatingPoint) -> None:
-        """Say where the machine is from now on."""
+        """Set the operating point of the motion that follows."""
         super().operate_at(point)
         self._sliced.operate_at(point)
         self._set.operate_at(point)
@@ -92,13 +92,13 @@ class BudgetMeasurement(Measurement):
             self._set.add(written.path_mm, written.executed_mm, written.extruding, of_sample)
 
     def jump(self) -> None:
-        """Say that the position is lost: the machine stands still when motion goes on."""
+        """Forget the position: the machine stands still when motion resumes."""
         super().jump()
         self._sliced.jump()
         self._set.jump()
 
     def finish(self) -> None:
-        """Say that the motion has ended."""
+        """Finish: the motion has ended."""
         super().finish()
         self._sliced.finish()
         self._set.finish()

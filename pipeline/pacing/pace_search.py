@@ -1,4 +1,4 @@
-"""The quickest paces that keep a budget of contour error, found on samples.
+"""Search, on samples, for the fastest paces within a budget of contour error.
 
 All classes are raised together, each as far as its own error leaves room; where that was too much,
 those above the budget come down until all keep it; and from there all are raised again. Classes
@@ -116,7 +116,7 @@ class _Climb:
         self._last: tuple[Factors, dict[int, float]] | None = None
 
     def learn(self, factors: Factors, over: dict[int, float]) -> None:
-        """Take what a trial showed: errors over their bounds by class."""
+        """Learn from a trial: errors over their bounds by class."""
         for one, ratio in over.items():
             if math.isinf(ratio):
                 self._unfit[one] = min(self._unfit[one], factors[one])
@@ -171,7 +171,7 @@ class _Climb:
         return wanted
 
     def _less(self, factor: float, ratio: float, power: float) -> float:
-        """Return a lower factor that may bring a ratio to what is aimed at."""
+        """Return a lower factor that should bring a ratio to the aim."""
         less = float((_AIM / ratio) ** (1.0 / power))
         return max(factor * min(less, 1.0 / _SAME), self._least)
 

@@ -1,4 +1,4 @@
-"""Samples of a file at other paces: how large their errors become, and how long they take."""
+"""Trials of samples at other paces: their errors and durations."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class _Measured:
 
 
 class PaceTrials:
-    """Try paces on samples; what was tried before is not worked out again.
+    """Try paces on samples; earlier trials are not computed again.
 
     Samples for which there is no command at their own pace are left out: they stay as sliced.
 

@@ -106,7 +106,7 @@ def take_samples(
         operation.passed(item.moves)
         if isinstance(item, Piece):
             _take(item, number, point, places, machine, first_layer)
-    # Until the second layer comes, nobody knows whether and how the file tells its layers.
+    # Whether and how the file marks its layers is unknown before the second layer begins.
     wanted = [one for (below, _), one in sorted(places.items()) if below == first_layer.below]
     each = int(np.clip(_TOTAL_S / _LASTS_S / max(len(wanted), 1), _FEWEST, _MOST))
     chosen = {entry[:3]: entry[3] for one in wanted for entry in one.some(each)}
@@ -125,7 +125,7 @@ def _items(
 
 
 def _seen(known: FirstLayer, moves: Moves) -> FirstLayer:
-    """Return what is known of the first layer when these moves have come."""
+    """Return what is known of the first layer after these moves."""
     below = max(known.below, min(int(np.max(moves.layer, initial=-1)), 1))
     prints = moves.prints & (moves.layer >= 0)
     if np.isfinite(known.z_mm) or not np.any(prints):

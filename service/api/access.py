@@ -1,4 +1,4 @@
-"""What a route asks of its caller: `Reader`, `Submitter` or `Admin` as a parameter.
+"""Access rights of routes: `Reader`, `Submitter` or `Admin` as a parameter.
 
 `Watcher` is a reader whose requests are not counted, for whoever follows a job; `Uploader` is a
 submitter who holds an upload slot until the answer; `Operator` is an admin, or

@@ -1,4 +1,4 @@
-"""From a request to a job that computes its answer, and back, while the caller waits for it.
+"""Runs a request as a job that computes its answer, while the caller waits for it.
 
 A repeated request is answered by the same job, so a caller whose wait timed out just asks again.
 """

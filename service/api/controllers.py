@@ -1,4 +1,4 @@
-"""Routes of closed-loop machines: which there are, and add-on controllers for them."""
+"""Routes of closed-loop machines: their list, and add-on controllers for them."""
 
 from __future__ import annotations
 

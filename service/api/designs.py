@@ -1,4 +1,4 @@
-"""Routes of designs: what `stillpath design` shows, computed by a job and kept with it."""
+"""Routes of designs: the report of `stillpath design`, computed by a job and kept with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keeps foreign web pages out, and tells browsers what pages of ours may do.
+"""Keeps foreign web pages out, and restricts in browsers what our own pages may do.
 
 A browser can be made to send requests here by any page it shows. Where callers need no key, three
 checks stop that: the Host header must name this computer (against DNS rebinding), a request that

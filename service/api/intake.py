@@ -1,4 +1,4 @@
-"""From an upload to a job in the queue; what goes wrong on the way leaves nothing."""
+"""Turns an upload into a queued job; a failure on the way leaves nothing behind."""
 
 from __future__ import annotations
 

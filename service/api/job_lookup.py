@@ -1,4 +1,4 @@
-"""From the job's name in a path to the job, for the caller who may see it."""
+"""Finds the job named in a path, for callers who may see it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much one caller may ask for: requests, uploads at once, sizes of requests."""
+"""Limits per caller: requests, simultaneous uploads, sizes of requests."""
 
 from __future__ import annotations
 

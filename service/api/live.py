@@ -1,4 +1,4 @@
-"""The route of the filter for live printing: what `stillpath klipper export` writes."""
+"""The route of the filter for live printing, as `stillpath klipper export` writes it."""
 
 from __future__ import annotations
 

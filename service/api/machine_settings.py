@@ -1,4 +1,4 @@
-"""Machines from what a printer says of itself: Klipper's printer.cfg, Marlin's answer to M503."""
+"""Machines from a printer's own settings: Klipper's printer.cfg, Marlin's answer to M503."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the routes of machines answer with."""
+"""Response models of the routes of machines."""
 
 from __future__ import annotations
 

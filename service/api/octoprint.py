@@ -1,4 +1,4 @@
-"""The two requests of OctoPrint's API that slicers send a file to a printer with.
+"""The two requests of OctoPrint's API with which slicers send a file to a printer.
 
 A slicer is given the address of this service as that of an OctoPrint. With
 ``http://host:8000/printers/NAME`` the file is for the printer NAME of the printers' file, to which

@@ -1,4 +1,4 @@
-"""Every error leaves as application/problem+json (RFC 9457)."""
+"""Every error is answered as application/problem+json (RFC 9457)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Routes of what is published beside the API's own description."""
+"""Routes of documents that are published beside the API's own description."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Routes of what came of a job: the file, the report, the layers."""
+"""Routes of a job's results: the file, the report, the layers."""
 
 from __future__ import annotations
 

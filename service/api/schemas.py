@@ -1,4 +1,4 @@
-"""What the API asks for and answers with."""
+"""Request and response models of the API."""
 
 from __future__ import annotations
 

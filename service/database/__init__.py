@@ -1,1 +1,1 @@
-"""The database: what the service remembers, and how its schema grows."""
+"""The database: the service's memory, and the migrations of its schema."""

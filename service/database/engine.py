@@ -1,4 +1,4 @@
-"""Opens the database, brings its schema up to date, and says it plainly when it is away.
+"""Opens the database, migrates its schema, and reports plainly when it is unavailable.
 
 ``writing`` and ``reading`` are the two ways to it: one transaction for each `with` block.
 """

@@ -1,1 +1,1 @@
-"""What goes out by itself when a job is over: webhooks, and results to printers."""
+"""Deliveries after a job: webhooks, and results to printers."""

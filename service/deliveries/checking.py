@@ -1,4 +1,4 @@
-"""Is a printer what its machine model says? Asked before a result goes to it.
+"""Compares a printer with its machine document before a result is sent to it.
 
 A file is made for a machine document. Where printer.cfg says something else, times and vibration
 are not those that were computed; some of it makes a print unsafe, and then none is started. The

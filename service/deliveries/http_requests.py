@@ -31,7 +31,7 @@ class Unreached(Exception):
 
 
 class Unanswered(Exception):
-    """Something was sent, and nobody knows what came of it."""
+    """A request was sent, but its outcome is unknown."""
 
 
 @dataclass(frozen=True, slots=True)

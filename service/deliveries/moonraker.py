@@ -1,4 +1,4 @@
-"""What a printer's Moonraker says of it: configuration, limits in force, commands.
+"""A printer's state from Moonraker: configuration, limits in force, commands.
 
 Moonraker's docs/external_api/printer.md (`GET /printer/info`, `GET /printer/objects/query`) and
 Klipper's docs/Status_Reference.md (`configfile`, `toolhead`, `gcode`, `extruder`, `print_stats`),

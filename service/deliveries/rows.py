@@ -1,4 +1,4 @@
-"""The table of deliveries: what is due, who sends it now, and what became of it.
+"""The table of deliveries: what is due, who is sending it, and how it ended.
 
 ::
 
@@ -81,7 +81,7 @@ def claim(engine: Engine, *, now: float, until: float) -> tuple[Delivery, bool] 
     Returns
     -------
     Delivery, bool
-        As claimed; and whether an earlier attempt ended without a word, so that nobody knows
+        As claimed; and whether an earlier attempt ended without an answer, so that it is unknown
         whether it arrived. None: nothing is due.
     """
     # What was never tried need not wait, whatever the clock of the worker says that noted it.

@@ -1,4 +1,4 @@
-"""Sends what is due: a thread that claims, and a few that send."""
+"""Sends due deliveries: a thread that claims them, and a few that send."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ class Sender:
     def _send_to_printer(self, job: Job, name: str) -> tuple[str, str | None]:
         printer = printer_for(self._printers, name, start=job.print_after)
         warnings, unsafe = self._looked_at(printer, job)
-        # Where a clock was set back, nobody knows how long ago it was.
+        # The age is unknown where a clock was set back.
         late = abs(time.time() - (job.finished_at or 0.0)) > self._times.start_within_s
         starts = job.print_after and not unsafe and not late
         copy = contextlib.ExitStack()

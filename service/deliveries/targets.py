@@ -1,4 +1,4 @@
-"""Which addresses the service may contact, so that nobody can send it into private networks.
+"""Addresses that the service may contact, so that nobody can send it into private networks.
 
 An address is checked when a job is submitted, and again when it is sent to; then the name is
 resolved once, what it stands for is checked, and exactly that is connected to.

@@ -1,4 +1,4 @@
-"""Webhooks: a signed word to somebody that a job is over."""
+"""Webhooks: signed notifications that a job is over."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def verify(secret: str, header: str, body: bytes, *, now: float, tolerance_s: fl
 
 
 def send_webhook(job: Job, target: Target, secret: str, *, delivery: int, now: float) -> Reply:
-    """Tell a target that a job is over.
+    """Notify a target that a job is over.
 
     Raises
     ------

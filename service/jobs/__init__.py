@@ -1,1 +1,1 @@
-"""Jobs: a state machine without I/O, a store that remembers, workers that do the work."""
+"""Jobs: a state machine without I/O, a store that persists them, workers that run them."""

@@ -1,4 +1,4 @@
-"""What is computed besides compensations: each takes a job's task and writes an answer."""
+"""Computations besides compensation: each takes a job's task and writes an answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `service.jobs.computations` imports: loaded once, so that no computation begins with it."""
+"""Imports of `service.jobs.computations`, loaded once so that no computation begins with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has been kept for long enough, by time that was seen to pass.
+"""Expiry of what has been kept long enough, measured in time that the service was seen to run.
 
 Clocks are set, stand still and jump: a computer without a battery begins in 1970. So how long
 something has been kept is counted by the sweep itself, with a clock that only runs (the system's

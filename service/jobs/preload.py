@@ -1,4 +1,4 @@
-"""What Dask does first in every worker process: make it modest, and deaf to foreign signals."""
+"""Setup of every Dask worker process: fewer resources, and no reaction to foreign signals."""
 
 from __future__ import annotations
 

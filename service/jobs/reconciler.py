@@ -1,4 +1,4 @@
-"""Makes the workers do what the database says: hands jobs over, and notices lost ones.
+"""Makes the workers follow the database: dispatches jobs, and notices lost ones.
 
 One thread of each process of the API. Of several, the one with the lease acts; it keeps nothing
 that could not be found out again, so any other can go on in its place.

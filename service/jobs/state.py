@@ -1,4 +1,4 @@
-"""The states of a job and what may happen to it. Pure: no clock, no files, no database.
+"""The states of a job and their transitions. Pure: no clock, no files, no database.
 
 ::
 

@@ -49,7 +49,7 @@ __all__ = ["BadCursor", "JobStore", "Page"]
 _JOBS = tables.jobs.c
 _OVER = tuple(state.value for state in JobState if state.is_final)
 _CLOCKS_APART = 12
-"""A lease that lasts for longer than so many times what it may was taken before clocks were set."""
+"""A lease this many times longer than allowed was taken before the clock was set."""
 
 
 # Statements of every upload and every look of the reconciler are made once: to put one together
@@ -304,7 +304,7 @@ class JobStore:
         fraction: float,
         eta_s: float | None,
     ) -> bool:
-        """Say that a worker lives and how far it is; False: it has lost the job and must stop.
+        """Record that a worker lives and its progress; False: it has lost the job and must stop.
 
         The same as `apply` with `Progressed`, in one statement.
         """

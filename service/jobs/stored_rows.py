@@ -1,4 +1,4 @@
-"""Rows of the table of jobs, and the jobs that they stand for."""
+"""Conversion between rows of the job table and jobs."""
 
 from __future__ import annotations
 

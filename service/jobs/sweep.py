@@ -1,4 +1,4 @@
-"""Deletes what nobody needs: files without a job, attempts that do not count, old jobs."""
+"""Deletes what is no longer needed: files without a job, attempts that do not count, old jobs."""
 
 from __future__ import annotations
 

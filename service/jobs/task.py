@@ -1,4 +1,4 @@
-"""One attempt at a job, as whoever computes sees it: plain values, and files on this computer."""
+"""One attempt at a job as the computation sees it: plain values, and files on this computer."""
 
 from __future__ import annotations
 

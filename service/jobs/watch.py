@@ -1,4 +1,4 @@
-"""Watches one attempt from a thread of its own: says that it lives, and ends it when it must.
+"""Watches one attempt from its own thread: reports that it lives, and ends it when necessary.
 
 The pipeline learns of it in its progress callback. If it never asks, the process is ended; the one
 that looks after the workers starts another.

@@ -1,4 +1,4 @@
-"""All of the work behind one door, for the API: start, stop, look."""
+"""One interface to all of the work, for the API: start, stop, look up."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Work:
         self._reconciler.leave()
 
     def notify(self) -> None:
-        """Say that there is a new job, or one less."""
+        """Notify that a job was added or removed."""
         self._reconciler.notify()
 
     @property

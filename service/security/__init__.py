@@ -1,1 +1,1 @@
-"""Who may do what: keys, scopes, limits, and the record of it."""
+"""Authorisation: keys, scopes, limits, and the audit log."""

@@ -1,4 +1,4 @@
-"""The record of who did what. Rows are only ever added."""
+"""The audit log of who did what. Rows are only ever added."""
 
 from __future__ import annotations
 

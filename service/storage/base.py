@@ -1,4 +1,4 @@
-"""What the service asks of a storage of files."""
+"""Interface of a storage of files."""
 
 from __future__ import annotations
 

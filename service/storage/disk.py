@@ -1,4 +1,4 @@
-"""How much room a disk has: some stays free, so that what was accepted can be done and deleted."""
+"""Free space of a disk: a reserve is kept so that accepted jobs can be finished and deleted."""
 
 from __future__ import annotations
 

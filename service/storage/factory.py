@@ -1,4 +1,4 @@
-"""From the settings to the storage."""
+"""Creates the storage that the settings name."""
 
 from __future__ import annotations
 

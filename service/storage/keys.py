@@ -1,4 +1,4 @@
-"""What a key of the storage may look like."""
+"""Valid keys of the storage."""
 
 from __future__ import annotations
 

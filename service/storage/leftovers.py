@@ -1,4 +1,4 @@
-"""What a process that was killed left behind in a folder of files that are being made."""
+"""Removes what a killed process left behind in a folder of unfinished files."""
 
 from __future__ import annotations
 

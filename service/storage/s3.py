@@ -1,4 +1,4 @@
-"""Files of jobs in a bucket of S3, or of what speaks like it: MinIO, Ceph, Garage."""
+"""Files of jobs in a bucket of S3 or a compatible server: MinIO, Ceph, Garage."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Virtual printers: masses, belts and friction, a form that no model of ours has."""
+"""Virtual printers: masses, belts and friction, deliberately unlike the model structures."""

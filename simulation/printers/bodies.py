@@ -179,7 +179,7 @@ def _state_matrix(m: Array, d: Array, k: Array) -> Array:
 
 
 def _held(a: Array, b: Array, dt_s: float) -> tuple[Array, Array, Array]:
-    """Return what a step does: to the state, to inputs held, to inputs that rise by 1 a step."""
+    """Return the matrices of a step: state, held inputs, and inputs that rise by 1 per step."""
     n, inputs = len(a), b.shape[1]
     block = np.zeros((n + 2 * inputs,) * 2)
     block[:n, :n] = a * dt_s

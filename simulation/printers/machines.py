@@ -1,4 +1,4 @@
-"""Printers made of bodies: bed slingers and CoreXY machines, and what they print and feel.
+"""Printers made of bodies: bed slingers and CoreXY machines, and where they print and measure.
 
 The nozzle prints relative to the bed, and an accelerometer feels its body against the ground; a
 frame that shakes by reaction therefore shows in the second more than in the first.

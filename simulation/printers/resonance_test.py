@@ -1,4 +1,4 @@
-"""Klipper's resonance test on a virtual printer, and the files that it leaves.
+"""Klipper's resonance test on a virtual printer, and the files that it writes.
 
 The accelerometer has the faults of real ones: wrong gains, a rotated mounting, noise, quantisation,
 a sampling rate that is not quite the nominal one, and a clock with an arbitrary origin.
@@ -89,7 +89,7 @@ class Record:
 
 
 def drawn_sensor(rng: np.random.Generator, chip: str | None = None) -> Accelerometer:
-    """Draw an accelerometer as they come: gains 15 % off at most, turned by some degrees."""
+    """Draw a typical accelerometer: gains up to 15 % off, rotated by some degrees."""
     chip = chip or str(rng.choice(sorted(_CHIPS)))
     rate_hz, step_mm_s2 = _CHIPS[chip]
     gains = rng.uniform(0.85, 1.15, 3)

@@ -1,4 +1,4 @@
-"""What Klipper offers to the pipeline."""
+"""Klipper's interface to the pipeline."""
 
 from __future__ import annotations
 

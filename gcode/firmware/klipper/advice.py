@@ -1,4 +1,4 @@
-"""Klipper's words for a shaper and an acceleration, read and written."""
+"""Klipper's commands for shaper and acceleration, read and written."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class KlipperAdviser:
         return (f"SET_VELOCITY_LIMIT ACCEL={accel_mm_s2:.10g}".encode(),)
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line sets the acceleration."""
+        """Return whether a line sets the acceleration."""
         command = split_line(text, self._dialect)[0]
         if command.name == "M204":
             return "S" in command.words or {"P", "T"} <= command.words.keys()
@@ -62,7 +62,7 @@ class KlipperAdviser:
         return False
 
     def stores(self, _text: str) -> bool:
-        """Tell no: SAVE_CONFIG writes what was calibrated, not what a file has set."""
+        """Return False: SAVE_CONFIG writes what was calibrated, not what a file has set."""
         return False
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
@@ -75,7 +75,7 @@ class KlipperAdviser:
         return (" ".join(words).encode(),)
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what a SET_INPUT_SHAPER leaves in force."""
+        """Return the shaper in force after a SET_INPUT_SHAPER."""
         command = split_line(text, self._dialect)[0]
         if command.name != "SET_INPUT_SHAPER":
             return now

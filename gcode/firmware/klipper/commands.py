@@ -1,4 +1,4 @@
-"""Klipper's commands that Python carries out.
+"""Klipper's commands that Python handles.
 
 Sources: klippy/extras/gcode_move.py, firmware_retraction.py, exclude_object.py, klippy/toolhead.py
 (cmd_M204, cmd_SET_VELOCITY_LIMIT), 2026-08.

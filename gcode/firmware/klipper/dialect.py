@@ -1,4 +1,4 @@
-"""What every command of a Klipper machine does to the motion, in one table.
+"""The effect of every command of a Klipper machine on the motion, in one table.
 
 Facts: Klipper's command handlers as of 2026-08 (klippy/extras/*.py): which of them flush the
 look-ahead queue, which only attach to it (fans, heaters, pressure advance), which move.

@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make Klipper execute it.
+"""Encodes a compensated command as the G1 lines that make Klipper execute it.
 
 Klipper re-plans every line, under the acceleration and corners that the motors bear: so the stream
 may break off at any line. What ramps cost at steps of speed is predicted by its law and taken off
@@ -52,7 +52,7 @@ _TIME_TOLERANCE_S = 2e-6
 def stream_limits(
     firmware: Klipper, command: CommandLimits, mesh_slope: float = 0.0
 ) -> KlipperLimits:
-    """Return what a stream runs under: what the motors bear, so that it may break off anywhere.
+    """Return the limits of a stream: those of the motors, so that it may break off anywhere.
 
     Parameters
     ----------

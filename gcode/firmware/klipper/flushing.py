@@ -90,7 +90,7 @@ def _reach_s(kind: str, f_hz: float, damping: float) -> float:
 
 
 def _number(text: str) -> float:
-    """Return a number of a line that stays as sliced; Klipper would refuse what is none."""
+    """Return a number of a line that stays as sliced; Klipper would refuse invalid ones."""
     try:
         value = float(text)
     except ValueError:

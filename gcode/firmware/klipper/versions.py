@@ -1,4 +1,4 @@
-"""What Klipper's version tells about its faults."""
+"""Known faults of Klipper by its version."""
 
 from __future__ import annotations
 

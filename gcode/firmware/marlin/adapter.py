@@ -1,4 +1,4 @@
-"""What Marlin offers to the pipeline."""
+"""Marlin's interface to the pipeline."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class MarlinAdapter:
         return initial_limits(self._firmware)
 
     def stream_limits(self, own: Limits) -> MarlinLimits:
-        """Return what a stream runs under where the file has set `own`."""
+        """Return the limits of a stream where the file has set `own`."""
         return stream_limits(cast(MarlinLimits, own), self._command, self._mesh_slope)
 
     def paced(self, own: Limits, accel: float, speed: float, most: CommandLimits) -> MarlinLimits:

@@ -1,4 +1,4 @@
-"""Marlin's words for a shaper and an acceleration, read and written."""
+"""Marlin's commands for shaper and acceleration, read and written."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class MarlinAdviser:
         return (f"M204 P{accel_mm_s2:.10g}".encode(),)
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line sets M204 P."""
+        """Return whether a line sets M204 P."""
         return any(
             c.name == "M204" and bool(c.words.keys() & {"P", "S"})
             for c in split_line(text, self._dialect)
         )
 
     def stores(self, text: str) -> bool:
-        """Tell whether a line holds M500: it writes accelerations and shaper to the EEPROM."""
+        """Return whether a line holds M500: it writes accelerations and shaper to the EEPROM."""
         return any(c.name == "M500" for c in split_line(text, self._dialect))
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
@@ -100,7 +100,7 @@ class MarlinAdviser:
         )
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what an M593 or M493 leaves in force."""
+        """Return the shaper in force after an M593 or M493."""
         for command in split_line(text, self._dialect):
             if command.name != self.shaper_word:
                 continue
@@ -126,7 +126,7 @@ class MarlinAdviser:
 
 
 def _read_version_1(command: Command, now: Shaping) -> Shaping:
-    """Return what an M493 of version 1 leaves in force: each axis has letters of its own."""
+    """Return the shaper after an M493 of version 1, where each axis has its own letters."""
     axes = []
     for s, (axis, hertz, zeta) in ((now.x, "XAI"), (now.y, "YBJ")):
         mode, f_hz, damping = (command.words.get(letter, "") for letter in (axis, hertz, zeta))

@@ -1,4 +1,4 @@
-"""Words of Bambu's firmware where they differ from Marlin's.
+"""Commands of Bambu's firmware where they differ from Marlin's.
 
 The firmware is closed. What its words do is told by the comments in the G-code that BambuStudio 2.3
 writes; a word that nobody explains is a barrier.

@@ -1,4 +1,4 @@
-"""Where the steps of Z lie in a stream that climbs, as a vase does.
+"""Places the steps of Z in a stream that climbs, as in a vase.
 
 The firmware moves Z by whole steps: one block climbs by a step, the ones around it do not. By
 junction deviation it takes that for a turn, at Z's acceleration; blocks on both sides are not

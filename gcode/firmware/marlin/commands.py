@@ -1,4 +1,4 @@
-"""Marlin's commands that Python carries out.
+"""Marlin's commands that Python handles.
 
 Sources: Marlin/src/gcode: config/M200-M205.cpp, config/M220.cpp, config/M221.cpp, geometry/G92.cpp,
 feature/advance/M900.cpp, feature/ft_motion/M495.cpp; which versions, and what was not read, stands
@@ -196,7 +196,7 @@ def reset_origin(state: MachineState, _command: Command) -> int:
 def reset_limits(state: MachineState, command: Command) -> int:
     """M501 and M502: the settings that are stored, or the build's own.
 
-    Those stored are what the machine's document says of power-on; of the build's nobody knows.
+    The machine's document gives the stored ones (power-on); the build's are unknown.
     """
     if command.name == "M502":
         state.warn("M502: the build's own limits are not known; those of the machine are taken")
@@ -234,7 +234,7 @@ def resonance_test(state: MachineState, command: Command) -> int:
 
 
 def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
-    """Return a handler for commands whose effect nobody here can follow.
+    """Return a handler for commands whose effect is not modelled.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ def unheeded(kind: EventKind, why: str, *, origin: bool = True) -> Handler:
 
 
 def _other_tool(state: MachineState, given: Mapping[str, float]) -> bool:
-    """Tell whether a command names a tool that is not the one in use."""
+    """Return whether a command names a tool that is not the one in use."""
     return "T" in given and int(given["T"]) != int(state.i[at.I_TOOL])
 
 

@@ -1,4 +1,4 @@
-"""How Marlin reads G-code, and its relatives: Prusa's Buddy firmware and Bambu's.
+"""G-code as read by Marlin and its relatives: Prusa's Buddy firmware and Bambu's.
 
 Sources: docs/dialects.md, which also says what was not read in a firmware's own source.
 
@@ -165,7 +165,7 @@ def marlin(firmware: Marlin) -> Dialect:
     """Return how Marlin, or a relative of it, reads G-code on a machine."""
     skipped = firmware.unknown_commands == "skip"
     if firmware.variant == "bambu" and "unknown_commands" not in firmware.model_fields_set:
-        skipped = False  # nobody knows what a word does that nobody has explained
+        skipped = False  # undocumented words may do anything
 
     def otherwise(_name: str) -> EventKind:
         return EventKind.HARMLESS if skipped else EventKind.UNKNOWN

@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make Marlin execute it.
+"""Encodes a compensated command as the G1 lines that make Marlin execute it.
 
 Marlin moves in whole steps and times them in whole ticks. The vertices lie on whole steps, so that
 its rounding changes nothing, and far enough apart that it executes each; the feedrates are those of
@@ -79,7 +79,7 @@ _BYTES_PER_LINE = 32.0
 def stream_limits(
     own: MarlinLimits, command: CommandLimits, mesh_slope: float = 0.0
 ) -> MarlinLimits:
-    """Return what a stream runs under where the file has set `own`.
+    """Return the limits of a stream where the file has set `own`.
 
     X and Y keep what the motors bear, so that the stream may break off anywhere. Retractions are
     not ours, so their acceleration stays. Linear advance is off, and the extruder may be as much
@@ -372,7 +372,7 @@ def _begun_late(encoded: Encoded, moves: Interleaved, timeline: Timeline) -> Enc
 
 
 def _check_advance(piece: Piece, k_s: NDArray[np.float64], fastest: NDArray[np.float64]) -> None:
-    """Refuse what the firmware would slow down for linear advance, where the plan does not."""
+    """Refuse moves that the firmware would slow down for linear advance and the plan does not."""
     limits = cast(list[MarlinLimits], piece.limits)
     own = np.array([(x.accel_x_mm_s2, x.accel_y_mm_s2, x.print_accel_mm_s2) for x in limits])
     which, direction = piece.moves.limits_id, piece.phases.direction

@@ -85,7 +85,7 @@ def without_advance(own: MarlinLimits) -> MarlinLimits:
 
 
 def advance_speed_mm_s(own: MarlinLimits, *, classic_jerk: bool) -> float:
-    """Return how fast linear advance moves the extruder at most, on top of what the file feeds.
+    """Return the largest speed that linear advance adds to the extruder's own.
 
     The firmware lowers accelerations so that it is no more than the extruder's jerk
     (Marlin/src/module/planner.cpp, `_populate_block`: MAX_E_JERK; 2.0.8, 2.1.2.5).

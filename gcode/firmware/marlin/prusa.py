@@ -1,4 +1,4 @@
-"""Words of Prusa's Buddy firmware (MINI, MK4, XL, CORE One) where they differ from Marlin's.
+"""Commands of Prusa's Buddy firmware (MINI, MK4, XL, CORE One) where they differ from Marlin's.
 
 Source: Prusa-Firmware-Buddy 6.x (2025), lib/Marlin/Marlin/src/gcode/gcode.cpp and
 src/marlin_stubs/gcode.cpp: which words there are; the files of T, P0, M74, M572, M593, M862.6 and

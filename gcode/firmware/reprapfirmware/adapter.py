@@ -1,4 +1,4 @@
-"""What RepRapFirmware offers to the pipeline."""
+"""RepRapFirmware's interface to the pipeline."""
 
 from __future__ import annotations
 

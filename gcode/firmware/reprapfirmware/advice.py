@@ -1,4 +1,4 @@
-"""RepRapFirmware's words for a shaper and an acceleration, read and written."""
+"""RepRapFirmware's commands for shaper and acceleration, read and written."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ class RepRapAdviser:
         return _FENCE, f"M204 P{accel_mm_s2:.10g}".encode()
 
     def sets_accel(self, text: str) -> bool:
-        """Tell whether a line sets M204 P."""
+        """Return whether a line sets M204 P."""
         return any(
             c.name == "M204" and bool(c.words.keys() & {"P", "S"})
             for c in split_line(text, self._dialect)
         )
 
     def stores(self, _text: str) -> bool:
-        """Tell no: M500 writes neither M204 nor M593 to config-override.g."""
+        """Return False: M500 writes neither M204 nor M593 to config-override.g."""
         return False
 
     def shaper_lines(self, shaping: Shaping) -> tuple[bytes, ...]:
@@ -74,7 +74,7 @@ class RepRapAdviser:
         return (f'M593 P"{name}" F{s.f_hz:.6g} S{s.damping:.6g}'.encode(),)
 
     def read_shaper(self, text: str, now: Shaping) -> Shaping:
-        """Return what an M593 leaves in force."""
+        """Return the shaper in force after an M593."""
         for command in split_line(text, self._dialect):
             if command.name != "M593" or command.uncertain:
                 continue

@@ -1,4 +1,4 @@
-"""RepRapFirmware's commands that Python carries out.
+"""RepRapFirmware's commands that Python handles.
 
 Sources: RepRapFirmware src/GCodes/GCodes.cpp, GCodes2.cpp, GCodes3.cpp and
 src/Movement/Move2.cpp, 3.5 and 3.6.0-beta.2 (2024-11).

@@ -1,4 +1,4 @@
-"""How RepRapFirmware 3 reads G-code.
+"""G-code as read by RepRapFirmware 3.
 
 Sources: docs/dialects.md, which also says what was not read in the firmware's own source.
 """

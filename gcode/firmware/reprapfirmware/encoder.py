@@ -1,4 +1,4 @@
-"""From a compensated command to the G1 lines that make RepRapFirmware execute it.
+"""Encodes a compensated command as the G1 lines that make RepRapFirmware execute it.
 
 The speed along the path is continuous in this firmware: a step of it costs time, a step of
 direction costs none within the jerk limits. The stream runs under what the motors bear, so that it
@@ -71,7 +71,7 @@ def stream_limits(
     *,
     corexy: bool = False,
 ) -> RepRapLimits:
-    """Return what the stream runs under.
+    """Return the limits of a stream.
 
     X and Y keep what the motors bear, so that the stream may break off anywhere, at M220 200 % too,
     where two corners may come within a ms. What Z and the extruder may do by themselves stays,
@@ -282,7 +282,7 @@ class RepRapEncoder:
         return length, accel, limit, junction
 
     def _check_rate(self, phases: Phases, piece: Piece) -> None:
-        """Refuse what the firmware's queue could not keep up with."""
+        """Refuse segments that come faster than the firmware's queue can handle."""
         half, least = self._half_ring, self._half_ring_s
         lasts = phases.lasts_s
         if len(lasts) <= half:

@@ -1,4 +1,4 @@
-"""What every recording must pass: rising time without gaps, and columns that are alive."""
+"""Checks of every recording: rising time without gaps, and columns that are alive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded drives: a command and what followed, in columns of any name."""
+"""Recorded drives: a command and the measured motion, in columns of any name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that others fitted: JSON of ours or of python-control's quantities, and MATLAB files."""
+"""Models fitted elsewhere: JSON of ours or of python-control's quantities, and MATLAB files."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _form(fields: Mapping[str, Any]) -> str:
 def _document(
     fields: Mapping[str, Any], settings: ReadSettings
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write the fields of any kind of model as a plant document of ours."""
+    """Convert the fields of any kind of model to a plant document."""
     form = _form(fields)
     if not form:
         raise ModelError(f"not a model: it has {', '.join(fields):.200}; it needs {_FORMS}")

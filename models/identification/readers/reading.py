@@ -1,4 +1,4 @@
-"""Files of measurements and models: what they are is told by their content, not their name."""
+"""Reads files of measurements and models; their kind follows from the content, not the name."""
 
 from __future__ import annotations
 

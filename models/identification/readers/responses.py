@@ -41,8 +41,8 @@ def read_responses(
     Raises
     ------
     ModelError
-        For a column that is missing, frequencies that do not rise, or a magnitude that must
-        be in dB although nobody says so.
+        For a missing column, frequencies that do not rise, or a magnitude that looks like dB
+        without being declared as dB.
     """
     check_long(table, _LEAST_POINTS, "frequencies", _MOST_POINTS)
     frequency = _needed(table, _FREQUENCY)

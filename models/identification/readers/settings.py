@@ -1,4 +1,4 @@
-"""What measurement files do not carry: asked for, or assumed by the date of the firmware."""
+"""Facts that measurement files lack: asked for, or assumed by the date of the firmware."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def excitation_for(
     Raises
     ------
     ModelError
-        If nobody says which axis was tested, or it is not in the plane.
+        If the tested axis is not stated, or does not lie in the plane.
     """
     return _resolved(measurement, settings or ReadSettings()).excitation
 
@@ -164,7 +164,7 @@ def excitation_for(
 def excitation_notes(
     measurement: AccelerationLog | Spectrum, settings: ReadSettings | None = None
 ) -> tuple[str, ...]:
-    """Return in words what `excitation_for` assumed because nobody said it."""
+    """Return notes on what `excitation_for` assumed for lack of information."""
     return _resolved(measurement, settings or ReadSettings()).notes
 
 
