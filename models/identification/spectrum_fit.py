@@ -20,12 +20,8 @@ from scipy.optimize import least_squares
 
 from stillpath.models.errors import ModelError
 from stillpath.models.identification.averaging import mean_spectrum
-from stillpath.models.identification.frame import (
-    LIKELY,
-    frame_hz_of,
-    shaken,
-    without_frame,
-)
+from stillpath.models.identification.frame import LIKELY, frame_hz_of, shaken, without_frame
+from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.messages import (
     apart_warning,
     cross_axis_warning,
@@ -459,14 +455,10 @@ class _Search:
                 [-1.0 / _SHARE_SPREAD],
             ]
         )
-        at: dict[bytes, tuple[Array, Array]] = {}
 
+        @last_kept
         def known(vector: Array) -> tuple[Array, Array]:
-            key = vector.tobytes()
-            if key not in at:
-                at.clear()
-                at[key] = model.log_spectrum_and_gradient(structure, vector)
-            return at[key]
+            return model.log_spectrum_and_gradient(structure, vector)
 
         def residual(vector: Array) -> Array:
             error = whitening @ (known(vector)[0] - log_psd)
