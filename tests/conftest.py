@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import tempfile
 from pathlib import Path
@@ -19,6 +20,10 @@ __all__ = ["cache", "postgres_server", "postgres_url", "shared_dir"]
 # Before numpy and numba are imported anywhere.
 for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
+
+# As in `service/environment.py`: modules, kernels and tests are very many objects that stay, and
+# looking through them for cycles whenever 700 have come took a quarter of all time.
+gc.set_threshold(50_000)
 
 _NO_SMALL_DISK = "no small disk"
 _MISSING = "no shared test data: set STILLPATH_SHARED, or put the folder beside the checkout"
@@ -62,6 +67,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     # Files with slow tests first: at the end no process waits long for the other.
     long = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in long)
+
+
+def pytest_collection_finish() -> None:
+    """Leave out what is there now whenever cycles are looked for."""
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -253,10 +253,13 @@ class _AxisWork:
         # A schedule counts the modes of the plant as it was fitted.
         frame_firm = self._settings.frame_firm or bool(special([c for _, c in responses]))
         friction_mm = 0.0
+        frame: Frame | None = None
         if self._kind == "raw log":
-            responses, friction_mm = self._without_friction(responses, common, frame_firm)
+            frame = None if frame_firm else _frame(responses, common)
+            responses, friction_mm = self._without_friction(responses, common, frame)
+            if friction_mm and not frame_firm:
+                frame = _frame(responses, common)
         chosen = [r for r, c in responses if c in common]
-        frame = self._frame(chosen, frame_firm)
         if frame is not None:
             chosen = [frame.over_bed(response) for response in chosen]
         found = response_set(
@@ -353,17 +356,11 @@ class _AxisWork:
         self._steps.stepped(what)
         return response
 
-    def _frame(self, responses: Sequence[FrequencyResponse], firm: bool) -> Frame | None:
-        """Return the frame that shakes in raw logs, if it may shake and one is seen."""
-        if self._kind != "raw log" or firm:
-            return None
-        return frame_of(mean_response(responses))
-
     def _without_friction(
         self,
         responses: Sequence[tuple[FrequencyResponse, Condition]],
         common: Collection[Condition],
-        frame_firm: bool,
+        frame: Frame | None,
     ) -> tuple[list[tuple[FrequencyResponse, Condition]], float]:
         """Return responses without what dry friction did, and how far it holds the axis back.
 
@@ -371,7 +368,6 @@ class _AxisWork:
         """
         used = [k for k, (_, c) in enumerate(responses) if c in common]
         felt = [r for r, _ in responses]
-        frame = self._frame([felt[k] for k in used], frame_firm)
         motions = [felt] if frame is None else [felt, [frame.over_bed(r) for r in felt]]
         held_mm, which = dry_friction(
             [self._aligned[k] for k in used], [[way[k] for k in used] for way in motions]
@@ -397,6 +393,13 @@ class _AxisWork:
         test = excitation_for(log, self._settings)
         again = estimate_aligned(log, aligned, test, label=response.label)
         return replace(again, notes=response.notes)
+
+
+def _frame(
+    responses: Sequence[tuple[FrequencyResponse, Condition]], common: Collection[Condition]
+) -> Frame | None:
+    """Return the frame that shakes in raw logs, if one is seen."""
+    return frame_of(mean_response([r for r, c in responses if c in common]))
 
 
 def _axis(measurement: Measurement, settings: ReadSettings) -> Axis:

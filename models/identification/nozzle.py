@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 
+from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.modal_fit import of_poles
 from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.response_data import ResponseData, response_data
@@ -89,12 +90,15 @@ class Frame:
 def frame_of(measured: FrequencyResponse) -> Frame | None:
     """Return the frame that a response shows; None if there is none that is clear."""
     data = response_data(measured).thinned(_POINTS)
-    firm = _best(data, [_start(data, None)])
-    found = _best(data, [_start(data, f_hz) for f_hz in _STARTS_HZ])
+    held = _start(data)
+    tried = [_polished(data, held.on_its_feet(f_hz)) for f_hz in _STARTS_HZ]
+    found = min(tried, key=lambda one: one.cost)
     frame = found.frame
     main_hz = float(data.f_hz[np.argmax(np.abs(data.response))])
-    seen = frame is not None and frame.mass_ratio > _LEAST_MU and frame.f_hz < _BELOW * main_hz
-    return frame if seen and found.cost < _CLEARLY**2 * firm.cost else None
+    if frame is None or frame.mass_ratio <= _LEAST_MU or frame.f_hz >= _BELOW * main_hz:
+        return None
+    firm = _polished(data, held)
+    return frame if found.cost < _CLEARLY**2 * firm.cost else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +117,12 @@ class _Found:
         (f, zeta), mu = np.exp(self.vector[2:4]), self.vector[4]
         return Frame(float(f), float(zeta), float(mu), float(np.exp(self.vector[0])))
 
+    def on_its_feet(self, f_hz: float) -> _Found:
+        """Return the same with a frame that shakes at this frequency."""
+        frame = [np.log(f_hz), np.log(_START[0]), _START[1]]
+        vector = np.concatenate([self.vector[:2], frame, self.vector[2:]])
+        return replace(self, vector=vector, shaken=True)
+
     def model_and_gradient(self, f_hz: Array) -> tuple[ComplexArray, ComplexArray]:
         """Return the response, shape (len(f_hz),), and its derivatives, (len(f_hz), parameters)."""
         late = np.exp(self.vector[0] - 2j * np.pi * f_hz * self.vector[1])
@@ -127,8 +137,11 @@ class _Found:
         return late * felt, late[:, None] * np.concatenate([by_level, gradient], axis=1)
 
 
-def _start(data: ResponseData, frame_hz: float | None) -> _Found:
-    """Start from the highest peak, the next one above it, and a mode beyond the band."""
+def _start(data: ResponseData) -> _Found:
+    """Start from the highest peak, the next one above it, and a mode beyond the band.
+
+    The frame is held.
+    """
     size, top_hz = np.abs(data.response), float(data.f_hz[-1])
     main = int(np.argmax(size))
     peaks = find_peaks(np.log(size), prominence=_PROMINENCE)[0]
@@ -145,13 +158,7 @@ def _start(data: ResponseData, frame_hz: float | None) -> _Found:
     else:
         # The last of its parameters is what acts against the frame.
         theta, level, delay_s = known.theta[:-1], float(known.vector[0]), known.delay_s
-    frame = [] if frame_hz is None else [np.log(frame_hz), np.log(_START[0]), _START[1]]
-    vector = np.concatenate([[level, delay_s], frame, theta])
-    return _Found(vector, structure, frame_hz is not None)
-
-
-def _best(data: ResponseData, starts: list[_Found]) -> _Found:
-    return min((_polished(data, start) for start in starts), key=lambda found: found.cost)
+    return _Found(np.concatenate([[level, delay_s], theta]), structure, shaken=False)
 
 
 def _polished(data: ResponseData, start: _Found) -> _Found:
@@ -163,14 +170,17 @@ def _polished(data: ResponseData, start: _Found) -> _Found:
     low = np.concatenate([ends[:, 0], frame[:, 0], low])
     high = np.concatenate([ends[:, 1], frame[:, 1], high])
 
+    @last_kept
+    def known(vector: Array) -> tuple[ComplexArray, ComplexArray]:
+        return replace(start, vector=vector).model_and_gradient(data.f_hz)
+
     def residual(vector: Array) -> Array:
-        error = replace(start, vector=vector).model_and_gradient(data.f_hz)[0] - data.response
+        error = known(vector)[0] - data.response
         unusual = (vector[3:4] - np.log(_START[0])) / _ZETA_SPREAD if start.shaken else vector[:0]
         return np.concatenate([data.weight * error.real, data.weight * error.imag, unusual])
 
     def jacobian(vector: Array) -> Array:
-        slope = replace(start, vector=vector).model_and_gradient(data.f_hz)[1]
-        slope = data.weight[:, None] * slope
+        slope = data.weight[:, None] * known(vector)[1]
         unusual = np.eye(len(vector))[3:4] / _ZETA_SPREAD if start.shaken else slope.real[:0]
         return np.concatenate([slope.real, slope.imag, unusual])
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from stillpath.models.errors import ModelError
+from stillpath.models.identification.last_kept import last_kept
 from stillpath.models.identification.modal_structure import ModalStructure
 from stillpath.models.identification.scatter import SCATTERS, Scatter
 from stillpath.models.identification.spectrum_model import spectrum_model
@@ -245,14 +246,10 @@ class Search:
                 [-1.0 / _SHARE_SPREAD],
             ]
         )
-        at: dict[bytes, tuple[Array, Array]] = {}
 
+        @last_kept
         def known(vector: Array) -> tuple[Array, Array]:
-            key = vector.tobytes()
-            if key not in at:
-                at.clear()
-                at[key] = model.log_spectrum_and_gradient(structure, vector)
-            return at[key]
+            return model.log_spectrum_and_gradient(structure, vector)
 
         def residual(vector: Array) -> Array:
             error = whitening @ (known(vector)[0] - log_psd)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,9 +33,24 @@ def gear(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+Written = Callable[[Firmware, str], tuple[Path, Result]]
+
+
+@pytest.fixture(scope="module")
+def written(gear: Path) -> Written:
+    """Give the gear as it is written for a firmware and a choice of what shows, each made once."""
+
+    @cache
+    def make(kind: Firmware, where: str) -> tuple[Path, Result]:
+        target = gear.parent / f"{kind}-{where}.gcode"
+        return target, run(gear, target, ender3_with(kind), where=where)
+
+    return make
+
+
 def run(gear: Path, target: Path, machine: Machine, **options: object) -> Result:
-    cache = gear.parent / "cache"
-    return compensate_file(gear, target, machine, Options.model_validate(options), cache_dir=cache)
+    chosen = Options.model_validate(options)
+    return compensate_file(gear, target, machine, chosen, cache_dir=gear.parent / "cache")
 
 
 def rms(result: Result, feature: str) -> dict[str, float]:
@@ -43,16 +60,15 @@ def rms(result: Result, feature: str) -> dict[str, float]:
 @pytest.mark.parametrize(
     "kind", [k if k == "klipper" else pytest.param(k, marks=pytest.mark.slow) for k in KINDS]
 )
-def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
-    machine = ender3_with(kind)
-    all_of_it = run(gear, tmp_path / "all.gcode", machine)
-    walls = run(gear, tmp_path / "walls.gcode", machine, where="walls")
-    text, written = gear.read_bytes(), (tmp_path / "walls.gcode").read_bytes()
+def test_outer_walls_alone(kind: Firmware, gear: Path, written: Written) -> None:
+    _, all_of_it = written(kind, "all")
+    target, walls = written(kind, "walls")
+    text, made = gear.read_bytes(), target.read_bytes()
     assert walls.put_back == []
 
     # The printer is where the file leaves it, at every line that both have.
-    assert differences(text, written, machine) == []
-    came, leaves = read(text, kind), read(written, kind)
+    assert differences(text, made, ender3_with(kind)) == []
+    came, leaves = read(text, kind), read(made, kind)
     assert leaves.modes() == came.modes()
     assert leaves.position_mm == pytest.approx(came.position_mm, abs=1e-3)
     assert leaves.extruded_mm[0] == pytest.approx(came.extruded_mm[0], abs=1e-3)
@@ -60,7 +76,7 @@ def test_outer_walls_alone(kind: Firmware, gear: Path, tmp_path: Path) -> None:
     inner = text.split(b";TYPE:WALL-INNER\n")[3].split(b";TYPE:")[0]
     kept = [line for line in inner.splitlines() if b"E" in line and not line.startswith(b";@")]
     assert len(kept) > 10
-    assert all(line in written for line in kept[1:-1])
+    assert all(line in made for line in kept[1:-1])
 
     assert walls.written_bytes < 0.7 * all_of_it.written_bytes
     assert walls.left_out_extruding_s > 20.0
@@ -87,8 +103,7 @@ def test_outer_walls_of_small_arcs(gear: Path, tmp_path: Path) -> None:
     machine, source = ender3_with("marlin"), tmp_path / "arcs.gcode"
     source.write_bytes(tagged(small_arcs().encode()))
     target, options = tmp_path / "walls.gcode", Options(where="walls")
-    cache = gear.parent / "cache"
-    result = compensate_file(source, target, machine, options, cache_dir=cache)
+    result = compensate_file(source, target, machine, options, cache_dir=gear.parent / "cache")
     assert result.put_back == []
     assert differences(source.read_bytes(), target.read_bytes(), machine) == []
     outer = next(g.contour_rms_um for g in result.features if g.name == "WALL-OUTER")
@@ -124,12 +139,9 @@ def test_what_is_left_out_has_the_firmwares_pressure_advance(
     assert (of_stream, of_file) == ({0.0}, {0.05})
 
 
-def test_a_file_that_must_not_be_large(gear: Path, tmp_path: Path) -> None:
+def test_a_file_that_must_not_be_large(gear: Path, written: Written, tmp_path: Path) -> None:
     machine, target = ender3_with("klipper"), tmp_path / "out.gcode"
-    sizes = [
-        run(gear, target, machine, where=where).written_bytes
-        for where in ("all", "visible", "walls")
-    ]
+    sizes = [written("klipper", where)[1].written_bytes for where in ("all", "visible", "walls")]
     assert sizes[0] > sizes[1] > sizes[2]
     for limit_mb, where, tolerance_um in (
         (10.0, "all", 2),

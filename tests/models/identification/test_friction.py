@@ -28,7 +28,7 @@ def held_mm(printer: Printer, number: int) -> float:
 
 
 def logs(  # type: ignore[no-untyped-def]
-    printer: Printer, test: Excitation, axis: str = "x", runs: int = 2
+    printer: Printer, test: Excitation, axis: str = "x", runs: int = 1
 ):
     rng = np.random.default_rng(4)
     sensor = drawn_sensor(rng, "lis2dw")
@@ -45,7 +45,7 @@ def logs(  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("test", [OLD_TEST, NEW_TEST], ids=["old", "new"])
 def test_it_is_told_by_the_log(test: Excitation) -> None:
     printer = draw("bed slinger", 3)
-    read = logs(printer, test)
+    read = logs(printer, test, runs=2)
     found, _ = dry_friction([one[1] for one in read], [[one[2] for one in read]])
     assert found == pytest.approx(held_mm(printer, 0), rel=0.3)
     # What is left follows the command better.

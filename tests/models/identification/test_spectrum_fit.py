@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from stillpath.models.identification.frame import LIKELY, without_frame
 from stillpath.models.identification.readers import read_measurements
 from stillpath.models.identification.spectrum_fit import (
     Explained,
+    Explanations,
     explanations,
     refit_spectrum,
 )
@@ -66,6 +68,12 @@ def explain_spectra(
     return found.explained(frame_likely)
 
 
+@cache
+def narrow() -> Explanations:
+    """What explains a spectrum of the narrow modes."""
+    return explanations([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY)
+
+
 def check_usable(fit: Fit) -> None:
     assert abs(frequency_response(fit.spec, [0.0])[0] - 1) < 1e-9
     roots = fit.spec.roots()
@@ -78,15 +86,16 @@ def check_usable(fit: Fit) -> None:
 
 
 @pytest.mark.parametrize(
-    ("test", "noise"), [(LEGACY, 400.0), (SWEEPING, 60.0)], ids=["legacy", "sweeping"]
-)
-@pytest.mark.parametrize(
-    ("modes", "gains"),
-    [(OUT_OF_BAND, (0.6, 0.3, 0.1)), (NARROW, (0.7, 0.3)), (CLOSE, (0.4, 0.4, 0.2))],
-    ids=["out of band", "narrow", "close"],
+    ("modes", "gains", "test", "noise"),
+    [
+        (OUT_OF_BAND, (0.6, 0.3, 0.1), LEGACY, 400.0),
+        (NARROW, (0.7, 0.3), SWEEPING, 60.0),
+        (CLOSE, (0.4, 0.4, 0.2), LEGACY, 400.0),
+    ],
+    ids=["out of band-legacy", "narrow-sweeping", "close-legacy"],
 )
 def test_modes_of_a_simulated_spectrum(
-    modes: Modes, gains: tuple[float, ...], noise: float, test: Excitation
+    modes: Modes, gains: tuple[float, ...], test: Excitation, noise: float
 ) -> None:
     """Within 0.5 % and 15 % (reference notes, section 9), from Klipper's 2.3 Hz wide bins."""
     fit = explain_spectra([simulated(modes, gains, test, noise)], test).fit
@@ -147,21 +156,21 @@ def test_a_frame_is_taken_out_where_it_may_be_one() -> None:
         }
     )
     assert without_frame(heavy).modes[0].f_hz == 14.0
-    firm = explain_spectra([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY, frame_likely=0.0)
-    assert firm.fit.order >= 2
+    assert narrow().explained(frame_likely=0.0).fit.order >= 2
 
 
 def test_most_plants_are_without_a_mode_that_may_be_the_frame_s() -> None:
     """Unless the frame stands firm; which mode that is, is said."""
     spectrum = simulated(((14.0, 0.1), (45.0, 0.06)), (0.1, 0.9), LEGACY)
-    found = explain_spectra([spectrum], LEGACY)
+    explaining = explanations([spectrum], LEGACY)
+    found = explaining.explained()
     weights = found.population.weights
     without = [min(m.f_hz for m in plant.modes) > 25.0 for plant in found.population.members]
     assert without[0]
     assert 0.6 < sum(w for w, free in zip(weights, without, strict=True) if free) < 0.95
     (note,) = (text for text in found.fit.notes if "frame on its feet" in text)
     assert "at 14." in note or "at 13." in note
-    firm = explain_spectra([spectrum], LEGACY, frame_likely=0.0)
+    firm = explaining.explained(frame_likely=0.0)
     assert not any("frame on its feet" in text for text in firm.fit.notes)
     assert min(m.f_hz for m in firm.population.members[0].modes) == pytest.approx(14.0, rel=0.1)
 
@@ -245,7 +254,7 @@ def test_dead_column_and_short_band_are_refused() -> None:
 
 
 def test_refit_keeps_the_structure() -> None:
-    fit = explain_spectra([simulated(NARROW, (0.7, 0.3), LEGACY)], LEGACY).fit
+    fit = narrow().explained().fit
     moved = ((37.0, 0.018), (60.0, 0.024))
     member = refit_spectrum(simulated(moved, (0.7, 0.3), LEGACY), LEGACY, fit)
     assert member.order == fit.order

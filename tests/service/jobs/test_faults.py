@@ -116,7 +116,7 @@ def test_a_worker_that_is_deaf_to_a_cancel_is_ended(shared: Site):
 
 
 def test_limits_end_a_job_and_nothing_else(site: Site):
-    with site.work(max_job_s=20.0, cancel_grace_s=1.0, max_job_bytes=250 << 20):
+    with site.work(max_job_s=8.0, cancel_grace_s=1.0, max_job_bytes=250 << 20):
         ids = [site.submit(text) for text in ("deaf", "grow 300", "grow 4000", "G1")]
         long, large, larger, good = (site.ended(job_id) for job_id in ids)
         assert "STILLPATH_MAX_JOB_S" in long.problem["detail"]
@@ -128,7 +128,7 @@ def test_limits_end_a_job_and_nothing_else(site: Site):
 
 
 def test_silence_is_a_loss(site: Site):
-    with site.work(heartbeat_timeout_s=10.0, max_attempts=3):
+    with site.work(heartbeat_timeout_s=5.0, max_attempts=3):
         job_id = site.submit("slow-once 1")
         pid = worker_pid(site, job_id)
         os.kill(pid, signal.SIGSTOP)  # neither dead nor alive

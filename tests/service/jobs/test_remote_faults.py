@@ -83,24 +83,24 @@ def test_scheduler_storage_and_database_may_go_away_in_mid_job(far: Far):
     for job_id in first[:2]:
         site.running(job_id)
     scheduler.kill()
-    time.sleep(2)
+    time.sleep(1)
     far.scheduler()
     all_done(site, first)
     assert all(site.get(job_id).losses <= 1 for job_id in first)
 
-    second = [site.submit("nap 3") for _ in range(2)]
+    second = [site.submit("nap 1.5") for _ in range(2)]
     for job_id in second:
         site.running(job_id)
     far.s3.cut()
-    time.sleep(6)
+    time.sleep(3)
     far.s3.mend()
     all_done(site, second)
 
-    third = [site.submit("nap 4") for _ in range(2)]
+    third = [site.submit("nap 3") for _ in range(2)]
     for job_id in third:
         site.running(job_id)
     far.database.cut()
-    time.sleep(8)  # longer than a worker may be silent
+    time.sleep(6)  # longer than a worker may be silent
     far.database.mend()
     all_done(site, third)
     assert all(site.get(job_id).attempt == 1 for job_id in second + third)

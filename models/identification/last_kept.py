@@ -1,0 +1,28 @@
+"""What a solver asks for twice at one point, residual and Jacobian, is computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["last_kept"]
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+
+def last_kept(function: Callable[[Array], T]) -> Callable[[Array], T]:
+    """Return the function with its last value kept, for as long as the vector is the same."""
+    kept: dict[bytes, T] = {}
+
+    def known(vector: Array) -> T:
+        key = vector.tobytes()
+        if key not in kept:
+            kept.clear()
+            kept[key] = function(vector)
+        return kept[key]
+
+    return known
