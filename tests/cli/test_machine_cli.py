@@ -348,9 +348,11 @@ def test_check_says_when_all_is_well(store: MachineStore, config: Path, capsys):
     assert machines("check", "mine", "--printer-cfg", config) == 0
     assert "note: [include mainsail.cfg]" in capsys.readouterr().out
     capsys.readouterr()
-    # A note for machines whose command is no such multiple, and no difference.
-    assert machines("check", "generic-corexy") == 0
-    assert "note: generic-corexy: a command may ask the motors for 20000" in capsys.readouterr().out
+    # A note for machines whose command is no such multiple; what was typed in is to be measured.
+    assert machines("check", "generic-corexy") == 2
+    out = capsys.readouterr().out
+    assert "axis x of generic-corexy: its plants were typed in, not measured" in out
+    assert "note: generic-corexy: a command may ask the motors for 20000" in out
     # Somebody else's printer, and years ago.
     assert machines("check", "ender3") == 2
 
