@@ -39,6 +39,8 @@ _SHORT = 0.5
 _NEARLY_BACK = 0.9999
 _JOLT = 20.0
 """Samples. What makes steps of an excess of speed; large, so that there is none where it can be."""
+_GENTLE = 0.2
+"""What a step of speed beyond gentle ramps counts in a fast place, one beyond all ramps being 1."""
 _SEEN = 0.1
 """What the square of an error counts by itself, that of the printer's answer being 1."""
 _ALONG = 0.1
@@ -175,7 +177,7 @@ def choose_vertices(
     unit: Any,
     step: Any,
     spare: float,
-    bend: float,
+    bend: Any,
     corexy: bool,
     pole: Any,
     weight: Any,
@@ -202,9 +204,11 @@ def choose_vertices(
         at a vertex; more is made to cost much.
     spare : float
         How many steps within a segment rounding may add to that.
-    bend : float
+    bend : ndarray, shape (3,)
         Acceleration in steps of X per sample^2. A step of speed is a ramp, or a bend, within the
-        shorter of two segments; what does not fit is made to cost as much.
+        shorter of two segments; what does not fit is made to cost as much. Then a gentle
+        acceleration, beyond which it is to cost something, too, where a motor makes more steps per
+        sample than the third number.
     pole, weight : ndarray, shape (2, 2 order)
     direct : ndarray, shape (2,)
         The printer's answer to an error e is direct e + sum of Re(weight x), x <- pole x + e, for
@@ -273,7 +277,7 @@ def _follow(
     unit: Any,
     step: Any,
     spare: float,
-    bend: float,
+    bend: Any,
     corexy: bool,
     pole: Any,
     weight: Any,
@@ -309,7 +313,7 @@ def _follow(
     kept : ndarray, shape (_WAYS,)
     """
     n, order = len(place), pole.shape[1] // 2
-    width = 4 * order
+    width, gentle = 4 * order, bend[1] / bend[0]
     cost[0, 0] = rank[0, 0] = 0.0
     n_ways[0] = 1
     for k in range(1, n):
@@ -360,11 +364,16 @@ def _follow(
                     dx, dy = bx * per - rate_x, by * per - rate_y
                     total += _jolt(dx, dy, jump, step, corexy)
                     # From a stand the mean speed of a ramp is half of what it reaches.
-                    room = bend * (min(span, lasts) if i >= 0 else 0.5 * span)
+                    room = bend[0] * (min(span, lasts) if i >= 0 else 0.5 * span)
                     total += _crowded(dx * unit[0], dy * unit[1], room)
+                    if gentle < 1.0 and _fastest(bx, by, rate_x, rate_y, per, corexy) > bend[2]:
+                        most_gentle = gentle * room
+                        total += _GENTLE * _crowded(dx * unit[0], dy * unit[1], most_gentle)
                     if last:
                         total += _jolt(bx * per, by * per, spare * per, step, corexy)
-                        total += _crowded(bx * per * unit[0], by * per * unit[1], 0.5 * bend * span)
+                        total += _crowded(
+                            bx * per * unit[0], by * per * unit[1], 0.5 * bend[0] * span
+                        )
                     for q in range(width):
                         x[q] = states[j, d, q]
                     s = int(np.ceil(begin + 1e-6))
@@ -466,6 +475,13 @@ def _crowded(dx: float, dy: float, most: float) -> float:
     """Cost of a step of speed, steps of X per sample, for which there is not the time."""
     excess = np.sqrt(dx * dx + dy * dy) - most
     return (_JOLT * excess) ** 2 if excess > 0.0 else 0.0
+
+
+@kernel(inline=True)
+def _fastest(bx: float, by: float, rx: float, ry: float, per: float, corexy: bool) -> float:
+    """Largest step rate of a motor in a segment and in the one before it."""
+    bx, by, rx, ry = abs(bx) * per, abs(by) * per, abs(rx), abs(ry)
+    return max(bx + by, rx + ry) if corexy else max(bx, by, rx, ry)
 
 
 @kernel(inline=True)

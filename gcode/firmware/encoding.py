@@ -41,8 +41,10 @@ class Encoded:
     begin : ndarray of int64, shape (4,)
     row : ndarray of int64, shape (n,)
         Row of the piece for a rest's own move, -1 for a segment of ours.
-    limits : Limits
-        What our segments run under.
+    limits : sequence of Limits
+        What our segments run under, one or the other.
+    level : ndarray of int64, shape (n,)
+        Which of them, for every segment of ours.
     feedrate_mm_min : ndarray, shape (n,)
     start_s : ndarray, shape (n,)
         When each move begins, counted as on the timeline.
@@ -59,7 +61,8 @@ class Encoded:
     position: NDArray[np.int64]
     begin: NDArray[np.int64]
     row: NDArray[np.int64]
-    limits: Limits
+    limits: Sequence[Limits]
+    level: NDArray[np.int64]
     feedrate_mm_min: NDArray[np.float64]
     start_s: NDArray[np.float64]
     group_start_s: NDArray[np.float64]
@@ -135,7 +138,10 @@ def interleave(
 
 
 def limits_in_force(
-    piece: Piece, rows: NDArray[np.int64], stream: Limits
+    piece: Piece,
+    rows: NDArray[np.int64],
+    stream: Sequence[Limits],
+    level: NDArray[np.int64],
 ) -> tuple[NDArray[np.int32], list[Limits]]:
     """Return `Moves.limits_id` and its table: the stream's limits, or the file's own in a rest.
 
@@ -143,12 +149,15 @@ def limits_in_force(
     ----------
     rows : ndarray of int64, shape (n,)
         Row of the piece for a rest's own move, -1 for a segment.
+    stream : sequence of Limits
+    level : ndarray of int64, shape (n,)
+        Which of them a segment runs under.
     """
     own = rows >= 0
     used, found = np.unique(piece.moves.limits_id[rows[own]], return_inverse=True)
-    limits_id = np.zeros(len(rows), np.int32)
-    limits_id[own] = 1 + found
-    return limits_id, [stream, *(piece.limits[i] for i in used)]
+    limits_id = level.astype(np.int32)
+    limits_id[own] = len(stream) + found
+    return limits_id, [*stream, *(piece.limits[i] for i in used)]
 
 
 def as_moves(
@@ -184,11 +193,18 @@ def as_moves(
 def encoded_piece(
     timeline: Timeline,
     moves: Interleaved,
-    limits: Limits,
+    limits: Limits | tuple[Sequence[Limits], NDArray[np.int64]],
     feedrate_mm_min: NDArray[np.float64],
     phases: Phases,
 ) -> Encoded:
-    """Return the encoded piece with the times that the firmware's plan of its moves gives."""
+    """Return the encoded piece with the times that the firmware's plan of its moves gives.
+
+    Parameters
+    ----------
+    limits : Limits, or sequence of Limits and ndarray of int64, shape (n,)
+        The stream's, or several and which of them each segment runs under.
+    """
+    table, level = limits if isinstance(limits, tuple) else ([limits], np.zeros_like(moves.row))
     duration_s = phases.lasts_s
     start_s = timeline.start_s[0] + phases.t_s
     group_start_s = _group_starts(timeline, moves.group, start_s, duration_s)
@@ -199,7 +215,8 @@ def encoded_piece(
         position=moves.position,
         begin=moves.begin,
         row=moves.row,
-        limits=limits,
+        limits=table,
+        level=level,
         feedrate_mm_min=feedrate_mm_min,
         start_s=start_s,
         group_start_s=group_start_s,

@@ -49,6 +49,8 @@ class Lattice:
         That the moves are executed with.
     moves_per_s : float
         As many moves come in.
+    fast_mm_s, fast_accel_mm_s2 : float
+        Acceleration that moves should need no more than where a motor is faster than that.
     """
 
     per_mm: NDArray[np.float64]
@@ -60,6 +62,14 @@ class Lattice:
     spare_steps: float
     accel_mm_s2: float
     moves_per_s: float
+    fast_mm_s: float = np.inf
+    fast_accel_mm_s2: float = np.inf
+
+    def bends(self, dt_s: float) -> NDArray[np.float64]:
+        """Return `bend` of `choose_vertices`."""
+        step, step2 = self.per_mm[0] * dt_s, self.per_mm[0] * dt_s**2
+        accel, gentle = self.accel_mm_s2, self.fast_accel_mm_s2
+        return np.array([accel * step2, gentle * step2, self.fast_mm_s * step])
 
 
 def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) -> Segments:
@@ -226,7 +236,7 @@ def _chosen(
         scale[0] / scale[:2],
         lattice.speed_step_mm_s * scale[:2] * dt_s,
         lattice.spare_steps,
-        lattice.accel_mm_s2 * scale[0] * dt_s**2,
+        lattice.bends(dt_s),
         lattice.corexy,
         answers.pole,
         answers.weight,

@@ -169,7 +169,8 @@ class StreamWriter:
     def piece(self, piece: Piece, encoded: Encoded, extruder_mm: float) -> bytes:
         """Text of a compensated piece; `extruder_mm` is that of `verbatim`."""
         self._reads(extruder_mm)
-        parts = [self._on(piece, encoded.limits)]
+        limits, level = encoded.limits, encoded.level
+        parts = [self._on(piece, limits[level[0]])]
         rows, events = encoded.row, piece.events
         index = self._event_places(piece, encoded)
         modes = self._modes(piece, index)
@@ -179,21 +180,22 @@ class StreamWriter:
         rest_rows = np.flatnonzero(rows >= 0)
         order: list[tuple[int, int, int]] = [(int(i), 0, k) for k, i in enumerate(index)]
         order += [(int(i), 1, int(rows[i])) for i in rest_rows]
+        order += [(int(i), -1, 0) for i in 1 + np.flatnonzero(np.diff(level))]  # other limits
         done = 0
         last_line = -1
         for at, kind, what in sorted(order):
             upto = int(line_end[at - 1]) if at else 0
             if upto > done:
-                parts += [self._ours(encoded.limits, modes.at(at - 1)), text[done:upto]]
+                parts += [self._ours(limits[level[at - 1]], modes.at(at - 1)), text[done:upto]]
                 done = upto
             written = float(extruded[at - 1] if at else piece.moves.start_mm[0, 3])
             if kind == 0:
                 parts.append(self._event(piece, what, kinds[what], written))
-            elif int(piece.moves.line[what]) != last_line:
+            elif kind > 0 and int(piece.moves.line[what]) != last_line:
                 last_line = int(piece.moves.line[what])
                 parts.append(self._rest_line(piece, what, written))
         if len(text) > done:
-            parts += [self._ours(encoded.limits, modes.at(len(rows) - 1)), text[done:]]
+            parts += [self._ours(limits[level[-1]], modes.at(len(rows) - 1)), text[done:]]
         last = piece.moves.speed_mm_s[-1]
         self._file_feed_mm_min = float(last) * 60.0 / piece.modal_after.speed_factor
         self._at_rest = False
@@ -313,8 +315,10 @@ class StreamWriter:
     def _limits_to(self, limits: Limits) -> bytes:
         if limits == self._limits_now:
             return b""
-        self._limits_now = limits
-        return self._stream_commands.limits(limits)
+        before, self._limits_now = self._limits_now, limits
+        known = b"" if before is None else self._stream_commands.limits(before)
+        lines = self._stream_commands.limits(limits).splitlines(keepends=True)
+        return b"".join(line for line in lines if line not in known.splitlines(keepends=True))
 
     def _ours(self, limits: Limits, ours: ModalState) -> bytes:
         """Lines after which ours run under the stream's limits and in their modes."""

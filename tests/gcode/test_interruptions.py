@@ -33,7 +33,7 @@ def written(piece: Piece, made: CompensatedPiece, factor: float) -> tuple[Moves,
     ours = encoded.row < 0
     own = np.where(ours, 1.0, piece.moves.speed_mm_s[encoded.row])
     speed = factor * np.where(ours, encoded.feedrate_mm_min / 60.0, own)
-    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits)
+    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits, encoded.level)
     return as_moves(places[:-1], places[1:], speed, limits_id), limits
 
 
@@ -62,21 +62,47 @@ def velocity_step(moves: Moves, limits: list[Limits], machine: Machine) -> float
     [
         *(("klipper", factor, 1.0) for factor in (0.5, 1.0, 2.0)),
         *(("reprapfirmware", factor, 1.0) for factor in (0.5, 1.0, 2.0)),
-        *(("marlin", factor, 2.1) for factor in (0.5, 1.0, 2.0)),
+        ("marlin", 0.5, 1.1),
+        ("marlin", 1.0, 1.5),
+        ("marlin", 2.0, 2.1),
     ],
 )
 def test_no_break_asks_for_more_than_the_motors_bear(
     kind: str, factor: float, times: float
 ) -> None:
-    """By each firmware's own rules; Marlin's ramps are steps of its step rate (docs/safety.md)."""
+    """By each firmware's own rules; Marlin may start harder (docs/safety.md)."""
     machine = ender3_with(kind)
-    moves, limits = written(*compensated(HEAD + BODY, machine), factor)
-    stream = np.flatnonzero(moves.limits_id == 0)
+    piece, made = compensated(HEAD + BODY, machine)
+    moves, limits = written(piece, made, factor)
+    stream = np.flatnonzero(made.encoded.row < 0)
     worst = 0.0
     for k in stream[5::7]:
         for rows in (slice(max(k - _AROUND, 0), k), slice(k, k + _AROUND)):
             worst = max(worst, velocity_step(rows_of(moves, rows), limits, machine))
     assert worst <= times * machine.command.speed_step_mm_s, worst
+
+
+@pytest.mark.parametrize("kinematics", ["cartesian", "corexy"])
+def test_marlin_starts_hard_at_few_lines_only(kinematics: str) -> None:
+    """Those that are fast and change their speed; under one limit for all it would be most."""
+    machine = ender3_with("marlin").model_copy(update={"kinematics": kinematics})
+    piece, made = compensated(HEAD + BODY, machine)
+    moves, limits = written(piece, made, 1.0)
+    stream = made.encoded.row < 0
+    shares = []
+    for found in (
+        moves,
+        replace(moves, limits_id=np.where(stream, len(made.encoded.limits) - 1, moves.limits_id)),
+    ):
+        steps = np.array(
+            [
+                velocity_step(rows_of(found, slice(k, k + _AROUND)), limits, machine)
+                for k in np.flatnonzero(stream)[5::7]
+            ]
+        )
+        shares.append(np.mean(steps > 1.1 * machine.command.speed_step_mm_s))
+    assert shares[0] < 0.1
+    assert shares[1] > 0.4
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])

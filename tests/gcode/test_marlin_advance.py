@@ -182,7 +182,7 @@ def test_where_nobody_says_that_there_is_advance_nothing_is_slower_for_it() -> N
     with pytest.raises(Unfit, match=r"M900 K0\.2.*15\.5 mm/s.*linear_advance true"):
         compensated(machine_of(linear_advance=None, linear_advance_k_s=0.2))
     made = compensated(machine_of(linear_advance=None, linear_advance_k_s=0.07))
-    assert made.encoded.limits.advance_in_filament == 1.0  # type: ignore[attr-defined]
+    assert made.encoded.limits[-1].advance_in_filament == 1.0  # type: ignore[attr-defined]
 
 
 # Words and plans

@@ -38,7 +38,7 @@ def on_a_plane(machine: Machine, piece: Piece, made: CompensatedPiece, slope: fl
     ours = encoded.row < 0
     own = np.where(ours, 1.0, piece.moves.speed_mm_s[encoded.row])
     speed = np.where(ours, encoded.feedrate_mm_min / 60.0, own)
-    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits)
+    limits_id, limits = limits_in_force(piece, encoded.row, encoded.limits, encoded.level)
     return plan_moves(as_moves(points[:-1], points[1:], speed, limits_id), limits, machine)
 
 

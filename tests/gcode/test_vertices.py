@@ -252,7 +252,7 @@ def test_the_choice_is_nearly_the_best_of_all() -> None:
             np.ones(2),
             np.full(2, np.inf),
             1.0,
-            np.inf,
+            np.array([1e9, 1e9, np.inf]),
             False,
             answers.pole,
             answers.weight,

@@ -100,7 +100,7 @@ class KlipperEncoder:
             if group.rest:
                 rows[group.first : group.last] = np.arange(group.first, group.last)
         moves = piece.moves
-        limits_id, limits = limits_in_force(piece, rows, self._limits)
+        limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
         own = as_moves(moves.start_mm, moves.end_mm, moves.speed_mm_s, limits_id)
         phases = Planner(self._firmware).plan_whole(own, limits)
         return group_durations(phases, groups)
@@ -118,7 +118,7 @@ class KlipperEncoder:
         places_mm = moves.places_mm()
         start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
-        limits_id, limits = limits_in_force(piece, rows, self._limits)
+        limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
         length, accel, limit, junction, stops = self._motion(start_mm, end_mm, limits_id, limits)
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 

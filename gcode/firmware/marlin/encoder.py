@@ -41,6 +41,7 @@ from stillpath.gcode.firmware.marlin._encoder_kernels import (
 from stillpath.gcode.firmware.marlin.climbing import climb_in_long_moves
 from stillpath.gcode.firmware.marlin.limits import MarlinLimits, advance_speed_mm_s, without_advance
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
+from stillpath.gcode.firmware.marlin.starting import StreamLevels, gentle_accel_mm_s2
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.vertices import Lattice, vertices_on_steps
 from stillpath.gcode.pieces import Piece
@@ -72,8 +73,9 @@ _CALM = 0.6
 """Share of the motors' permitted step of speed; making up for lost time needs the rest."""
 _PASSES = 10
 _TIME_TOLERANCE_S = 5e-5
-_BYTES_PER_LINE = 32.0
-"""Length of a written line with line number, checksum and its share of the acknowledgement."""
+_BYTES_PER_LINE = 36.0
+"""Length of a written line with line number, checksum and its share of the acknowledgement, and a
+tenth more for the lines that set accelerations."""
 
 
 def stream_limits(
@@ -159,6 +161,8 @@ class MarlinEncoder:
             rate = min(rate, firmware.baud_rate / 10.0 / _BYTES_PER_LINE)
         self._rate = rate
         self._least_hz = float(planner_facts(firmware, corexy=corexy)[C_MIN_RATE])
+        # With classic jerk a start has the jerk's speed, and no slow step.
+        self._start_hz = self._least_hz if firmware.junction == "deviation" else np.inf
         self._burst = 0.5 * firmware.block_buffer_size
         low_mm, high_mm = np.transpose(travel_mm)
         self._lattice = Lattice(
@@ -172,6 +176,7 @@ class MarlinEncoder:
             spare_steps=1.0,
             accel_mm_s2=command.accel_mm_s2,
             moves_per_s=rate,
+            fast_mm_s=command.speed_step_mm_s,
         )
 
     grid_mm = 1e-3
@@ -191,21 +196,64 @@ class MarlinEncoder:
         """
         own = cast(MarlinLimits, piece.limits_before)
         limits = stream_limits(own, self._command, self._mesh_slope)
-        on_steps = self._on_steps(timeline, segments, limits)
+        encoded, on_time = self._with_starts(piece, timeline, segments, limits, self._start_hz)
+        if on_time:
+            return encoded
+        # Better all of the motors' acceleration than a piece that is late.
+        return self._with_starts(piece, timeline, segments, limits, np.inf)[0]
+
+    def _with_starts(
+        self,
+        piece: Piece,
+        timeline: Timeline,
+        segments: Segments,
+        limits: MarlinLimits,
+        least_hz: float,
+    ) -> tuple[Encoded, bool]:
+        """Encode for starts from rest at a step rate; tell whether the motion keeps up."""
+        on_steps = self._on_steps(timeline, segments, limits, least_hz)
         segments = self._advanced(piece, timeline, on_steps)
         moves = interleave(piece, timeline, segments, 1)
         moves = self._where_the_file_says(piece, timeline, moves)
-        rows = moves.row
-        start = np.concatenate([moves.begin[None], moves.position[:-1]])
-        start_mm, end_mm = start / UNITS_PER_MM, moves.position / UNITS_PER_MM
-        ours = rows < 0
-        limits_id, table = limits_in_force(piece, rows, limits)
-        speed = np.where(ours, _DIAGONAL * self._fastest_mm_s, piece.moves.speed_mm_s[rows])
-        steps, path = self._blocks(start_mm, end_mm)
+        begin_s = float(timeline.start_s[0])
+        speed = np.where(moves.row < 0, self._fastest_mm_s, piece.moves.speed_mm_s[moves.row])
+        levels = StreamLevels(
+            moves,
+            limits,
+            self._command,
+            least_hz=least_hz,
+            ahead=self._firmware.block_buffer_size - 3,
+            corexy=self._corexy,
+        )
+        correction_s = np.zeros(len(moves.row))
+        while True:
+            in_force = limits_in_force(piece, moves.row, levels.limits, levels.level)
+            feedrate, phases = self._rates(moves, begin_s, speed, correction_s, *in_force)
+            raised = levels.raise_late(phases)
+            if not np.any(raised):
+                break
+            correction_s[raised] = 0.0
+        in_stream = levels.limits, levels.level
+        encoded = encoded_piece(timeline, moves, in_stream, feedrate, phases)
+        return _begun_late(encoded, moves, timeline), levels.keep_up(phases)
 
-        phases = self._plan(start_mm, end_mm, speed, limits_id, table)
+    def _rates(
+        self,
+        moves: Interleaved,
+        begin_s: float,
+        speed_mm_s: NDArray[np.float64],
+        correction: NDArray[np.float64],
+        limits_id: NDArray[np.int32],
+        limits: Sequence[Limits],
+    ) -> tuple[NDArray[np.float64], Phases]:
+        """Feedrates that keep the times of the segments, and the firmware's plan of them."""
+        ours, places = moves.row < 0, moves.places_mm()
+        start_mm, end_mm = places[:-1], places[1:]
+        steps, path = self._blocks(start_mm, end_mm)
+        fastest = np.where(ours, _DIAGONAL * speed_mm_s, speed_mm_s)
+        phases = self._plan(start_mm, end_mm, fastest, limits_id, limits)
         actual = phases.lasts_s
-        correction, feedrate, predicted = (np.zeros(len(rows)) for _ in range(3))
+        feedrate, predicted = np.zeros(len(ours)), np.zeros(len(ours))
         accel = self._command.accel_mm_s2
         floor_mm_s = np.sqrt(0.5 * accel * path / np.maximum(steps, 1.0))
         for attempt in range(_PASSES):
@@ -215,7 +263,7 @@ class MarlinEncoder:
                 path,
                 moves.end_s,
                 moves.planned_s,
-                speed,
+                fastest,
                 actual,
                 correction,
                 floor_mm_s,
@@ -224,21 +272,19 @@ class MarlinEncoder:
                 self._releases and self._firmware.junction == "classic_jerk",
                 self._firmware.step_timer_hz,
                 self._least_hz,
-                float(timeline.start_s[0]),
+                begin_s,
                 feedrate,
                 predicted,
             )
-            chosen = np.where(ours, feedrate / 60.0, speed)
-            phases = self._plan(start_mm, end_mm, chosen, limits_id, table)
+            chosen = np.where(ours, feedrate / 60.0, fastest)
+            phases = self._plan(start_mm, end_mm, chosen, limits_id, limits)
             actual = phases.lasts_s
             miss = actual - predicted
             if np.max(np.abs(np.cumsum(miss)), initial=0.0) < _TIME_TOLERANCE_S:
                 break
             # Rates have steps: a full correction would swing to and fro.
             correction[ours] += miss[ours] * (1.0 if attempt == 0 else 0.7)
-        return _begun_late(
-            encoded_piece(timeline, moves, limits, feedrate, phases), moves, timeline
-        )
+        return feedrate, phases
 
     def _advanced(self, piece: Piece, timeline: Timeline, segments: Segments) -> Segments:
         """Segments with linear advance in their filament.
@@ -295,13 +341,17 @@ class MarlinEncoder:
         position[last] = np.where(same, to_units(ends), position[last])
         return replace(moves, position=position, begin=to_units(piece.moves.start_mm[0]))
 
-    def _on_steps(self, timeline: Timeline, segments: Segments, limits: MarlinLimits) -> Segments:
+    def _on_steps(
+        self, timeline: Timeline, segments: Segments, limits: MarlinLimits, least_hz: float
+    ) -> Segments:
         """Put the vertices on whole steps, and leave out those that would be swallowed."""
         if len(segments) == 0:
             # X and Y of the whole piece move by less than a step.
             return segments
         scale = self._scale[:3]
-        wish = vertices_on_steps(self._lattice, timeline, segments)
+        gentle = gentle_accel_mm_s2(self._command, least_hz)
+        lattice = replace(self._lattice, fast_accel_mm_s2=gentle)
+        wish = vertices_on_steps(lattice, timeline, segments)
         steps = np.round(wish.end_mm[:3].T * scale).astype(np.int64)
         begin = np.round(timeline.group_start_mm[:, :3] * scale).astype(np.int64)
         keep = np.ones(len(wish), np.bool_)

@@ -177,7 +177,7 @@ class RepRapEncoder:
         places_mm = moves.places_mm()
         start_mm, end_mm = places_mm[:-1], places_mm[1:]
         ours = rows < 0
-        limits_id, limits = limits_in_force(piece, rows, self._limits)
+        limits_id, limits = limits_in_force(piece, rows, [self._limits], np.zeros_like(rows))
         length, accel, limit, junction = self._motion(start_mm, end_mm, limits_id, limits)
         speed = np.where(ours, limit, np.minimum(limit, piece.moves.speed_mm_s[rows]))
 

@@ -1,0 +1,194 @@
+"""Which acceleration each line of a stream runs under, so that the motors bear a start from rest.
+
+The first step from rest lasts as long as the least step rate lets it, and the second has the rate
+that the acceleration reaches meanwhile, up to the line's own (docs/marlin.md). So a line that is
+no faster than a motor's step of speed may start under any acceleration; a faster one gets as
+little as its place in the motion allows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stillpath.gcode.firmware.encoding import Interleaved
+from stillpath.gcode.firmware.marlin.limits import MarlinLimits
+from stillpath.gcode.types import Phases
+from stillpath.models.machine import CommandLimits
+
+__all__ = ["StreamLevels", "gentle_accel_mm_s2"]
+
+_WITHIN_S = 1e-3
+"""In which a motor bears its step of speed."""
+_RUNGS = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0)
+"""Accelerations that are tried, of the one that makes a gentle start; then comes the stream's."""
+_ROOM = 1.1
+"""Of what a line needs by the speeds around it."""
+_TRIES = 8
+"""Plans that are looked at; the last two give the most acceleration where one is late."""
+_BEHIND_MM, _TRAVEL_BEHIND_MM = 0.02, 0.06
+"""Where the motion falls behind by that, with filament or without, acceleration is too low."""
+_BEHIND = 3
+"""Lines before a late one that may be the reason."""
+
+
+def gentle_accel_mm_s2(bears: CommandLimits, least_hz: float) -> float:
+    """Return the acceleration from which a start from rest is a step of speed that a motor bears.
+
+    Parameters
+    ----------
+    bears : CommandLimits
+        Of one axis.
+    least_hz : float
+        The least step rate.
+    """
+    return min(bears.speed_step_mm_s / (1.0 / least_hz + _WITHIN_S), bears.accel_mm_s2)
+
+
+class StreamLevels:
+    """Levels of acceleration of a stream's lines, the gentle one first and the stream's own last.
+
+    Parameters
+    ----------
+    moves : Interleaved
+    stream : MarlinLimits
+    command : CommandLimits
+    least_hz : float
+        The least step rate, which a start from rest begins with.
+    ahead : int
+        How many lines the firmware knows when one begins, that one included.
+    corexy : bool
+
+    Attributes
+    ----------
+    limits : list of MarlinLimits
+    level : ndarray of int64, shape (n,)
+        Of every line, an index of `limits`.
+    """
+
+    def __init__(
+        self,
+        moves: Interleaved,
+        stream: MarlinLimits,
+        command: CommandLimits,
+        *,
+        least_hz: float,
+        ahead: int,
+        corexy: bool,
+    ) -> None:
+        bears = [command.of(axis) for axis in ("x", "y")]
+        gentle = np.array([gentle_accel_mm_s2(one, least_hz) for one in bears])
+        top = np.array([stream.accel_x_mm_s2, stream.accel_y_mm_s2])
+        rungs = [gentle * rung for rung in _RUNGS if np.all(gentle * rung < top)]
+        self.limits = [
+            *(replace(stream, accel_x_mm_s2=x, accel_y_mm_s2=y) for x, y in np.round(rungs)),
+            stream,
+        ]
+        self._ours, self._ahead, self._moves = moves.row < 0, ahead, moves
+        self._tries = 0
+        way = np.where(self._ours[:, None], np.diff(moves.places_mm(), axis=0)[:, :2], 0.0)
+        span_s = np.where(self._ours, np.maximum(moves.planned_s, 1e-6), 1.0)
+        motors = way @ np.array([[1.0, 1.0], [1.0, -1.0]]) if corexy else way
+        steps = np.array([one.speed_step_mm_s for one in bears])
+        self._speed_mm_s = np.hypot(*way.T) / span_s
+        self._feeds = np.diff(moves.places_mm()[:, 3]) > 0.0
+        self._fast = np.any(np.abs(motors) / span_s[:, None] > steps, axis=1)
+        deviation_mm = stream.junction_deviation_mm
+        needed = _needed(way, motors, span_s, self._ours, gentle, deviation_mm)
+        np.maximum(needed, self._to_stop(motors / gentle, span_s), out=needed)
+        levels = np.array([*(rung[0] for rung in rungs), np.inf]) / gentle[0]
+        self._least = np.where(self._ours, np.searchsorted(levels, _ROOM * needed), 0)
+        self.level = self._spread()
+
+    def raise_late(self, phases: Phases) -> NDArray[np.bool_]:
+        """Give more acceleration where the plan comes late; return which lines have got it.
+
+        Parameters
+        ----------
+        phases : Phases
+            The firmware's plan under these levels.
+        """
+        ours, top = self._ours, len(self.limits) - 1
+        behind = self._behind(phases)
+        around = np.zeros(len(ours), np.bool_)
+        for k in np.flatnonzero((behind > 1.0) & (np.diff(behind, prepend=0.0) > 0.2)).tolist():
+            around[max(k - _BEHIND, 0) : k + self._ahead] = True
+        self._tries += 1
+        around &= ours & (self._least < top) & (self._tries <= _TRIES)
+        self._least[around] = top if self._tries > _TRIES - 2 else self._least[around] + 1
+        self.level = self._spread()
+        return around
+
+    def keep_up(self, phases: Phases) -> bool:
+        """Tell whether a plan is not behind by more than twice what is looked at."""
+        return bool(np.all(self._behind(phases) < 2.0))
+
+    def _behind(self, phases: Phases) -> NDArray[np.float64]:
+        """How far lines end behind where they should, over what is too far, shape (n,)."""
+        ours = self._ours
+        first = ours & np.append(True, ~ours)[:-1]
+        lasts_s = phases.lasts_s
+        gained_s = np.cumsum(np.where(ours & ~first, lasts_s - self._moves.planned_s, 0.0))
+        begin = np.maximum.accumulate(np.where(first, np.arange(len(first)), 0))
+        most_mm = np.where(self._feeds, _BEHIND_MM, _TRAVEL_BEHIND_MM)
+        late_s = np.where(ours, gained_s - gained_s[begin], 0.0)
+        return np.asarray(late_s * self._speed_mm_s / most_mm)
+
+    def _to_stop(
+        self, motors: NDArray[np.float64], span_s: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Acceleration with which the lines that the firmware knows suffice to stop in."""
+        size = np.abs(motors).max(axis=1)
+        n, known = len(size), self._ahead - 1
+        passed = np.append(0.0, np.cumsum(size))
+        stop = np.minimum(np.arange(n) + known, n)
+        rests = np.append(np.flatnonzero(~self._ours), n)
+        nearer = rests[np.searchsorted(rests, np.arange(n))] <= stop
+        room = np.maximum(passed[stop] - passed[:-1], 1e-9)
+        asked = np.where(nearer, 0.0, 0.5 * (size / span_s) ** 2 / room)
+        needed = asked.copy()
+        for k in range(1, min(known, n)):
+            np.maximum(needed[k:], asked[:-k], out=needed[k:])
+        return needed
+
+    def _spread(self) -> NDArray[np.int64]:
+        """Levels of all lines: what they need, and slow ones no less than those before them."""
+        level = self._least.copy()
+        now = 0
+        for i in np.flatnonzero(self._ours).tolist():
+            now = int(level[i]) if self._fast[i] else max(now, int(level[i]))
+            level[i] = now
+        return level
+
+
+def _needed(
+    way: NDArray[np.float64],
+    motors: NDArray[np.float64],
+    span_s: NDArray[np.float64],
+    ours: NDArray[np.bool_],
+    gentle: NDArray[np.float64],
+    deviation_mm: float,
+) -> NDArray[np.float64]:
+    """Acceleration that each line needs to have its speed, over the gentle one.
+
+    A line speeds up within itself, and brakes within itself for the next; what turns at its begin
+    is borne like the curve that short moves are part of, or by junction deviation.
+    """
+    speed = np.hypot(*way.T) / span_s
+    heading = motors / np.maximum(speed * span_s, 1e-9)[:, None]
+    before, after = np.append(0.0, speed[:-1]), np.append(speed[1:], 0.0)
+    # From a stand and to one the mean speed is half of what is reached.
+    twice = (
+        np.append(1.0, np.where(ours[:-1], 1.0, 2.0)),
+        np.append(np.where(ours[1:], 1.0, 2.0), 2.0),
+    )
+    twice[0][0] = 2.0
+    ramp = np.maximum((speed - before) * twice[0], (speed - after) * twice[1]).clip(0.0)
+    along = ramp * np.abs(heading / gentle).max(axis=1) / span_s
+    turn = np.diff(heading, axis=0, prepend=heading[:1]) * np.minimum(speed, before)[:, None]
+    size = np.abs(turn / gentle).max(axis=1)
+    corner = (turn**2 / gentle).max(axis=1) / (8.0 * deviation_mm)
+    needed: NDArray[np.float64] = np.maximum(np.maximum(along, size / span_s), corner)
+    return needed
