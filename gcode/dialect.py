@@ -158,7 +158,7 @@ class Dialect:
     )
 
     def word(self, name: str) -> Word:
-        """Return what a command is."""
+        """Return how a command is handled."""
         found = self.words.get(name)
         if found is None and name[:1] == "T" and (len(name) == 1 or name[1] in "-0123456789"):
             found = self.words.get("T")

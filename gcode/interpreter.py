@@ -100,12 +100,12 @@ class Interpreter:
 
     @property
     def layer_z_mm(self) -> list[float]:
-        """Height of each layer as the slicer's marks say; NaN where they do not."""
+        """Height of each layer by the slicer's marks; NaN where they lack it."""
         return [float(z) for z in self.state.tables.layer_z[: int(self.state.i[at.I_LAYER]) + 1]]
 
     @property
     def warnings(self) -> list[str]:
-        """What the firmware passes over, or what nobody can know before it prints."""
+        """Commands that the firmware skips, or whose effect is unknown before the print."""
         return [f"line {line}: {text}" for text, line in self.state.warnings.items()]
 
     @property
@@ -125,7 +125,7 @@ class Interpreter:
         return int(self.state.i[at.I_KNOWN])
 
     def push(self, data: bytes) -> list[ProgramBlock]:
-        """Take the next bytes of the file; return what its whole lines say.
+        """Take the next bytes of the file; return the content of its complete lines.
 
         Raises
         ------
@@ -138,7 +138,7 @@ class Interpreter:
         return blocks
 
     def flush(self) -> list[ProgramBlock]:
-        """Take what is left as the last line; it may lack its newline."""
+        """Interpret the rest as the last line; it may lack its newline."""
         text = b"".join((*self._carry, _PAD))
         self._carry, self._carried = [], 0
         return self._read(text) if len(text) > PADDING else []

@@ -222,7 +222,7 @@ class _Fit:
         self._count += n
 
     def segments(self) -> Segments:
-        """Return what was fitted."""
+        """Return the fitted segments."""
         end_s, end_mm, groups = (
             a[..., : self._count] for a in (self._end_s, self._end_mm, self._groups)
         )

@@ -81,7 +81,7 @@ class Splitter:
         self._modal_id = 0
 
     def push(self, block: ProgramBlock) -> Iterator[Piece | VerbatimPart]:
-        """Take a block; yield what is complete."""
+        """Take a block; yield complete parts."""
         self._append(block)
         yield from self._cut(final=False)
 

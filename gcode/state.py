@@ -55,7 +55,7 @@ class Retraction:
 
     @classmethod
     def of(cls, facts: FirmwareRetraction) -> Retraction:
-        """Return what the machine's document says."""
+        """Return the retraction of the machine's document."""
         return cls(
             facts.retract_length_mm,
             facts.retract_speed_mm_s,
@@ -192,7 +192,7 @@ class MachineState:
         return self.event(EventKind.MODE) if status == at.DONE else status
 
     def home(self, axes: int, home_mm: tuple[float, float, float] | None) -> None:
-        """Give axes their G-code origin back and, if the machine says it, their place."""
+        """Restore the G-code origin of axes and, if the machine states it, their place."""
         f, i = self.f, self.i
         self.settle()
         f[at.F_LAST : at.F_LAST + 4] = f[at.F_TOOL : at.F_TOOL + 4]

@@ -91,6 +91,6 @@ def _axis_text(machine: Machine, axis: Literal["x", "y"]) -> str:
 
 
 def um_text(value: float, digits: int = 2) -> str:
-    """Return micrometres with so many significant digits, but never with an exponent of ten."""
+    """Return micrometres rounded to significant digits, never with an exponent of ten."""
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+" in text else text

@@ -62,7 +62,7 @@ class Designed:
 
 
 def design_controller(spec: LoopSpec, options: ControllerOptions) -> Designed:
-    """Design an add-on for a closed-loop machine, and simulate what it is good for.
+    """Design an add-on for a closed-loop machine, and simulate its effect.
 
     Raises
     ------

@@ -67,7 +67,7 @@ def charted(title: str, note: str, chart: Chart, *, wide: bool = False) -> Figur
 
 
 def short(value: float) -> str:
-    """Return a number with three digits; below 1e-9, what is left of rounding, as 0."""
+    """Return a number with three digits; rounding residues below 1e-9 as 0."""
     if abs(value) < 1e-9:
         return "0"
     return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 else f"{value:.1e}"

@@ -166,7 +166,7 @@ class _Designed:
     ladder: tuple[RungFigures, ...]
 
     def figures(self, settings: DesignSettings) -> dict[str, Any]:
-        """Return what a report says of them."""
+        """Return the figures of the report."""
         plants, lifted = self.plants, self.lifted
         window = round(settings.window_s / settings.dt_s)
         guarded = lifted.weights if self.mode == "minimax" else plants.weights

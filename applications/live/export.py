@@ -26,7 +26,7 @@ _DIGITS = 12
 
 
 def write_export(machine: Machine, target: Path, cache_dir: Path | None = None) -> dict[str, Any]:
-    """Design the filter of a machine and write it, whole or not at all; return what was written.
+    """Design the filter of a machine, write it whole or not at all, and return it.
 
     Raises
     ------

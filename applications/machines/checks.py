@@ -218,7 +218,7 @@ def _refuse_limits_by_axis(config: PrinterConfig) -> None:
 
 
 def not_followed(config: PrinterConfig) -> list[str]:
-    """Return a line for each file that the configuration includes: nobody looked into it."""
+    """Return a warning for each file that the configuration includes, as none is read."""
     return [
         f"[include {name}] in {config.name}: not followed; its contents were not checked"
         for name in config.includes
@@ -231,7 +231,7 @@ def stated_axis(f_hz: float, zeta: float) -> dict[str, Any]:
 
 
 def derived_envelope(machine: Machine) -> CommandLimits:
-    """Return what the motors are taken to bear, from what the printer allows a file.
+    """Return the limits assumed for the motors, from those that the printer sets for a file.
 
     A little more than that, since a command has to lead the nozzle; who knows more says so in the
     machine's `command`. Where the printer states X and Y apart, so do `axes`; the motors of a

@@ -132,7 +132,7 @@ def parse_printer_config(text: str, name: str) -> PrinterConfig:
 
 
 def facts(config: PrinterConfig) -> list[Fact]:
-    """Return what a configuration says, Klipper's defaults where it says nothing.
+    """Return the facts of a configuration, with Klipper's defaults for missing ones.
 
     Sections that are missing altogether while other files are included say nothing.
     """

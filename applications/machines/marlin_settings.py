@@ -60,7 +60,7 @@ def looks_like_m503(text: str) -> bool:
 
 
 def firmware_section(text: str, name: str) -> dict[str, Any]:
-    """Return the fields of a Marlin section that a printed M503 says, without those it does not.
+    """Return those fields of a Marlin section that a printed M503 contains.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def machine_from_m503(
     kinematics: str = "cartesian",
     fields: Sequence[str] = (),
 ) -> Machine:
-    """Return a machine with the limits that M503 says and plants that were not measured.
+    """Return a machine with the limits of M503 and unmeasured plants.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def machine_from_m503(
 
 
 def with_m503(machine: Machine, text: str, file: str) -> Machine:
-    """Return a machine with the limits of a printed M503; what that does not say stays.
+    """Return a machine with the limits of a printed M503; those it lacks remain.
 
     A machine of another firmware becomes one with Marlin, with what most builds have (`ASSUMED`)
     where M503 says nothing.
@@ -196,7 +196,7 @@ def with_m503(machine: Machine, text: str, file: str) -> Machine:
 
 
 def read_travel(text: str) -> tuple[float, float, float]:
-    """Return what ``235x235x250`` says, in mm."""
+    """Parse a travel such as ``235x235x250``, in mm."""
     parts = re.split(r"[x,]", text.strip().lower())
     try:
         x, y, z = map(float, parts)

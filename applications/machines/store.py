@@ -176,7 +176,7 @@ class MachineStore:
         message: str = "",
         sources: Sequence[SourceFile] = (),
     ) -> Revision:
-        """Remember what a ring test said of axes, on top of whatever else has changed.
+        """Store a ring test's verdict on axes, on top of whatever else has changed.
 
         If that is a change of the plants, the confirmation names those it was of, and is stale.
         """

@@ -178,7 +178,7 @@ class _Axis:
         self._reasons.append(reason)
 
     def add(self, source: SourceFile, log: AxisLog | None) -> None:
-        """Take a log, or say why it does not count."""
+        """Add a log, or record why it does not count."""
         reason = self._unusable(source.name, log)
         if reason:
             self._reasons.append(reason)

@@ -52,7 +52,7 @@ class AxisMotion:
 
 
 def judge(axis: AxisMotion, dt_s: float) -> AxisReadback:
-    """Compare, identify, and say what it means.
+    """Compare, identify, and judge.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ def levels_of(text: str) -> list[Level]:
 
 
 def borne(levels: list[Level], console: str, full_step: int) -> int:
-    """Return how many levels the motors bore, from what the console said.
+    """Return how many levels the motors passed, from the console's answers.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def borne(levels: list[Level], console: str, full_step: int) -> int:
 
 
 def envelope(machine: Machine, level: Level, margin: float) -> CommandLimits:
-    """Return what the machine may ask of motors that bore a level."""
+    """Return the machine's limits for motors that passed a level."""
     changed: dict[str, object] = {
         "accel_mm_s2": round(margin * level.accel_mm_s2),
         "speed_step_mm_s": round(margin * level.speed_step_mm_s, 1),

@@ -124,7 +124,7 @@ def read_axis(
     predicted: Array,
     axis: Axis,
 ) -> AxisLog | None:
-    """Return what a log says of an axis; None if it was taken at another time of the file.
+    """Return the ringing of an axis in a log; None if it was taken at another time of the file.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def residual(accel: Array, stops: Sequence[Stop], band: Band) -> Power:
 
 
 def floor(log: AxisLog, motion: RingMotion, band: Band) -> Power:
-    """Return the same while the machine stands before its first move: what is not its doing."""
+    """Return the same before the first move: vibration that the machine does not cause."""
     length_s = WINDOW_S[1] - WINDOW_S[0]
     starts = [
         start

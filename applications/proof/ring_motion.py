@@ -83,7 +83,7 @@ class RingMotion:
 
 
 def is_ring_test(printed: Path) -> bool:
-    """Whether a file says of itself that it is a ring test."""
+    """Whether a file is marked as a ring test."""
     with printed.open("rb") as file:
         return file.read(_HEAD_BYTES).startswith(f"; {TITLE}".encode())
 

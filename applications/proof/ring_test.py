@@ -246,7 +246,7 @@ def region(axis: Axis, part: str) -> str:
 
 
 def plants_line(axis: Axis, digest: str) -> str:
-    """Return what the file's first lines say of the plants of an axis."""
+    """Return the plants of an axis as the file's first lines describe them."""
     return f"plants of {axis}: {digest}"
 
 

@@ -185,7 +185,7 @@ class _Prefilter:
             self.preview = 64
 
     def figures(self) -> dict[str, Any]:
-        """Return what a report says of it."""
+        """Return the figures of the report."""
         return {
             "prefilter": self.label,
             "preview_samples": self.preview,

@@ -164,7 +164,7 @@ class BinaryGcode:
         target.writelines(self._renewed(block) for block in self._after)
 
     def facts(self) -> SlicerFacts:
-        """Return what the metadata say about the file."""
+        """Return the facts in the metadata of the file."""
         return facts_in(self._head(thumbnails=False), self._tail())
 
     def write_plain(self, text: BinaryIO, target: BinaryIO) -> None:

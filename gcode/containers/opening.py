@@ -47,13 +47,13 @@ class Container:
     _packed: BinaryGcode | ThreeMf | None
 
     def facts(self) -> SlicerFacts:
-        """Return what the file says about itself, in its text or around it."""
+        """Return the facts that the file states about itself, in its text or container."""
         if isinstance(self._packed, BinaryGcode):
             return self._packed.facts()
         return read_facts(self.text)
 
     def delay(self, seconds: float) -> None:
-        """Take note that the print takes longer than the container says it does."""
+        """Record that the print takes longer than the container states."""
         if self._packed is not None:
             self._packed.delay_s = seconds
 

@@ -50,18 +50,18 @@ _SUFFIXES = {
 
 
 def sniff(path: Path) -> Kind:
-    """Return what a file is, by its magic number; text if it has none."""
+    """Return the kind of a file by its magic number; text if it has none."""
     with path.open("rb") as file:
         return kind_of(file.read(4))
 
 
 def kind_of(head: bytes) -> Kind:
-    """Return what a file is that begins with these four bytes; text if they are no magic number."""
+    """Return the kind of a file by its first four bytes; text if they are no magic number."""
     return _MAGICS.get(head[:4], Kind.TEXT)
 
 
 def foreign(path: Path) -> str | None:
-    """Return what a file is that is known and certainly no print file; None of any other."""
+    """Return the kind of a file that is certainly no print file; None for any other."""
     with path.open("rb") as file:
         head = file.read(_STL_HEAD_BYTES)
     size = path.stat().st_size
@@ -73,5 +73,5 @@ def foreign(path: Path) -> str | None:
 
 
 def kind_named(path: Path) -> Kind | None:
-    """Return what a file to be written shall be by its name; None if the name does not say."""
+    """Return the kind of an output file by its name; None if the name does not show it."""
     return _SUFFIXES.get(path.suffix.lower())

@@ -109,7 +109,7 @@ class SlicerFacts:
 
 
 def read_facts(file: BinaryIO) -> SlicerFacts:
-    """Read what a text file says about itself; its position stays.
+    """Read the facts that a text file states about itself; its position stays.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def read_facts(file: BinaryIO) -> SlicerFacts:
 
 
 def facts_in(head: bytes, tail: bytes = b"") -> SlicerFacts:
-    """Return what the two ends of a text say."""
+    """Return the facts in the two ends of a text."""
     estimate_s = _estimate_s(head, tail)
     # Nearly all of it are moves, which no pattern below looks at.
     head, tail = _comments(head), _comments(tail)

@@ -178,7 +178,7 @@ class _Times:
         self._total_s = {silent: _total(told_s, silent=silent) for silent in (False, True)}
 
     def line(self, line: bytes, offset: int, late_s: float) -> bytes:
-        """Return a line that stands at `offset` and comes so much later than in the original."""
+        """Return the line at `offset` with its times updated; it comes `late_s` later."""
         written, done = b"", 0
         for field in read_times(line):
             written += line[done : field.start] + field.written(self._time(field, offset, late_s))
