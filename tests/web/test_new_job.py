@@ -55,7 +55,7 @@ def test_an_upload_becomes_a_report(visitor: Visitor, tmp_path: Path):
     progress = page.get_by_role("progressbar", name="Progress")
     expect(progress.or_(page.locator(".headline")).first).to_be_visible()
     visitor.shoot(page, "progress")
-    expect(page.locator(".headline")).to_contain_text("explain the machine's measurement")
+    expect(page.locator(".headline")).to_contain_text("explain what is known of the machine")
     before, after = (page.locator(f".headline .{name}") for name in ("before", "after"))
     low, high = map(float, after.inner_text().split(" to "))
     assert low < float(before.inner_text()) / 3
@@ -230,7 +230,7 @@ def test_a_key_is_asked_for_and_goes_along(guarded: Service, visitor: Visitor, t
     page.get_by_label("Key", exact=True).fill(KEY)
     page.get_by_role("button", name="Use this key").click()
     hand_in(page, file)
-    expect(page.locator(".headline")).to_contain_text("explain the machine's measurement")
+    expect(page.locator(".headline")).to_contain_text("explain what is known of the machine")
     expect(page.locator(".stage:not([aria-busy])")).to_be_visible()
     with page.expect_download() as download:
         page.get_by_role("link", name=re.compile("^G-code")).click()

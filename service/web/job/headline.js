@@ -26,7 +26,7 @@ export function headline(report, channels) {
     rms.after !== undefined
       ? h("div.figure.first", null, h("p.label", null, label),
         h("p.big", null, h("span.before", null, um(rms.before)), h("span.to", { "aria-hidden": "true" }, " → "), h("span.sr", null, " to "), h("span.after", null, said("after")), h("small", null, "\u00a0µm")),
-        h("p.note", null, ranges.after ? `predicted, by all plants that explain the machine's measurement; ${um(rms.after)} by the one in the middle` : ratio >= LEAST_RATIO ? `${ratio >= 10 ? ratio.toFixed(0) : ratio.toFixed(1)} times smaller than as sliced` : "no smaller than as sliced"))
+        h("p.note", null, ranges.after ? `predicted, by all plants that explain what is known of the machine; ${um(rms.after)} by the one in the middle` : ratio >= LEAST_RATIO ? `${ratio >= 10 ? ratio.toFixed(0) : ratio.toFixed(1)} times smaller than as sliced` : "no smaller than as sliced"))
       : h("div.figure.first", null, h("p.label", null, label),
         h("p.big", null, h("span.before", null, um(rms.before)), h("small", null, "\u00a0µm")), h("p.note", null, "as sliced")),
     rms.shaper === undefined ? null
