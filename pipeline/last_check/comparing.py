@@ -237,7 +237,7 @@ class LastCheck:
             self._filament_mm,
         )
         written.line += lines
-        if taken and wanted.code in self._original.perhaps:
+        if taken and wanted.code in self._original.perhaps and not self._is_wanted(wanted, found):
             self._take_earlier(wanted.code, carried_out=found == at.SAME)
             return
         if taken:
@@ -264,6 +264,14 @@ class LastCheck:
             written.skip(end + 1)
             if self._streaming and self._wanted is None:
                 self._take_harmless()
+
+    def _is_wanted(self, wanted: Wanted, found: int) -> bool:
+        """Whether a line is the one waited for and no earlier one with its text.
+
+        Where place and filament are as the original has them there, it does the same in any case.
+        """
+        counted = not np.isnan(self._before.state[at.FED] + self._after.state[at.FED])
+        return found == at.SAME and counted and wanted.kind is Kind.RESTS
 
     def _takes_line(self, line: bytes, wanted: Wanted) -> bool:
         """Take a line that is no move of ours, unless the one waited for came before."""

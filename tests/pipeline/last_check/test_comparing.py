@@ -442,9 +442,30 @@ G1 X50 E3
 CONDITION = SUBCODE.replace("G0.837 E0.5", "if {x}\n G1 F7200") + "G1 Y50 E4\n"
 
 
+LIFTED = """\
+M204 S3000
+G1 X{0} Y100 F9000
+G1 Z.2
+G1 E.75 F1800
+M204 S1000
+G1 X{1} Y100 E.5 F2400
+G1 X{1} Y{2} E.005
+M204 S3000
+G1 E-.75 F3000
+G1 Z.6 F18000
+"""
+LIFTED_AGAIN = (
+    "G28\nM83\nG1 Z.2 F6000\nG1 X90 Y100\nG1 E-.75 F3000\nG1 Z.6\n"
+    + "".join(LIFTED.format(100 + 5 * k, 110 + 5 * k, y) for y in (100.1, 104) for k in range(3))
+    + "G1 X50 Y50\nM105\n"
+)
+
+
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
+        # A retraction is the one waited for, though those before it might have moved X and Y.
+        pytest.param("marlin", LIFTED_AGAIN, id="lifted again"),
         # Filament is counted anew at a line between two streams.
         pytest.param("marlin", FILAMENT, id="filament"),
         # A line that stands still moves what the short one before it left.
