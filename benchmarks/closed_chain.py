@@ -8,6 +8,9 @@ Klipper's rules recommend from the same table; and the shaper tuned by brute for
 own linear part, which nobody has. Contour error while extruding.
 
     python benchmarks/closed_chain.py --printers 30 --from spectra
+
+Between measurement and print the printer may change: `--load-kg` lies on the bed of a bed slinger,
+`--belts` scales the stiffness of all belts.
 """
 
 from __future__ import annotations
@@ -19,11 +22,12 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from firmwares import machine_with, without_macros
 from numpy.typing import NDArray
 from readback import (
     DT_S,
@@ -73,6 +77,8 @@ _EVERY = 20
 _TUNE_S = 40.0
 _GOALS = {"spectra": (0.6, 1.05), "raw": (0.45, 1.0), "typed": (1.0, 1.05)}
 _TYPED_ZETA = 0.07
+OTHERS = ("marlin", "reprapfirmware")
+_STEPS_PER_MM, _MIN_STEPS = 80.0, 6
 _NOTHING = 0.8
 
 
@@ -87,6 +93,9 @@ class Task:
     seconds: float
     oracle: bool
     max_accel_mm_s2: float | None = None
+    firmware: str = "klipper"
+    load_kg: float = 0.0
+    belts: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +161,9 @@ def main() -> int:
         type=float,
         help="of printer.cfg; the motors bear what follows from it (default: the built-in limits)",
     )
+    parser.add_argument("--firmware", choices=("klipper", *OTHERS), default="klipper")
+    parser.add_argument("--load-kg", type=float, default=0.0, help="on the bed, after measuring")
+    parser.add_argument("--belts", type=float, default=1.0, help="stiffness after, over before")
     parser.add_argument("--oracle", action="store_true", help="tune shapers on the truth as well")
     parser.add_argument("--shared", type=Path, help="default: $STILLPATH_SHARED or ../shared")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
@@ -163,6 +175,10 @@ def main() -> int:
     print(f"{head}{'/recom.':>8}{'/none':>7}{'predicted':>14}  recommended", flush=True)
     with tempfile.TemporaryDirectory(prefix="stillpath-chain-") as folder:
         files = tuple(plain_copy(find_input(name, shared), Path(folder)) for name in given.files)
+        if given.firmware != "klipper":
+            plain = Path(folder, "plain")
+            plain.mkdir()
+            files = tuple(without_macros(file, plain) for file in files)
         tasks = [
             Task(
                 kind,
@@ -172,6 +188,9 @@ def main() -> int:
                 given.seconds,
                 given.oracle,
                 given.max_accel_mm_s2,
+                given.firmware,
+                given.load_kg,
+                given.belts,
             )
             for seed in range(given.first, given.first + given.printers)
             for kind in KINDS
@@ -222,7 +241,10 @@ def judged(task: Task) -> list[Row]:
     printer = draw(task.kind, task.seed)
     rng = np.random.default_rng([KINDS.index(task.kind), task.seed, 1])
     base = limited(load_machine(BASES[task.kind]), task.max_accel_mm_s2)
+    if task.firmware != "klipper":
+        base = machine_with(BASES[task.kind], task.firmware, _STEPS_PER_MM, min_steps=_MIN_STEPS)
     machine, shapers, note = identified(printer, base, task.source, rng)
+    printer = changed(printer, task.load_kg, task.belts)
     rows = []
     for file in task.files:
         own = read_motion(file, base)
@@ -253,6 +275,22 @@ def judged(task: Task) -> list[Row]:
             )
         )
     return rows
+
+
+def changed(printer: Printer, load_kg: float, belts: float) -> Printer:
+    """Return the printer with a load on its bed, if that moves, and all belts as stiff as said."""
+    bodies = printer.bodies
+    masses = {
+        name: mass_kg + load_kg * (name == "bed") for name, mass_kg in bodies.masses_kg.items()
+    }
+    elements = tuple(
+        # A belt is what lies between a rotor and something else.
+        replace(one, k_n_m=belts * one.k_n_m)
+        if len(one.along) > 1 and any(name.startswith("rotor") for name in one.along)
+        else one
+        for one in bodies.elements
+    )
+    return replace(printer, bodies=replace(bodies, masses_kg=masses, elements=elements))
 
 
 def limited(base: Machine, max_accel_mm_s2: float | None) -> Machine:

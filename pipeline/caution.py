@@ -8,6 +8,7 @@ bad for any. How much worse the worst member fares is stored with the choice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -53,7 +54,7 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 Pair: TypeAlias = tuple[DiscretePlant, DiscretePlant]
 
-_VERSION = 9
+_VERSION = 10
 _SHARES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2, 0.0)
 _UNSEEN_SHARE = 0.85
 """Largest share where the phase was not measured: a set cannot warn of what it does not contain."""
@@ -65,6 +66,8 @@ _COARSE_UM, _LEAST_FIT = 4.0, 0.5
 share of it below: on a well known machine they would otherwise be the larger error."""
 _FRICTION_UNSURE = 0.25
 """Relative error of friction identified from logs: often 10 % on virtual printers, seldom 25 %."""
+_STEPS_UNSURE = 0.2
+"""How much more or less than the nominal plants other plants make of whole motor steps."""
 _LAG_UNSURE_S = 1.5e-4
 """Unknown delay of X against Y: alignment sets both to 0, but viscous guides may delay one."""
 _STRIDE = 5
@@ -89,6 +92,8 @@ class Choice:
     ranges : dict
         By channel of a report, least and largest contour error of the members (delays and all)
         against the nominal plants' with the same command.
+    reference_um : dict
+        By channel, the nominal plants' contour error.
     """
 
     shares: tuple[float, float]
@@ -97,6 +102,7 @@ class Choice:
     worst_to_none: float
     rms_um: float
     ranges: dict[str, tuple[float, float]] = field(default_factory=dict)
+    reference_um: dict[str, float] = field(default_factory=dict)
 
     @property
     def fit_share(self) -> float:
@@ -108,12 +114,30 @@ class Choice:
             return _LEAST_FIT
         return float(np.clip(self.rms_um / _COARSE_UM, _LEAST_FIT, 1.0))
 
-    def ranged(self, channel: Channel) -> Channel:
-        """Return a channel of a report with the range over the members."""
-        if channel.name not in self.ranges:
-            return channel
-        low, high = (channel.judged_rms_um * s for s in self.ranges[channel.name])
-        return channel.model_copy(update={"contour_range_um": (low, high)})
+    def ranged(self, channels: Sequence[Channel], *, steps: bool) -> list[Channel]:
+        """Return the channels of a report with the range over the members.
+
+        Members differ in what they make of a command. What a firmware that moves in whole motor
+        steps adds to it is much the same for all of them: what is above the command's own error,
+        which follows from the reference motion and from how much harder this print shakes.
+        """
+        before_um = next(c.judged_rms_um for c in channels if c.name == "before")
+        harder = before_um / max(self.reference_um.get("before", 0.0), 1e-9)
+        found = []
+        for channel in channels:
+            if channel.name in self.ranges:
+                all_um = channel.judged_rms_um
+                own_um = min(all_um, harder * self.reference_um[channel.name]) if steps else all_um
+                rounded_um = math.sqrt(all_um**2 - own_um**2)
+                low, high = self.ranges[channel.name]
+                least, most = 1.0 - _STEPS_UNSURE, 1.0 + _STEPS_UNSURE
+                um = (
+                    math.hypot(low * own_um, least * rounded_um),
+                    math.hypot(high * own_um, most * rounded_um),
+                )
+                channel = channel.model_copy(update={"contour_range_um": um})
+            found.append(channel)
+        return found
 
 
 def measured_set(axis: PlantSetSpec) -> bool:
@@ -266,7 +290,20 @@ def _tried(machine: Machine, shaper: BestShaper, dt_s: float, basis: str) -> Cho
         "after": against_friction(mixed, machine.friction_mm, _NO_RESTS, dt_s),
         "shaper": commands[1],
     }
-    return replace(best, ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s))
+    return replace(
+        best,
+        ranges=error_ranges(machine, channels, lambda y: rms(y[:, at]), dt_s),
+        reference_um={
+            name: 1e3 * rms(_nominal(machine, command, dt_s)[:, at])
+            for name, command in channels.items()
+        },
+    )
+
+
+def _nominal(machine: Machine, command: Array, dt_s: float) -> Array:
+    """Return what the nominal plants make of a command, dry friction included."""
+    pair = [plant_set(machine.axes[axis], dt_s).nominal for axis in ("x", "y")]
+    return response(pair, _received(machine, command))
 
 
 def _commands(
@@ -322,14 +359,13 @@ def error_ranges(
         From positions (2, n) to their error.
     """
     x, y = (plant_set(machine.axes[axis], dt_s) for axis in ("x", "y"))
-    nominal = (x.nominal, y.nominal)
     pairs = _side_by_side(x.members, y.members)
     sides = np.where(np.arange(len(pairs)) % 2, 1.0, -1.0)
     # A set of plants without measured phase holds delays of its own.
     lag_s = 0.0 if any(map(_unseen, machine.axes.values())) else _LAG_UNSURE_S
     out = {}
     for name, command in commands.items():
-        usual = max(rms(response(nominal, _received(machine, command))), 1e-12)
+        usual = max(rms(_nominal(machine, command, dt_s)), 1e-12)
         found = []
         for pair, side in zip(pairs, sides, strict=True):
             received = _received(machine, command, 1.0 + _FRICTION_UNSURE * side)

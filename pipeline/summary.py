@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.firmware.writing import StreamWriter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.slicers.facts import SlicerFacts
@@ -96,7 +97,8 @@ class Summary:
                 c.model_copy(update={"selected_rms_um": rms_um.get(c.name)}) for c in channels
             ]
         if self.choice is not None:
-            channels = [self.choice.ranged(channel) for channel in channels]
+            steps = any(adapter(self.machine).step_mm[:2])
+            channels = self.choice.ranged(channels, steps=steps)
         return channels
 
     def _warnings(self, channels: list[Channel]) -> Iterator[str]:
