@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from stillpath.models.machine import Machine
 from stillpath.pipeline.last_check import _reader_kernels as at
-from stillpath.pipeline.last_check.errors import LastCheckError
+from stillpath.pipeline.last_check.errors import LastCheckError, shown
 from stillpath.pipeline.last_check.original import ALL, Original, Place, Text, Wanted
-from stillpath.pipeline.last_check.reader import NAN, Kind, Reader, code_of, tells_times
+from stillpath.pipeline.last_check.reader import NAN, Kind, Reader, code_of, is_same
 from stillpath.pipeline.last_check.rules import rules_of
 from stillpath.pipeline.result import LastCheckFigures
 
@@ -31,7 +31,6 @@ __all__ = ["LastCheck"]
 _PLACE_MM, _FILAMENT_MM = 1e-5, 1e-4
 _MOST_IDLE = 1 << 10
 _SHOWN = 5
-_SHOWN_CHARACTERS = 60
 _ON, _HELD = b"; stillpath: stream on", b"; stillpath, held back: "
 _OFF = re.compile(rb"; stillpath: stream off(?:, line (\d+) of the original)?\s*$")
 _NAMES = ("x", "y", "z", "the extruder", "filament fed", "F", "", "relative", "relative E")
@@ -205,7 +204,7 @@ class LastCheck:
                 self._begun.append(self._original.place())
             return
         expected = self._original.peek()
-        if _is_same(code, expected):
+        if is_same(code, expected):
             _, mask = self._before.carry_out(expected)
             self._after.carry_out(code)
             self._check(self._before.state, mask, code, original.line)
@@ -300,7 +299,7 @@ class LastCheck:
     def _takes(self, code: bytes, *, held_back: bool) -> bool:
         """Take a line of a stream for one of the original, if it is one."""
         wanted, perhaps = self._wanted, self._original.perhaps
-        if wanted is not None and _is_same(code, wanted.code) and code not in perhaps:
+        if wanted is not None and is_same(code, wanted.code) and code not in perhaps:
             compared = wanted.kind is Kind.RESTS and not held_back
             if compared:
                 # Before it too: where E is absolute, what was fed too much comes back with it.
@@ -318,7 +317,7 @@ class LastCheck:
                 pass
             if not held_back:
                 self._after.carry_out(code)
-            if wanted is not None and _is_same(code, wanted.code):
+            if wanted is not None and is_same(code, wanted.code):
                 self._earlier.append(wanted.code)
                 self._count_anew()
             self._kept += 1
@@ -451,7 +450,7 @@ class LastCheck:
 
     def _close_gap(self, until: str) -> None:
         line, self._gap_line = self._gap_line, 0
-        why = _shown(self._before.lost) or "no line has named one yet"
+        why = shown(self._before.lost) or "no line has named one yet"
         if len(self._gaps) < _SHOWN:
             self._gaps.append(
                 f"from line {line} up to {until}: filament and modes only, since the position is "
@@ -475,7 +474,7 @@ class LastCheck:
             limit = float(self._place_mm[found])
         unit = _UNITS[found] and " " + _UNITS[found]
         return LastCheckError(
-            f"{where} {_shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
+            f"{where} {shown(code)!r} {_NAMES[found]} is {other:.7g}{unit}, in the original "
             f"{one:.7g}{unit}; they may differ by {limit:.3g}{unit}",
             line,
             written_line,
@@ -483,24 +482,14 @@ class LastCheck:
 
     def _missing(self, line: int, code: bytes) -> LastCheckError:
         return LastCheckError(
-            f"a line of the original is missing ({_shown(code)!r})", line, self._written.line
+            f"a line of the original is missing ({shown(code)!r})", line, self._written.line
         )
 
     def _strange(self, code: bytes, expected: bytes) -> LastCheckError:
-        wanted = repr(_shown(expected)) if expected else "the end of the file"
+        wanted = repr(shown(expected)) if expected else "the end of the file"
         return LastCheckError(
-            f"{_shown(code)!r} is not what comes next in the original ({wanted}), and no line that "
+            f"{shown(code)!r} is not what comes next in the original ({wanted}), and no line that "
             "Stillpath adds there",
             self._original.text.line,
             self._written.line,
         )
-
-
-def _is_same(code: bytes, expected: bytes) -> bool:
-    """Whether a line is that of the original; the times of M73 are new."""
-    return code == expected or (tells_times(code) and tells_times(expected))
-
-
-def _shown(line: bytes) -> str:
-    text = line.strip().decode("utf-8", "replace")
-    return text if len(text) <= _SHOWN_CHARACTERS else text[: _SHOWN_CHARACTERS - 3] + "..."

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["LastCheckError"]
+__all__ = ["LastCheckError", "shown"]
+
+_LONGEST = 60
 
 
 class LastCheckError(Exception):
@@ -37,3 +39,9 @@ def _rebuilt(text: str, line: int, written_line: int, reason: str) -> LastCheckE
     error = LastCheckError(reason, line, written_line)
     error.args = (text,)
     return error
+
+
+def shown(line: bytes) -> str:
+    """Return a line as a message quotes it, cut if it is long."""
+    text = line.strip().decode("utf-8", "replace")
+    return text if len(text) <= _LONGEST else text[: _LONGEST - 3] + "..."
