@@ -37,10 +37,14 @@ from stillpath.pipeline.result import (
 )
 from stillpath.simulation.measures import ContourErrors, GroupTally, MotionMeter, Tally
 
-__all__ = ["STRIDE", "Measurement", "channel_names"]
+__all__ = ["CHANNELS", "STRIDE", "UNCHANGED_CHANNELS", "Measurement"]
 
 Array = NDArray[np.float64]
 
+CHANNELS = ("before", "after", "shaper")
+"""The measured channels, in the order of all tables."""
+UNCHANGED_CHANNELS = ("before", "shaper")
+"""Those of a file that is not compensated."""
 STRIDE = 6
 """Contour errors are measured at every sixth sample, since they change over tens of samples; maxima
 of the written motion are searched between them, too (`maxima`)."""
@@ -59,13 +63,13 @@ class Measurement:
     shaper : BestShaper
         The reference shaper.
     names : tuple of str
-        Channels, of those that `channel_names` has. Without `after`, `before` is the executed
-        motion: the firmware's own shaper may be in it.
+        Which of `CHANNELS`. Without `after`, `before` is the executed motion: the firmware's own
+        shaper may be in it.
     earlier : EarlierErrors, optional
         Keeps the errors of `before` and `shaper` where they are measured; where `after` is, gives
         them back for what is shown along the path.
     take_layer : callable, optional
-        Is given every layer as soon as it is measured; channels as `channel_names` has them.
+        Is given every layer as soon as it is measured.
     trace : callable, optional
         Is given the motion. Errors are then measured at every sample.
     size : int, optional
@@ -77,7 +81,7 @@ class Measurement:
         machine: Machine,
         dt_s: float,
         shaper: BestShaper,
-        names: tuple[str, ...],
+        names: tuple[str, ...] = CHANNELS,
         *,
         take_layer: Callable[[LayerTile], None] | None = None,
         trace: Callable[[Trace], None] | None = None,
@@ -93,8 +97,7 @@ class Measurement:
         self._dt_s = dt_s
         self._band = BandContent(machine, dt_s)
         self._names = names
-        shown = channel_names(compensated=True) if self._beside else names
-        self._shown = shown
+        self._shown = shown = CHANNELS if self._beside else names
         self._meter = MotionMeter(dt_s, stride=self._stride, channels=len(names))
         self._layers, self._features = (GroupTally(len(names)) for _ in range(2))
         exact = names.index("after") if self._stride > 1 and compensated else None
@@ -293,11 +296,6 @@ class Measurement:
             "spectra": self.spectra(),
             "layer_views": self.layer_views(),
         }
-
-
-def channel_names(*, compensated: bool) -> tuple[str, ...]:
-    """Return the names of the measured channels, in the order of all tables."""
-    return ("before", "after", "shaper") if compensated else ("before", "shaper")
 
 
 class _Bins:

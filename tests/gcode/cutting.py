@@ -8,17 +8,24 @@ from pathlib import Path
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pieces import Piece, VerbatimPart
 from stillpath.gcode.splitter import Splitter
+from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.store import load_machine
 from stillpath.pipeline.options import Options
 from stillpath.pipeline.piece_compensator import CompensatedPiece, PieceCompensator
 
-__all__ = ["HEAD", "compensated", "cut", "ender3_with", "pieces_of"]
+__all__ = ["HEAD", "blocks_of", "compensated", "cut", "ender3_with", "pieces_of"]
 
 _SECTIONS = Path(__file__).parents[2] / "examples" / "firmware"
 
 HEAD = "G28\nG90\nM83\nG1 X50 Y50 Z5 F6000\nG1 X60 Y50 F6000\nG4 P10\n"
 """After this the machine stands still at 60, 50, 5."""
+
+
+def blocks_of(data: bytes, machine: Machine, *, strict_bounds: bool = True) -> list[ProgramBlock]:
+    """Interpret a whole file."""
+    interpreter = Interpreter(machine, strict_bounds=strict_bounds)
+    return [*interpreter.push(data), *interpreter.flush()]
 
 
 def cut(

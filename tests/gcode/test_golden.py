@@ -10,8 +10,8 @@ import pytest
 
 from stillpath.gcode.firmware.klipper.planner import Planner
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.interpreter import interpret_bytes
 from stillpath.models.machine import Machine
+from tests.gcode.cutting import blocks_of
 
 pytestmark = pytest.mark.shared
 
@@ -46,9 +46,7 @@ def test_same_plan_as_klipper(name: str, golden_machine: Machine, shared_dir: Pa
     source = shared_dir / "corpus" / "own" / f"{name.split('__')[0]}.gcode.gz"
     machine = machine_of(name, golden_machine)
     planner = Planner(machine.firmware)
-    parts = [
-        planner.push(b) for b in interpret_bytes(gzip.decompress(source.read_bytes()), machine)
-    ]
+    parts = [planner.push(b) for b in blocks_of(gzip.decompress(source.read_bytes()), machine)]
     plan = join_phases([*parts, planner.flush()])
 
     times = np.column_stack(
