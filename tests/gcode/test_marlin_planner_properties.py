@@ -26,7 +26,7 @@ from stillpath.gcode.firmware.marlin._planner_kernels import _step_time, settle
 from stillpath.gcode.firmware.marlin.limits import initial_limits
 from stillpath.gcode.firmware.marlin.planner import Planner, planner_facts
 from stillpath.gcode.firmware.planning import join_phases
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import Marlin
 from stillpath.models.firmware.marlin import PerAxis
 
@@ -111,10 +111,7 @@ def test_what_every_plan_keeps(firmware: Marlin, moves: Moves, corexy: bool) -> 
 @settings(max_examples=80, deadline=None)
 def test_cutting_the_stream_changes_nothing(firmware: Marlin, moves: Moves, cuts: Any) -> None:
     bounds = sorted({0, len(moves), *(min(c, len(moves)) for c in cuts)})
-    parts = [
-        Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__))
-        for a, b in pairwise(bounds)
-    ]
+    parts = [rows_of(moves, slice(a, b)) for a, b in pairwise(bounds)]
     whole, cut = plan(firmware, [moves]), plan(firmware, parts)
     for name in Phases.__dataclass_fields__:
         assert getattr(cut, name) == pytest.approx(getattr(whole, name), rel=1e-9, abs=1e-12)

@@ -15,7 +15,7 @@ from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware.planning import join_phases
 from stillpath.gcode.firmware.reprapfirmware.limits import RepRapLimits
 from stillpath.gcode.firmware.reprapfirmware.planner import RepRapPlanner
-from stillpath.gcode.types import Moves, Phases
+from stillpath.gcode.types import Moves, Phases, rows_of
 from stillpath.models.firmware import RepRapFirmware
 from stillpath.models.firmware.reprapfirmware import Drive, RepRapExtruder
 
@@ -61,12 +61,7 @@ def plan(
 ) -> Phases:
     planner = RepRapPlanner(firmware, kinematics)
     edges = [0, *sorted(cuts), len(moves)]
-    parts = [
-        planner.push_moves(
-            Moves(*(getattr(moves, name)[a:b] for name in Moves.__dataclass_fields__)), [limits]
-        )
-        for a, b in pairwise(edges)
-    ]
+    parts = [planner.push_moves(rows_of(moves, slice(a, b)), [limits]) for a, b in pairwise(edges)]
     return join_phases([*parts, planner.flush()])
 
 
