@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from quality import FILES, MACHINES
 from readback import DT_S, find_input, plain_copy, read_motion, shared_folder
 
 from stillpath.gcode.pieces import Piece
@@ -32,8 +33,6 @@ from stillpath.pipeline.order import Order
 from stillpath.pipeline.piece_compensator import CompensatedPiece
 from stillpath.pipeline.result import Result
 
-FILES = ("ps_voron_klipper_ringing", "cura_ender3_gear24", "klipper_excludeobj_multi")
-MACHINES = ("ender3", "voron-v0", "voron-v24-250", "annex-k3")
 _BIN_UM, _BINS = 0.01, 40_000
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -120,12 +119,10 @@ def vertices_on_steps(lattice: Lattice, timeline: Timeline, segments: Segments) 
     answer = _answer_of(segments.error_filter)
     direction = np.empty((2, timeline.position_mm.shape[1]))
     path_directions(timeline.position_mm[:2], direction)
-    firsts = np.flatnonzero(np.append(True, segments.group[1:] != segments.group[:-1]))
     end_s, end_mm, groups = [], [], []
-    for first, stop in itertools.pairwise((*firsts.tolist(), len(segments))):
-        group = int(segments.group[first])
-        at_s = np.append(timeline.start_s[group], segments.end_s[first:stop])
-        at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, first:stop].T])
+    for group, rows in segments.stretches():
+        at_s = np.append(timeline.start_s[group], segments.end_s[rows])
+        at_mm = np.vstack([timeline.group_start_mm[group], segments.end_mm[:, rows].T])
         at_s, at_mm = _chosen(lattice, timeline.dt_s, at_s, at_mm, answer, direction)
         end_s.append(at_s[1:])
         end_mm.append(at_mm[1:])

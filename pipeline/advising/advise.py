@@ -20,7 +20,7 @@ from stillpath.gcode.firmware.registry import adapter
 from stillpath.gcode.interpreter import Interpreter
 from stillpath.gcode.pacing import FirstLayer
 from stillpath.gcode.slicers.facts import SlicerFacts
-from stillpath.gcode.slicers.features import feature_title
+from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.gcode.types import ProgramBlock
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
@@ -206,7 +206,7 @@ class _Job:
         """Return warnings: stored settings, unknown shapers, features with too large errors."""
         unshaped = "" if self._shapes(reading) else None
         given_back = self._before.label if figures.shapers else unshaped
-        helpless = [names[f] if f >= 0 else "unnamed" for f in sorted(choice.helpless)]
+        helpless = [feature_name(f, names) for f in sorted(choice.helpless)]
         return [
             *stored_settings(reading.stored_lines, shaper=given_back),
             *shaper_warnings(
@@ -318,7 +318,7 @@ class _Job:
                 continue
             bound = bounds.get(f)
             limit = self._bound_um(f, was) if f in choice.rung else None
-            name = names[f] if f >= 0 else "unnamed"
+            name = feature_name(f, names)
             features.append(
                 AdvisedFeature(
                     name=name,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stillpath.gcode.slicers.features import feature_title
+from stillpath.gcode.slicers.features import feature_name, feature_title
 from stillpath.models.machine import Machine
 from stillpath.models.schedule import OperatingPoint
 from stillpath.pipeline.band import BandContent
@@ -241,26 +241,33 @@ class Measurement:
 
     def layers(self) -> list[GroupFigures]:
         """Return the figures by layer."""
-        return self._groups(self._layers, self._maxima.layers, None)
+        return self._groups(self._layers, self._maxima.layers, _layer_label)
 
     def features(self, names: Sequence[str]) -> list[GroupFigures]:
         """Return the figures by feature."""
-        return self._groups(self._features, self._maxima.features, names)
+
+        def label(number: int) -> tuple[str, str]:
+            name = feature_name(number, names)
+            return name, feature_title(name)
+
+        return self._groups(self._features, self._maxima.features, label)
 
     def _groups(
-        self, groups: GroupTally, ends_mm: dict[int, Array], names: Sequence[str] | None
+        self,
+        groups: GroupTally,
+        ends_mm: dict[int, Array],
+        label: Callable[[int], tuple[str, str]],
     ) -> list[GroupFigures]:
+        """Return the figures of groups; `label` gives the name and the title of a number."""
         tallies = {name: groups.tallies(c) for c, name in enumerate(self._names)}
         out = []
         for key, tally in tallies[self._names[0]].items():
-            label = f"{key}" if names is None else (names[key] if key >= 0 else "unnamed")
-            if names is None and key < 0:
-                label = "before the first layer"
+            name, title = label(key)
             behind_mm = ends_mm.get(key, np.zeros(len(tallies)))
             out.append(
                 GroupFigures(
-                    name=label,
-                    title=label if names is None else feature_title(label),
+                    name=name,
+                    title=title,
                     seconds=round(self._stride * tally.count * self._dt_s, 3),
                     contour_rms_um={n: 1e3 * t[key].rms for n, t in tallies.items() if key in t},
                     contour_max_um={
@@ -296,6 +303,11 @@ class Measurement:
             "spectra": self.spectra(),
             "layer_views": self.layer_views(),
         }
+
+
+def _layer_label(number: int) -> tuple[str, str]:
+    label = f"{number}" if number >= 0 else "before the first layer"
+    return label, label
 
 
 class _Bins:

@@ -69,5 +69,5 @@ def test_same_plan_as_klipper(name: str, golden_machine: Machine, shared_dir: Pa
     m = len(golden["e"])
     np.testing.assert_allclose(e[:m], golden["e"], rtol=0.0, atol=1e-9)
 
-    end = plan.t_s[-1] + plan.accel_s[-1] + plan.cruise_s[-1] + plan.decel_s[-1]
+    end = plan.end_s[-1]
     assert end == pytest.approx(float(golden["total_time_s"]), rel=0.0, abs=1e-8)

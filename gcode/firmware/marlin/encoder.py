@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
-from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.base import corner_step_mm_s, square_corner_mm_s
 from stillpath.gcode.firmware.encoding import (
     UNITS_PER_MM,
@@ -308,8 +308,7 @@ class MarlinEncoder:
         begin_mm = timeline.group_start_mm[segments.group, 3]
         per_mm = self._scale[3]
         whole_mm = begin_mm + np.round((end_mm[3] + lead_mm - begin_mm) * per_mm) / per_mm
-        final = final_segments(segments)
-        end_mm[3] = np.where(final, end_mm[3], whole_mm)
+        end_mm[3] = np.where(segments.final, end_mm[3], whole_mm)
         return replace(segments, end_mm=end_mm)
 
     def _where_the_file_says(
@@ -361,9 +360,9 @@ class MarlinEncoder:
         if self._firmware.junction == "deviation":
             places = end_mm[:2].T * scale[:2]
             bend_reversals(steps, begin, group, places, self._lattice.least, self._corexy)
-        last = np.append(group[1:] != group[:-1], True)
-        end_mm[:2, ~last] = (steps[~last, :2] / scale[:2]).T
         chosen = Segments(wish.end_s[keep], end_mm, group)
+        inner = ~chosen.final
+        end_mm[:2, inner] = (steps[inner, :2] / scale[:2]).T
         classic = self._firmware.junction == "classic_jerk"
         return climb_in_long_moves(chosen, timeline, scale[2], limits, classic_jerk=classic)
 

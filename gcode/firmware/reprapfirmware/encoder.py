@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from stillpath.gcode.errors import GcodeError
 from stillpath.gcode.firmware._encoding_kernels import MoveLimits
-from stillpath.gcode.firmware.advance import feed_at_ends, final_segments
+from stillpath.gcode.firmware.advance import feed_at_ends
 from stillpath.gcode.firmware.encoding import (
     Encoded,
     as_moves,
@@ -209,7 +209,6 @@ class RepRapEncoder:
         if len(segments) < half:
             return segments
         begin_s = timeline.start_s[segments.group]
-        final = final_segments(segments)
         lasts = segments.end_s - _starts(timeline, segments)[0]
         total = np.cumsum(np.append(0.0, lasts))
         wanted_s = _SPARSE * self._half_ring_s
@@ -218,7 +217,7 @@ class RepRapEncoder:
         if not np.any(crowded):
             return segments
         keep = np.ones(len(segments), np.bool_)
-        keep_apart(segments.end_s, crowded, final, begin_s, wanted_s / half, keep)
+        keep_apart(segments.end_s, crowded, segments.final, begin_s, wanted_s / half, keep)
         return replace(
             segments,
             end_s=segments.end_s[keep],
@@ -231,7 +230,7 @@ class RepRapEncoder:
         end_mm = segments.end_mm.copy()
         rows, fed, _ = feed_at_ends(piece, timeline, segments)
         advance_s = np.array([x.pressure_advance_s for x in cast(list[RepRapLimits], piece.limits)])
-        fed = np.where(final_segments(segments), 0.0, fed)
+        fed = np.where(segments.final, 0.0, fed)
         end_mm[3] += advance_s[piece.moves.limits_id[rows]] * fed
         return replace(segments, end_mm=end_mm)
 
@@ -299,7 +298,7 @@ def _starts(
     timeline: Timeline, segments: Segments
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """When, shape (n,), and where, shape (4, n), segments begin."""
-    fresh = np.append(True, final_segments(segments)[:-1])
+    fresh = np.append(True, segments.final[:-1])
     start_s = np.where(fresh, timeline.start_s[segments.group], np.roll(segments.end_s, 1))
     start_mm = np.roll(segments.end_mm, 1, axis=1)
     start_mm[:, fresh] = timeline.group_start_mm[segments.group[fresh]].T
