@@ -138,7 +138,7 @@ def _final_job(
             budget = budget and budget.again()
         else:
             if gentler is None:
-                traced = trace
+                traced = trace  # the file is good: once more as it is, for the trace
             budget = gentler or job.same
         file.spool.seek(0)
         file.spool.truncate()
